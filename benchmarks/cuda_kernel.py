@@ -25,6 +25,7 @@ import numpy as np
 
 from raybeam import Pattern, RayCaster, available_backends
 from raybeam.cuda_backend import CudaBackend
+from raybeam.instances import plain
 from raybeam.mesh import local_mesh
 from raybeam.scan import Scan, check_scan
 
@@ -71,7 +72,7 @@ class Bench:
         start = time.perf_counter()
         self.local = local_mesh(*mesh)
         self.check_seconds = time.perf_counter() - start
-        self.engine = CudaBackend(self.local)
+        self.engine = CudaBackend(plain(self.local))
 
     def whole(self, directions: Float) -> Scan:
         """Ask for all directions, from the origin, not turned."""
@@ -88,15 +89,15 @@ class Bench:
         scan = self.whole(directions)
         parts = list(engine._made(scan))
         results = [engine._cast("cast_pattern", size, rays) for _, size, rays in parts]
-        hits = sum(int((place >= 0).sum()) for _, place in results)
+        hits = sum(int((place >= 0).sum()) for _, place, _ in results)
 
         def cast() -> None:
             for _, size, rays in parts:
                 engine._cast("cast_pattern", size, rays)
 
         def pack() -> None:
-            for t, place in results:
-                engine._packed(t, place, 1.0)
+            for found in results:
+                engine._packed(*found, 1.0)
 
         times = {
             "cast": milliseconds(cupy, cast, repeats),
@@ -109,12 +110,12 @@ class Bench:
     def brute_force(self, directions: Float) -> dict[str, float]:
         """Rate of every ray against every triangle, on so many rays that it takes a moment."""
         cupy = self.cupy
-        triangles = self.engine._scene[1]
+        triangles = self.engine._meshes[1]
         n = int(np.clip(4e10 / len(triangles), 1024, len(directions)))
         part = cupy.asarray(directions[:: max(1, len(directions) // n)][:n])
         n = len(part)
         kernel = cupy.RawKernel(_BRUTE_FORCE, "brute_force")
-        at = [np.float32(x) for x in self.local.to_local(self.origin[None])[0]]
+        at = [np.float32(x) for x in self.local.frame.to_local(self.origin[None])[0]]
         out = cupy.empty(n, np.float32)
         given = (triangles, np.int32(len(triangles)), *at, part, np.int32(n), out)
         took = milliseconds(cupy, lambda: kernel((-(-n // _BLOCK),), (_BLOCK,), given), 3)

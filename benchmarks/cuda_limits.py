@@ -20,8 +20,8 @@ from .cuda_timing import milliseconds, wall_milliseconds
 def build(cupy: Any, mesh: LocalMesh) -> float:
     """Milliseconds of a build by NumPy, the way to the device included."""
     start = time.perf_counter()
-    made = lay_out(mesh)
-    tables = (made.nodes, made.triangles, made.corners, made.faces, made.frame)
+    made = lay_out((mesh,))
+    tables = (made.nodes, made.triangles, made.corners, made.faces)
     kept = [cupy.asarray(table) for table in tables]
     cupy.cuda.Device().synchronize()
     took = 1e3 * (time.perf_counter() - start)
@@ -55,7 +55,7 @@ def many_rays(engine: CudaBackend, origin: Float, rays: int) -> dict[str, Any]:
 
     def count() -> int:
         casts = (engine._cast("cast_pattern", n, rays) for _, n, rays in engine._made(scan))
-        return sum(int((place >= 0).sum()) for _, place in casts)
+        return sum(int((place >= 0).sum()) for _, place, _ in casts)
 
     once = count()
     start = time.perf_counter()

@@ -13,7 +13,7 @@ import time
 import numpy as np
 
 from lidarpool.plan import Planning, best, run_trial
-from lidarpool.plan.axes import PathAxes
+from lidarpool.plan.geometry import PathAxes
 from lidarpool.plan.trial import prepare_swarm
 
 SEED_SCENE = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]

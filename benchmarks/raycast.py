@@ -28,7 +28,16 @@ from .raycast_scenes import Job, jobs
 
 CLOCKS = {"wall": time.perf_counter, "cpu": time.process_time}
 _MOMENT_S = 0.15  # an engine's turn takes about that long at least
-_VERSIONS = ("numpy", "open3d-cpu", "open3d", "trimesh", "embreex", "warp-lang", "cupy-cuda13x")
+_VERSIONS = (
+    "numpy",
+    "open3d-cpu",
+    "open3d",
+    "trimesh",
+    "embreex",
+    "numba",
+    "warp-lang",
+    "cupy-cuda13x",
+)
 
 
 def timed(cast: Cast, repeats: int, clock: Callable[[], float]) -> tuple[float, int]:
@@ -113,12 +122,7 @@ def findings(row: dict[str, Any]) -> list[str]:
     has = row["engines"]
     out = []
     if "Open3D, bare" in has and "embree" in has:
-        slower = 1 / ratio(row, "embree, cast alone", "Open3D, bare") - 1
-        whole = 1 / ratio(row, "embree", "embree, cast alone") - 1
-        out.append(
-            f"embree's cast alone takes {100 * slower:+.1f} % of bare Open3D's time more; making "
-            f"rays and gathering hits takes {100 * whole:.0f} % of the cast"
-        )
+        out.append(f"embree is {ratio(row, 'embree', 'Open3D, bare'):.2f} x bare Open3D")
     if "brute force, NumPy" in has and "numpy" in has:
         out.append(f"numpy is {ratio(row, 'numpy', 'brute force, NumPy'):,.0f} x brute force")
     return out

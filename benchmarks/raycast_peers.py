@@ -8,43 +8,12 @@ from typing import Any, ClassVar
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import available_backends
-from raybeam.embree_backend import EmbreeBackend
-from raybeam.mesh import local_mesh
-
 from .raycast_engines import BruteForce, Cast, Cuda, Embree, Engine, Numpy
 from .raycast_scenes import Job
 
 Float = NDArray[np.float64]
 
 _MISS = 0xFFFFFFFF
-
-
-class EmbreeAlone(Engine):
-    """The embree backend's cast without the making of rays and the gathering of hits."""
-
-    name = "embree, cast alone"
-    ours = True
-    peer = False
-
-    def missing(self) -> str:
-        """See `Engine.missing`."""
-        return available_backends()["embree"]
-
-    def prepare(self, job: Job) -> Cast:
-        """See `Engine.prepare`."""
-        mesh = local_mesh(job.vertices, job.faces)
-        engine = EmbreeBackend(mesh, self.threads)
-        origins = [mesh.to_local(origin[None]) for origin in job.origins]
-        chunks = _chunks(job, origins, engine.chunk)
-        hits = sum(int((engine._trace(rows)[1] >= 0).sum()) for rows in chunks)
-
-        def cast() -> int:
-            for rows in chunks:
-                engine._trace(rows)
-            return hits  # counting them anew would be gathering
-
-        return cast
 
 
 class Open3D(Engine):
@@ -219,6 +188,6 @@ def _chunks(job: Job, origins: Any, chunk: int) -> list[NDArray[np.float32]]:
 
 
 ENGINES: tuple[type[Engine], ...] = (
-    Cuda, Embree, EmbreeAlone, Numpy,
+    Cuda, Embree, Numpy,
     Open3D, Open3DWhole, Trimesh, TrimeshPoints, Warp, WarpCuda, BruteForce,
 )  # fmt: skip

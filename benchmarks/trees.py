@@ -26,7 +26,8 @@ from unittest.mock import patch
 import numpy as np
 
 from raybeam import cuda_backend, ploc
-from raybeam.layout import Layout, lay_out
+from raybeam.instances import plain
+from raybeam.layout import Layout, lay_out, lay_out_places
 from raybeam.mesh import LocalMesh, local_mesh
 
 from .raycast_scenes import Job, jobs
@@ -46,7 +47,7 @@ def compiled(folder: Path) -> ctypes.CDLL:
     library = folder / "intersect.so"
     files = importlib.resources.files("raybeam")
     with importlib.resources.as_file(files / "intersect.cu") as kernels:
-        flags = [flag for flag in cuda_backend.flags(_STACK) if flag != "-fmad=false"]
+        flags = [flag for flag in cuda_backend.flags(_STACK, False, False) if flag != "-fmad=false"]
         command = [
             "g++", "-O2", "-ffp-contract=off", "-shared", "-fPIC", *flags,
             f'-DSOURCE="{kernels}"', "-o", str(library), str(_HOST / "intersect.cpp"),
@@ -62,13 +63,21 @@ def count(library: ctypes.CDLL, layout: Layout, mesh: LocalMesh, job: Job) -> di
     directions = np.ascontiguousarray(job.directions @ job.rotation.T)
     n = len(directions)
     distance, place = np.empty(n), np.empty(n, np.int32)
+    places = lay_out_places(plain(mesh), layout.roots)
+    where = (places.frame, places.top, places.instances)
     before = _seen(library)
     hits = 0
     for origin in job.origins:
-        tables = (layout.nodes, layout.triangles, layout.corners, layout.faces, layout.frame)
+        tables = (
+            layout.nodes,
+            layout.triangles,
+            layout.corners,
+            layout.faces,
+            *cuda_backend.NO_MASKS,
+        )
         rays = (np.array(origin), ctypes.c_int(0), directions)  # one origin for all
         limits = (ctypes.c_longlong(n), ctypes.c_double(0.0), ctypes.c_double(np.inf))
-        _run(library, "cast_table", n, *tables, *rays, *limits, distance, place)
+        _run(library, "cast_table", n, *tables, *where, *rays, *limits, distance, place, place)
         hits += int((place >= 0).sum())
     seen = (_seen(library) - before) / job.rays
     return {**dict(zip(KINDS, seen.tolist(), strict=True)), "hit_share": hits / job.rays}
@@ -92,7 +101,7 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
     row: dict[str, Any] = {"scene": job.name, "triangles": len(mesh.corners), "rays": job.rays}
     for name, left in TREES.items():
         start = time.process_time()
-        layout = lay_out(mesh) if left is None else _laid_out(mesh, left)
+        layout = lay_out((mesh,)) if left is None else _laid_out(mesh, left)
         row[name] = {
             "build_s": time.process_time() - start,
             "tree_nodes": len(layout.nodes),
@@ -104,7 +113,7 @@ def measure(library: ctypes.CDLL, job: Job) -> dict[str, Any]:
 def _laid_out(mesh: LocalMesh, left: tuple[int, int]) -> Layout:
     """Lay out a mesh with so many clusters left to the sweep."""
     with patch.object(ploc, "_MOST", left[0]), patch.object(ploc, "_ENOUGH", left[1]):
-        return lay_out(mesh)
+        return lay_out((mesh,))
 
 
 def show(row: dict[str, Any]) -> None:

@@ -20,10 +20,14 @@ import pytest
 LOOPBACK = "127.0.0.1"
 
 
-def _installed(*programs: str) -> bool:
+def _found(program: str) -> str | None:
     # Those of administrators are not in everybody's PATH.
     places = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"])
-    return all(shutil.which(program, path=places) for program in programs)
+    return shutil.which(program, path=places)
+
+
+def _installed(*programs: str) -> bool:
+    return all(map(_found, programs))
 
 
 needs_slurm = pytest.mark.skipif(
@@ -58,13 +62,15 @@ class Slurm:
 @contextmanager
 def slurm(folder: Path) -> Iterator[Slurm]:
     """Start a Slurm of this user for as long as the body runs; its files are in the folder."""
+    key = folder / "munge.key"
+    key.touch(0o600)
+    key.write_bytes(secrets.token_bytes(128))
     with ExitStack() as stack:
         _start(
             stack,
             *("munged", "--foreground", "--force", "--num-threads=2"),
             *(f"--{what}-file={folder}/munge.{what}" for what in ("key", "pid", "log", "seed")),
             f"--socket={folder}/munge.socket",
-            prepare=lambda: _write_secret(folder / "munge.key"),
         )
         wait_until((folder / "munge.socket").exists)
         for _ in range(20):  # a port that was free may be taken by now
@@ -134,16 +140,10 @@ PartitionName=main Nodes={host} Default=YES MaxTime=INFINITE State=UP
 
 
 def _start(
-    stack: ExitStack,
-    program: str,
-    *arguments: str,
-    prepare: Callable[[], object] = lambda: None,
-    **environment: str,
+    stack: ExitStack, program: str, *arguments: str, **environment: str
 ) -> subprocess.Popen[bytes]:
-    prepare()
-    path = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"])
     daemon = subprocess.Popen(
-        [shutil.which(program, path=path) or program, *arguments],
+        [_found(program) or program, *arguments],
         env={**os.environ, **environment},
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,
@@ -152,11 +152,6 @@ def _start(
     stack.callback(daemon.wait, 120)
     stack.callback(daemon.terminate)
     return daemon
-
-
-def _write_secret(path: Path) -> None:
-    path.write_bytes(secrets.token_bytes(128))
-    path.chmod(0o600)
 
 
 def _free_port() -> int:
@@ -185,8 +180,7 @@ PasswordAuthentication no
 SetEnv PYTHONPATH={os.pathsep.join(filter(None, sys.path))}
 """
     )
-    path = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/usr/local/sbin"])
-    command = [shutil.which("sshd", path=path) or "sshd", "-i", "-e", "-f", str(config)]
+    command = [_found("sshd") or "sshd", "-i", "-e", "-f", str(config)]
     if os.geteuid() == 0:  # an empty folder that it wants, made by Debian when the machine starts
         Path("/run/sshd").mkdir(mode=0o755, exist_ok=True)
     servers: list[subprocess.Popen[bytes]] = []

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .hits import Hits, ScanReturns
-from .mesh import LocalMesh
+from .instances import Scene
 from .rays import Rays
 from .scan import Collector, Scan
 
@@ -30,9 +30,11 @@ class Found:
     t
         float64 (k,): distance in local units.
     triangle
-        int32 (k,): row of `faces`.
+        int32 (k,): row of its mesh's `faces`.
     u, v
         float64 (k,): weights of the second and third corner.
+    instance
+        int32 (k,): number of the instance.
     """
 
     ray: NDArray[np.integer[Any]]
@@ -40,13 +42,15 @@ class Found:
     triangle: NDArray[np.int32]
     u: NDArray[np.float64]
     v: NDArray[np.float64]
+    instance: NDArray[np.int32]
 
 
 class Backend(ABC):
-    """One engine, bound to one mesh.
+    """One engine, bound to the meshes of a scene.
 
-    A backend is made with the mesh, the most CPU threads to use (None for its own choice) and
+    A backend is made with the scene, the most CPU threads to use (None for its own choice) and
     the number of the CUDA device (None for the current one); it ignores those it does not need.
+    It builds the trees of the meshes once, and calls `place` for what depends on where they are.
     It must implement `closest`; it may override `scan` to be faster.
     """
 
@@ -65,8 +69,12 @@ class Backend(ABC):
         """Versions and instruction set that its bits depend on, beside NumPy; "" for none."""
         return ""
 
-    def __init__(self, mesh: LocalMesh, threads: int | None, device: int | None) -> None:
-        self._mesh = mesh
+    def __init__(self, scene: Scene, threads: int | None, device: int | None) -> None:
+        self._scene = scene
+
+    def place(self, scene: Scene) -> None:
+        """Take another scene of the same instances, some of which have moved."""
+        self._scene = scene
 
     @abstractmethod
     def closest(self, rays: Rays) -> Found:
@@ -75,23 +83,28 @@ class Backend(ABC):
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""
         n = len(rays)
-        hits = Hits(np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n))
+        hits = Hits(
+            np.full(n, np.inf), np.full(n, -1, np.int32), np.zeros(n), np.zeros(n),
+            np.full(n, -1, np.int32),
+        )  # fmt: skip
         for start in range(0, n, self.chunk):
             found = self.closest(rays.part(start, start + self.chunk))
             row = start + found.ray.astype(np.int64)
-            hits.distance[row] = found.t / self._mesh.scale
+            hits.distance[row] = found.t / self._scene.frame.scale
             hits.triangle[row] = found.triangle
             hits.u[row] = found.u
             hits.v[row] = found.v
+            hits.instance[row] = found.instance
         return hits
 
     def scan(self, scan: Scan) -> ScanReturns:
         """Closest hits of a scan's rays: the kept ones, and counts of all."""
-        collector = Collector(scan, self._mesh.face_count)
+        collector = Collector(scan, self._scene.face_count)
         for start, stop in scan.chunks(self.chunk):
             found = self.closest(scan.rays(start, stop))
-            collector.tally(found.triangle)
+            collector.tally(self._scene.tally_rows(found.instance, found.triangle))
             kept = collector.keep(found.ray, start, stop)
-            distance = found.t[kept] / self._mesh.scale
-            collector.add(start, found.ray[kept], distance, found.triangle[kept])
+            distance = found.t[kept] / self._scene.frame.scale
+            hits = found.triangle[kept], found.instance[kept]
+            collector.add(start, found.ray[kept], distance, *hits)
         return collector.result()

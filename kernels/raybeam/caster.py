@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Sequence
 from operator import index
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from .backend import Backend
 from .hits import Hits, ScanReturns
-from .mesh import local_mesh
+from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
 from .poses import Motion, Poses
 from .rays import check_rays
@@ -17,7 +20,7 @@ from .scan import check_scan
 
 
 class RayCaster:
-    """Closest hits of rays with a triangle mesh.
+    """Closest hits of rays with a triangle mesh, or with instances of meshes: see `of`.
 
     Both sides of a triangle count. A ray in a triangle's plane does not hit that triangle. A
     ray through an edge or a corner hits every triangle there, so closed meshes do not leak.
@@ -60,14 +63,67 @@ class RayCaster:
         threads: int | None = None,
         device: int | None = None,
     ) -> None:
+        self._start([Instance(Mesh(vertices, faces))], backend, threads, device)
+
+    @classmethod
+    def of(
+        cls,
+        instances: Sequence[Instance],
+        backend: str = "auto",
+        *,
+        threads: int | None = None,
+        device: int | None = None,
+    ) -> RayCaster:
+        """Make a caster for instances of meshes, which are numbered from 0 as they are given.
+
+        Each mesh gets one tree, so memory and time to build grow with the meshes. A single
+        instance without a transform is the same as its mesh alone.
+
+        Parameters
+        ----------
+        instances
+            At least one.
+        backend, threads, device
+            As of `RayCaster`.
+
+        Raises
+        ------
+        ValueError
+            If there is no instance, or a transform is not an invertible, finite (3, 4) or (4, 4)
+            matrix; the message has the instance's number.
+        BackendUnavailable
+            As of `RayCaster`.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
+        >>> above = [[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 2]]
+        >>> caster = RayCaster.of([Instance(mesh), Instance(mesh, above)], backend="numpy")
+        >>> hits = caster.cast([0.25, 0.25, 3], [[0, 0, -1]])
+        >>> hits.distance.tolist(), hits.instance.tolist()
+        ([1.0], [1])
+        """
+        caster = cls.__new__(cls)
+        caster._start(instances, backend, threads, device)
+        return caster
+
+    def _start(
+        self,
+        instances: Sequence[Instance],
+        backend: str,
+        threads: int | None,
+        device: int | None,
+    ) -> None:
         if threads is not None and index(threads) < 1:
             raise ValueError(f"threads is {threads}; it must be at least 1, or None.")
         engine = choose(backend)
-        self._mesh = local_mesh(vertices, faces)
-        self._engine = engine(self._mesh, threads, device)
+        self._scene, self._transforms = check_instances(instances)
+        self._engine = engine(self._scene, threads, device)
+        self._moved, self._lock = False, threading.Lock()
 
     def __repr__(self) -> str:
-        return f"RayCaster({self.face_count} triangles, backend={self.backend!r})"
+        many = f" in {self.instance_count} instances" if self._scene.nested else ""
+        return f"RayCaster({self.face_count} triangles{many}, backend={self.backend!r})"
 
     @property
     def backend(self) -> str:
@@ -76,8 +132,56 @@ class RayCaster:
 
     @property
     def face_count(self) -> int:
-        """Number of triangles given, including those without an area."""
-        return self._mesh.face_count
+        """Number of triangles of all meshes, including those without an area."""
+        return self._scene.face_count
+
+    @property
+    def instance_count(self) -> int:
+        """Number of instances."""
+        return len(self._scene.mesh)
+
+    def move(self, number: int, transform: ArrayLike) -> None:
+        """Give an instance another transform; casts that begin after this see it there.
+
+        Only the tree over the instances is built anew, once for all moves before a cast. The
+        results are those of a new caster. No cast of this caster may be under way.
+
+        Parameters
+        ----------
+        number
+            Of the instance.
+        transform
+            As of `Instance`.
+
+        Raises
+        ------
+        IndexError
+            If there is no such instance.
+        ValueError
+            If the transform is invalid, or the caster has a single mesh without a transform.
+        """
+        if not 0 <= index(number) < self.instance_count:
+            raise IndexError(
+                f"There is no instance {number}: this caster has {self.instance_count}, from 0."
+            )
+        if not self._scene.nested:
+            raise ValueError(
+                "A single mesh without a transform stays in its place: make the caster with "
+                "RayCaster.of([Instance(mesh, numpy.eye(4))]) to move it."
+            )
+        matrix = check_transform(index(number), transform)
+        with self._lock:
+            self._transforms[index(number)] = matrix
+            self._moved = True
+
+    def _ready(self) -> Backend:
+        """Return the engine, with all instances in their places."""
+        with self._lock:
+            if self._moved:
+                self._scene = place(self._scene.meshes, self._scene.mesh, self._transforms)
+                self._engine.place(self._scene)
+                self._moved = False
+        return self._engine
 
     def cast(
         self,
@@ -105,7 +209,7 @@ class RayCaster:
             If a direction is zero, a value is NaN or infinite (the message names the first such
             row), or the shapes do not fit.
         """
-        return self._engine.cast(check_rays(origins, directions, t_min, t_max))
+        return self._ready().cast(check_rays(origins, directions, t_min, t_max))
 
     def scan(
         self,
@@ -170,7 +274,7 @@ class RayCaster:
         >>> found.ray.tolist(), found.hits.tolist()
         ([0, 2, 4], [6])
         """
-        return self._engine.scan(
+        return self._ready().scan(
             check_scan(
                 pattern,
                 positions,

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from .backend import Backend, Found
 from .hits import ScanReturns
-from .layout import lay_out
-from .mesh import LocalMesh
+from .instances import Scene
+from .layout import lay_out, lay_out_places
+from .opacity import Masks
 from .pattern import Pattern
 from .poses import Poses
 from .rays import Rays
@@ -23,6 +24,8 @@ from .scan import Collector, Scan
 
 _BLOCK = 128  # threads; the kernels are bound to it
 _STACK_STEP = 32
+# Tables that are not read where all triangles are opaque.
+NO_MASKS = np.zeros((1, 6), np.float32), np.zeros(1, np.uint8), np.zeros((1, 4), np.int64)
 _MOST_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than a chunk has
 
 
@@ -67,22 +70,34 @@ class CudaBackend(Backend):
             return "CuPy finds no CUDA headers: pip install 'cupy-cuda13x[ctk]', or 12x"
         return ""
 
-    def __init__(
-        self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
-    ) -> None:
-        super().__init__(mesh, threads, device)
+    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+        super().__init__(scene, threads, device)
         self._cupy = cupy = self._library()
         self._device = _device(cupy, device)
-        made = lay_out(mesh)
+        made = lay_out(scene.meshes)
+        self._roots, self._stack = made.roots, made.stack
         with self._device:
-            # In steps, so that scenes share compiled kernels.
-            stack = -(-max(made.stack, 1) // _STACK_STEP) * _STACK_STEP
-            self._module = _compiled(cupy, self._device.id, flags(stack))
-            given = (made.nodes, made.triangles, made.corners, made.faces, made.frame)
-            self._scene = tuple(_sent(cupy, table) for table in given)
-        _, _, self._corners, self._faces, self._frame = self._scene
+            masks = made.masks or Masks(*NO_MASKS)
+            tables = (made.nodes, made.triangles, made.corners, made.faces)
+            given = (*tables, masks.uv, masks.mask, masks.records)
+            self._meshes = tuple(_sent(cupy, table) for table in given)
+        self._masked = made.masks is not None
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
+        self.place(scene)
+
+    def place(self, scene: Scene) -> None:
+        """See `Backend.place`."""
+        super().place(scene)
+        made = lay_out_places(scene, self._roots)
+        with self._device:
+            # In steps, so that scenes share compiled kernels.
+            stack = -(-max(self._stack + made.stack, 1) // _STACK_STEP) * _STACK_STEP
+            self._module = _compiled(
+                self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
+            )
+            given = (made.frame, made.top, made.instances)
+            self._places = tuple(_sent(self._cupy, table) for table in given)
 
     @staticmethod
     def _library() -> Any:
@@ -97,30 +112,33 @@ class CudaBackend(Backend):
         with self._device:
             stride = np.int32(0 if len(rays.origins) == 1 else 3)
             table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
-            limits = (np.float64(t * self._mesh.scale) for t in (rays.t_min, rays.t_max))
-            t, place = self._cast("cast_table", n, (*table, np.int64(n), *limits))
-            ray, *hits = self._packed(t, place, 1.0)
+            limits = (np.float64(t * self._scene.frame.scale) for t in (rays.t_min, rays.t_max))
+            found = self._cast("cast_table", n, (*table, np.int64(n), *limits))
+            ray, *hits, instance = self._packed(*found, 1.0)
             u, v = cp.empty(len(ray)), cp.empty(len(ray))
-            given = (self._corners, self._frame, *table, ray, place, np.int64(len(ray)))
+            frame, _, instances = self._places
+            scene = (self._meshes[2], frame, instances)
+            given = (*scene, *table, ray, *found[1:], np.int64(len(ray)))
             self._run("weigh_table", len(ray), *given, u, v)
-            return Found(*(array.get() for array in (ray, *hits, u, v)))
+            return Found(*(array.get() for array in (ray, *hits, u, v, instance)))
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`; the rays are made on the device, hits are chosen on the host."""
-        collector = Collector(scan, self._mesh.face_count)
+        collector = Collector(scan, self._scene.face_count)
         with self._device:
             for start, n, rays in self._made(scan):
-                found = self._packed(*self._cast("cast_pattern", n, rays), self._mesh.scale)
-                ray, distance, triangle = (array.get() for array in found)
-                collector.tally(triangle)
+                found = self._cast("cast_pattern", n, rays)
+                packed = self._packed(*found, self._scene.frame.scale)
+                ray, distance, triangle, instance = (array.get() for array in packed)
+                collector.tally(self._scene.tally_rows(instance, triangle))
                 kept = collector.keep(ray, start, start + n)
-                collector.add(start, ray[kept], distance[kept], triangle[kept])
+                collector.add(start, ray[kept], distance[kept], triangle[kept], instance[kept])
         return collector.result()
 
     def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
         """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
         cp, poses, unused = self._cupy, scan.poses, np.zeros(1)
-        limits = [np.float64(t * self._mesh.scale) for t in (scan.t_min, scan.t_max)]
+        limits = [np.float64(t * self._scene.frame.scale) for t in (scan.t_min, scan.t_max)]
         shifted, turned = scan.pattern.origins is not None, poses.rotations is not None
         tables, rows = self._resident(scan.pattern), len(scan.pattern)
         for start, stop in scan.chunks(self.chunk):
@@ -157,25 +175,29 @@ class CudaBackend(Backend):
             )
         return kept
 
-    def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any]:
-        """Local distance and table row of the closest hit of each ray, on the device."""
+    def _cast(self, kernel: str, n: int, rays: tuple[Any, ...]) -> tuple[Any, Any, Any]:
+        """Local distance, table row and instance of the closest hit of each ray, on the device."""
         t, place = self._cupy.empty(n), self._cupy.empty(n, np.int32)
-        self._run(kernel, n, *self._scene, *rays, t, place)
-        return t, place
+        instance = self._cupy.empty(n if self._scene.nested else 1, np.int32)
+        self._run(kernel, n, *self._meshes, *self._places, *rays, t, place, instance)
+        return t, place, instance
 
-    def _packed(self, distance: Any, place: Any, scale: float) -> tuple[Any, Any, Any]:
+    def _packed(
+        self, distance: Any, place: Any, instance: Any, scale: float
+    ) -> tuple[Any, Any, Any, Any]:
         """Compact the results of a cast on the device; distances are divided by `scale`.
 
-        Returns numbers of the rays that hit, distances, and the caller's triangles.
+        Returns numbers of the rays that hit, distances, the caller's triangles, and instances.
         """
         cp, n = self._cupy, len(place)
         # Compacted by sums in ray order, not by atomics: the same bytes on every run.
         ends = cp.cumsum(place >= 0, dtype=np.int32) if n else place
         hits = int(ends[-1]) if n else 0
-        ray, metres, triangle = (cp.empty(hits, d) for d in (np.uint32, np.float64, np.int32))
-        given = (self._faces, distance, place, ends, np.int64(n), np.float64(scale))
-        self._run("pack", n, *given, ray, metres, triangle)
-        return ray, metres, triangle
+        kinds = (np.uint32, np.float64, np.int32, np.int32)
+        packed = tuple(cp.empty(hits, kind) for kind in kinds)
+        found = (distance, place, instance, ends)
+        self._run("pack", n, self._meshes[3], *found, np.int64(n), np.float64(scale), *packed)
+        return packed
 
     def _run(self, kernel: str, threads: int, *arguments: Any) -> None:
         """Launch a kernel with one thread for each item; does nothing without items.
@@ -193,9 +215,14 @@ def source() -> str:
     return f'#line 1 "intersect.cu"\n{text}'
 
 
-def flags(stack: int) -> tuple[str, ...]:
-    """Compiler options of intersect.cu; `stack` is the most nodes that wait in a traversal."""
-    return "-std=c++17", "-fmad=false", f"-DSTACK={stack}"
+def flags(stack: int, nested: bool, masked: bool) -> tuple[str, ...]:
+    """Compiler options of intersect.cu.
+
+    `stack` is the most nodes that wait in a traversal; `nested` says whether there are instances,
+    `masked` whether parts of triangles are transparent.
+    """
+    kinds = f"-DNESTED={int(nested)}", f"-DMASKED={int(masked)}"
+    return "-std=c++17", "-fmad=false", f"-DSTACK={stack}", *kinds
 
 
 @lru_cache(maxsize=64)

@@ -2,302 +2,282 @@
 
 from __future__ import annotations
 
-import ctypes
+import importlib.util
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
-from importlib.metadata import files, version
 from typing import Any, ClassVar
+from weakref import WeakKeyDictionary
 
 import numpy as np
 from numpy.typing import NDArray
 
+from . import embree_library
 from .backend import Backend, Found
 from .hits import ScanReturns
-from .mesh import LocalMesh
+from .instances import Scene
+from .mesh import NEAR, Frame
+from .pattern import Pattern
+from .poses import Poses
 from .rays import Rays
-from .refine import Refiner
-from .scan import Collector, Scan
-from .workspace import Starts, Workspace
+from .scan import Scan
 
 Float = NDArray[np.float64]
-
-# Embree decides in float32, and may find a hit again that refinement put just before the start. So
-# the start moves on, in local units: a little for most surfaces, and as far as necessary for
-# surfaces that a ray grazes, where float32 is less accurate.
-_STARTS = (0.0, *(4.0**k * 2**-20 for k in range(6)))
-
-# A ray that starts farther from zero than this, in local units, is started at the scene's box:
-# float32 then rounds by the scene's size, not by the distance to it.
-_NEAR = 2.0
-
-# Local units. A float32 distance that is farther than this from the limits decides whether the hit
-# counts, so that only kept hits have to be refined. Its error is larger only if the cosine between
-# ray and normal is below some 1e-4; then a refined distance beyond a limit is ignored.
-_CLEAR = 2.0**-8
+_Room = tuple[Float, NDArray[np.int32], NDArray[np.int32]]
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
-
-# RTC_DEVICE_PROPERTY_NATIVE_RAY…_SUPPORTED, and the rays.
-_WIDTHS = ((34, 16), (33, 8), (32, 4))
-
-
-@dataclass(frozen=True)
-class _Limits:
-    """Limits of distances, in local units.
-
-    Attributes
-    ----------
-    t_min, t_max
-        Hits between these count.
-    near
-        A rough distance behind this is not before `t_min`.
-    far
-        A rough distance before this is not behind `t_max`.
-    last
-        A rough distance behind this is behind `t_max`.
-    """
-
-    t_min: float
-    t_max: float
-    near: float
-    far: float
-    last: float
-
-
-@dataclass(frozen=True)
-class _Hits:
-    """Closest hits of a chunk of n rays.
-
-    Attributes
-    ----------
-    counts
-        bool (n,): rays whose hits count.
-    t
-        (n,): local distance of each ray's hit; where it does not count, anything.
-    place
-        int32 (n,): row of the mesh's corners; likewise.
-    """
-
-    counts: NDArray[np.bool_]
-    t: NDArray[np.floating[Any]]
-    place: NDArray[np.int32]
+_COHERENCE = 0.94  # cosine of 20 degrees: wider packets are slower than single rays
 
 
 class EmbreeBackend(Backend):
-    """Embree's closest hits; their distances are recomputed in float64.
+    """Embree's candidates, of which the watertight test in float64 takes the closest.
 
-    Embree decides in float32 which triangle is hit. It does not distinguish surfaces that are
-    nearer to each other, or to the ray's start, than about 1e-6 of the scene's size. Casting
-    uses the given number of threads; the tree is built by all cores.
+    A triangle that Embree does not propose is not found. It decides in float32, and does not see
+    surfaces that are nearer to the ray's start than about 1e-6 of the scene's size. Casting and
+    building the tree use the given number of threads.
     """
 
     name: ClassVar[str] = "embree"
-    # Smaller chunks would fit a core's level 2 cache, but more calls cost more than that gains.
-    chunk: ClassVar[int] = 1 << 16
+    chunk: ClassVar[int] = 1 << 15  # distances and places fit a core's level 2 cache
 
     @classmethod
     def missing(cls) -> str:
         """See `Backend.missing`."""
+        if importlib.util.find_spec("numba") is None:
+            return "numba is not installed: pip install numba"
         try:
-            import embreex.rtcore_scene  # noqa: F401
-        except ImportError as error:
-            return f"embreex does not load ({error}): pip install embreex"
+            embree_library.library()
+        except (ImportError, OSError) as error:
+            return f"Embree does not load ({error}): pip install embreex"
         return ""
 
     @classmethod
     def build(cls) -> str:
-        """See `Backend.build`: embreex, its copy of Embree, and the width of Embree's vectors."""
-        [library] = [file for file in files("embreex") or () if "libembree4" in file.name]
-        embree = ctypes.CDLL(str(library.locate()))
-        embree.rtcNewDevice.restype = ctypes.c_void_p
-        embree.rtcGetDeviceProperty.restype = ctypes.c_ssize_t
-        device = ctypes.c_void_p(embree.rtcNewDevice(None))
-        # By the processor: native packets of 16 rays need AVX-512, of 8 rays AVX.
-        width = next((n for p, n in _WIDTHS if embree.rtcGetDeviceProperty(device, p)), 1)
-        embree.rtcReleaseDevice(device)
-        digest = library.hash.value[:8] if library.hash else ""
-        return f"{version('embreex')} ({digest}, vectors of {width})"
+        """See `Backend.build`: embreex and its copy of Embree."""
+        return embree_library.build()
 
-    def __init__(
-        self, mesh: LocalMesh, threads: int | None = None, device: int | None = None
-    ) -> None:
-        from embreex.mesh_construction import TriangleMesh
-        from embreex.rtcore_scene import EmbreeScene
+    def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
+        from . import embree_kernels
 
-        super().__init__(mesh, threads, device)
-        self._threads = ThreadPoolExecutor(threads or os.cpu_count(), "embree")
-        self._one = threads == 1
-        self._scene = EmbreeScene()  # robust: rays between two triangles hit one of them
-        TriangleMesh(self._scene, mesh.points, mesh.rows)
-        self._trace(np.empty((0, 6), np.float32))  # builds the tree, which threads may not
-        self._refine = Refiner(mesh)
+        super().__init__(scene, threads, device)
+        count = threads or os.cpu_count() or 1
+        self._threads = ThreadPoolExecutor(count, "embree") if count > 1 else None
+        trees = [embree_library.EmbreeMesh(mesh, threads) for mesh in scene.meshes]
+        self._instances = (
+            embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
+        )
+        self._tree = self._instances or trees[0]
+        self._width = embree_library.packet_width()
+        self._steps: WeakKeyDictionary[Pattern, dict[int, int]] = WeakKeyDictionary()
+        self._kernels = embree_kernels
+        self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
+        self._meshes = np.zeros((len(scene.meshes), embree_kernels.MESH_RECORD), np.int64)
+        for record, mesh, corners in zip(self._meshes, scene.meshes, self._corners, strict=True):
+            record[0] = corners.ctypes.data
+            if (opacity := mesh.opacity) is not None:
+                tables = opacity.uv.ctypes.data, opacity.mask.ctypes.data
+                record[1:] = *tables, *opacity.mask.shape
+        self._masked = any(mesh.opacity is not None for mesh in scene.meshes)
+        proposers = [embree_kernels.propose] * 2
+        if not (scene.nested or self._masked):
+            proposers = [embree_kernels.plain_proposer(n) for n in (self._width, 1)]
+        filters = [filter_.address for filter_ in (*proposers, embree_kernels.decide)]
+        self._filters = np.array(filters, np.int64)
+        self._index = np.concatenate([mesh.index for mesh in scene.meshes])
+        self.place(scene)
+
+    def place(self, scene: Scene) -> None:
+        """See `Backend.place`."""
+        super().place(scene)
+        self._frame = scene.frame.table
+        self._records_at = 0
+        if self._instances is not None:
+            self._instances.place(scene)
+            first = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
+            self._records = np.empty((len(scene.mesh), self._kernels.RECORD))
+            self._records[:, :12] = scene.matrices
+            rows = self._meshes.ctypes.data + self._meshes.strides[0] * scene.mesh
+            self._records.view(np.int64)[:, 12] = rows
+            self._records.view(np.int64)[:, 13] = first[scene.mesh]
+            self._records_at = self._records.ctypes.data
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        desk, limits = _desk(len(rays)), self._limits(rays.t_min, rays.t_max)
-        unit, starts = rays.directions.T.copy(), Starts(self._mesh.to_local(rays.origins))
-        desk.aim(unit)
-        hits = self._within(desk, unit, starts, limits)
-        ray = np.flatnonzero(hits.counts)
-        t, place = self._distance(hits, ray, unit, starts, limits)
-        u, v = self._refine.weights(starts.of(ray), rays.directions[ray], place)
-        return Found(ray, t, self._mesh.index[place], u, v)
+        frame = self._scene.frame
+        each = len(rays) if len(rays.origins) == 1 else 1
+        source = _Source(rays.directions.T, None, Poses(rays.origins, None, each), frame)
+        limits = (rays.t_min, rays.t_max)
+        t, place, instance = self._cast(source, 0, (0, len(rays)), limits, 1, self._room(len(rays)))
+        ray = np.flatnonzero(place >= 0)
+        hits = place[ray]
+        instance = instance[ray] if self._scene.nested else np.zeros(len(ray), np.int32)
+        u, v = np.empty((2, len(ray)))
+        origins = frame.to_local(rays.origins)
+        if len(origins) > 1:
+            origins = np.ascontiguousarray(origins[ray])
+        directions = np.ascontiguousarray(rays.directions[ray])
+        self._kernels.weigh(
+            self._meshes.ctypes.data, self._records_at, origins, directions, hits, instance, u, v
+        )
+        return Found(ray, t[ray], self._index[hits], u, v, instance)
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """See `Backend.scan`; rays are made where Embree reads them, a chunk at a time."""
-        collector = Collector(scan, self._mesh.face_count)
-        limits = self._limits(scan.t_min, scan.t_max)
+        """See `Backend.scan`."""
+        pattern, frame = scan.pattern, self._scene.frame
+        origins = None if pattern.origins is None else pattern.origins.T
+        source = _Source(pattern.directions.T, origins, scan.poses, frame)
+        step, limits = self._step(scan), (scan.t_min, scan.t_max)
+        room = self._room(min(len(scan), self.chunk))
+        groups = np.array(scan.groups)
+        hits = np.zeros(len(groups), np.int64)
+        tally = np.zeros(len(self._index) if scan.tally else 0, np.int64)
+        # Pages of what is not written take no memory.
+        ray, metres = np.empty(len(scan), np.uint32), np.empty(len(scan))
+        triangle, instance = np.empty(len(scan), np.int32), np.zeros(len(scan), np.int32)
+        kept = 0
         for start, stop in scan.chunks(self.chunk):
-            desk = _desk(stop - start)
-            order, unit, starts = desk.make(scan, start, stop, self._mesh)
-            hits = self._within(desk, unit, starts, limits)
-            ray = np.flatnonzero(order.by_ray(hits.counts))
-            slot = order.of(ray)
-            if scan.tally:
-                collector.tally(self._mesh.index.take(hits.place.take(slot)))
-            keep = collector.keep(ray, start, stop)
-            kept, slot = ray[keep], slot[keep]
-            t, place = self._distance(hits, slot, unit, starts, limits)
-            t /= self._mesh.scale
-            collector.add(start, kept, t, self._mesh.index.take(place))
-        return collector.result()
+            t, place, chosen = self._cast(source, scan.first, (start, stop), limits, step, room)
+            kept += self._kernels.gather(
+                t,
+                place,
+                chosen,
+                self._index,
+                start,
+                1 / frame.scale,
+                groups,
+                int(np.searchsorted(groups, start, side="right")) - 1,
+                scan.keep_every,
+                hits,
+                tally,
+                ray[kept:],
+                metres[kept:],
+                triangle[kept:],
+                instance[kept:],
+            )
+        found = ray[:kept], metres[:kept], triangle[:kept]
+        counts = self._by_face(tally) if scan.tally else None
+        return ScanReturns(*found, hits, counts, instance[:kept])
 
-    def _limits(self, t_min: float, t_max: float) -> _Limits:
-        t_min, t_max = t_min * self._mesh.scale, t_max * self._mesh.scale
-        # Float32 numbers, so that float32 and float64 distances compare with them alike.
-        with np.errstate(over="ignore"):
-            rough = np.array([t_min + _CLEAR, t_max - _CLEAR, t_max + _CLEAR]).astype(np.float32)
-        return _Limits(t_min, t_max, *rough.tolist())
+    def _by_face(self, tally: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Count hits of all faces, from those of triangles that have an area."""
+        counts, start = np.zeros(self._scene.face_count, np.int64), 0
+        for mesh, first in zip(self._scene.meshes, self._scene.first_face, strict=False):
+            stop = start + len(mesh.index)
+            counts[first + mesh.index] = tally[start:stop]
+            start = stop
+        return counts
 
-    def _within(self, desk: Workspace, unit: Float, starts: Starts, limits: _Limits) -> _Hits:
-        """Closest hits, refined where that decides whether they count; see `_CLEAR`.
+    def _room(self, rays: int) -> _Room:
+        """Arrays for distances, places, and instances if there are any."""
+        instances = np.empty(rays if self._scene.nested else 0, np.int32)
+        return np.empty(rays), np.empty(rays, np.int32), instances
 
-        The rows of `desk` hold the directions already; `unit`, (3, n), are the same in float64.
+    def _step(self, scan: Scan) -> int:
+        """How far apart the rays of a packet are; found once for a pattern with one or many poses.
+
+        It is that for which they differ least; 1 for rays that have nothing in common.
         """
-        t, place = self._cast(desk, unit, starts, 0.0)
-        counts = t < np.inf if limits.last == np.inf else t <= limits.last
-        unclear = t < limits.near
-        if limits.far < np.inf:
-            unclear |= t > limits.far
-            unclear &= counts
-        ray = np.flatnonzero(unclear)
-        if not len(ray):
-            return _Hits(counts, t, place)
-        exact = self._refined(ray, t[ray], place[ray], unit, starts)
-        t = t.astype(np.float64)
-        t[ray] = exact
-        early = exact < limits.t_min  # a refined distance may be just below 0 as well
-        counts[ray] = ~early & (exact <= limits.t_max)
-        if early.any():
-            again, t[again], place[again] = self._beyond(desk, ray[early], unit, starts, limits)
-            counts[again] = t[again] <= limits.t_max
-        return _Hits(counts, t, place)
+        each = scan.poses.rays if len(scan.poses) > 1 else 0
+        steps = self._steps.setdefault(scan.pattern, {})
+        if each not in steps:
+            spreads = {
+                step: self._spread(scan, step) for step in {1, scan.pattern.step, each} - {0}
+            }
+            best = max(spreads, key=lambda step: spreads[step])
+            steps[each] = best if spreads[best] > _COHERENCE else 1
+        return steps[each]
 
-    def _beyond(
-        self,
-        desk: Workspace,
-        ray: NDArray[np.intp],
-        unit: Float,
-        starts: Starts,
-        limits: _Limits,
-    ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
-        """Find the next hits, beyond `t_min`, of rays that hit something before it.
-
-        Returns the rays that have one, in any order; refined distances; places.
-        """
-        rays, distances, places = [], [], []
-        for ahead in _STARTS:
-            directions, at = _columns_of(unit, ray), Starts(starts.of(ray))
-            desk.aim(directions)
-            rough, place = self._cast(desk, directions, at, limits.t_min + ahead)
-            hit = np.flatnonzero(rough < np.inf)
-            t = self._refined(hit, rough[hit], place[hit], directions, at)
-            good = t >= limits.t_min
-            rays.append(ray[hit[good]])
-            distances.append(t[good])
-            places.append(place[hit[good]])
-            ray = ray[hit[t < limits.t_min]]
-            if not len(ray):
-                break
-        return np.concatenate(rays), np.concatenate(distances), np.concatenate(places)
+    def _spread(self, scan: Scan, step: int) -> float:
+        """Mean over some packets of the least cosine between their first ray and some others."""
+        lags = step * np.array([0, self._width // 4, self._width // 2, self._width - 1])
+        room = len(scan) - int(lags[-1])
+        if room <= 0:
+            return -1.0
+        ray = np.linspace(0, room - 1, 32).astype(np.int64)[:, None] + lags
+        _, directions = scan.pattern.made(scan.first, ray.reshape(-1), scan.poses)
+        packets = directions.reshape(-1, len(lags), 3)
+        return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())
 
     def _cast(
-        self, desk: Workspace, unit: Float, starts: Starts, begin: float
-    ) -> tuple[NDArray[np.floating[Any]], NDArray[np.int32]]:
-        """Closest hits at or behind a distance `begin`, up to float32 rounding; see `_within`.
-
-        Returns rough distances (n,), local, inf for a miss; and rows of the mesh's corners (n,).
-        """
-        n = unit.shape[1]
-        ways: Float | None = None
-        if begin > 0 or starts.reach > _NEAR:
-            points = starts.of(np.arange(n))
-            entry, _ = self._mesh.clip(points, unit.T)
-            near = np.abs(points).max(axis=1) <= _NEAR
-            ways = np.maximum(np.where(near, 0, entry), begin)
-            # If the ray is too far away for float64 to place the start, it stays near the scene.
-            starts = Starts(np.clip(points + ways[:, None] * unit.T, -_NEAR, _NEAR))
-        t, place = self._trace(desk.start(n, starts))
-        return t if ways is None else t + ways, place
-
-    def _trace(self, rows: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.int32]]:
-        """Closest hits of rows (n, 6), origins and directions; distances are inf for a miss."""
-        t = np.full(len(rows), np.inf, np.float32)  # longest distance; embreex writes hits to it
-
-        def part(share: slice) -> NDArray[np.int32]:
-            origins, directions = rows[share, :3], rows[share, 3:]
-            found = self._scene.run(origins, directions, dists=t[share], output=True)
-            place: NDArray[np.int32] = found["primID"]
-            return place
-
-        if self._one or len(rows) <= _SHARE:
-            return t, part(slice(None))
-        shares = [slice(start, start + _SHARE) for start in range(0, len(rows), _SHARE)]
-        return t, np.concatenate(list(self._threads.map(part, shares)))
-
-    def _refined(
         self,
-        ray: NDArray[np.intp],
-        rough: NDArray[np.floating[Any]],
-        place: NDArray[np.int32],
-        unit: Float,
-        starts: Starts,
-    ) -> Float:
-        """Distances of some rays in float64 accuracy, from their `rough` and `place`."""
-        directions = _columns_of(unit, ray)
-        return self._refine.distance(starts.of(ray), directions, place.astype(np.intp), rough)
+        source: _Source,
+        first: int,
+        rays: tuple[int, int],
+        limits: tuple[float, float],
+        step: int,
+        room: _Room,
+    ) -> _Room:
+        """Local distances (n,), inf for a miss; places in `index` (n,), -1; instances, if any."""
+        start, stop = rays
+        scale = self._scene.frame.scale
+        n = stop - start
+        t, place, instance = room[0][:n], room[1][:n], room[2][:n]
 
-    def _distance(
-        self, hits: _Hits, ray: NDArray[np.intp], unit: Float, starts: Starts, limits: _Limits
-    ) -> tuple[Float, NDArray[np.intp]]:
-        """Refined distances of some hits that count, and their places."""
-        rough, place = hits.t.take(ray), hits.place.take(ray)
-        if 2 * len(ray) > len(hits.t):  # selecting directions and starts takes longer
-            every = hits.place.astype(np.intp)
-            t = self._refine.distance(starts.points, unit, every, hits.t).take(ray)
+        def part(begin: int) -> None:
+            end = min(begin + share, stop)
+            self._kernels.trace(
+                self._tree.address,
+                _scratch(self._kernels.SIZE),
+                self._meshes.ctypes.data,
+                self._records_at,
+                self._masked,
+                self._filters,
+                source.addresses,
+                self._frame,
+                source.near,
+                source.still,
+                first,
+                begin,
+                end,
+                source.each,
+                step,
+                self._width,
+                _COHERENCE,
+                limits[0] * scale,
+                limits[1] * scale,
+                t[begin - start : end - start],
+                place[begin - start : end - start],
+                instance[begin - start : end - start],
+            )
+
+        span = step * self._width
+        share = max(_SHARE // span, 1) * span
+        if self._threads is None or stop - start <= share:
+            share = stop - start
+            part(start)
         else:
-            t = self._refined(ray, rough, place, unit, starts)
-        beyond = np.flatnonzero((t < limits.t_min) | (t > limits.t_max))
-        t[beyond] = rough[beyond]
-        return t, place.astype(np.intp)
+            list(self._threads.map(part, range(start, stop, share)))
+        return t, place, instance
 
 
-_desks = threading.local()  # threads of one worker may cast at the same time
+class _Source:
+    """Arrays from which rays are made, and their addresses for compiled code; see `trace`."""
+
+    def __init__(
+        self, directions: Float, origins: Float | None, poses: Poses, frame: Frame
+    ) -> None:
+        motion, self.each = poses.motion, poses.rays
+        tables = [directions, origins, poses.positions, poses.rotations]
+        tables += [None] * 3 if motion is None else [motion.delays, motion.velocities, motion.rates]
+        self._kept = [None if a is None else np.ascontiguousarray(a, np.float64) for a in tables]
+        places = [0 if a is None else a.ctypes.data for a in self._kept]
+        self.addresses = np.array([*places, directions.shape[1]], np.int64)
+        reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
+        if origins is not None:
+            reach += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
+        if motion is not None:
+            way = np.abs(motion.delays).max(initial=0) * np.abs(motion.velocities).max(initial=0)
+            reach += 2 * float(way) * frame.scale
+        self.near = reach < NEAR
+        self.still = len(poses) == 1 and origins is None and motion is None
 
 
-def _desk(rays: int) -> Workspace:
-    """Workspace of this thread, for at least that many rays; its casters share it."""
-    kept: Workspace | None = getattr(_desks, "desk", None)
-    if kept is None or kept.size < rays:
-        kept = _desks.desk = Workspace(rays)
-    return kept
+_own = threading.local()  # threads of one worker may cast at the same time
 
 
-def _columns_of(unit: Float, ray: NDArray[np.intp]) -> Float:
-    """Select columns of (3, n); faster than `take` along the axis, which copies all columns."""
-    out = np.empty((3, len(ray)))
-    for row, axis in zip(unit, out, strict=True):
-        row.take(ray, out=axis, mode="clip")  # the mode in which it writes straight to `out`
-    return out
+def _scratch(size: int) -> int:
+    """Address of scratch memory of this thread, a multiple of 64."""
+    room: NDArray[Any] | None = getattr(_own, "room", None)
+    if room is None:
+        room = _own.room = np.zeros(size + 8, np.int64)
+    return room.ctypes.data + -room.ctypes.data % 64

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-# Ray, distance and triangle of some hits, as in `ScanReturns`.
-Part = tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.int32]]
+# Ray, distance, triangle and instance of some hits, as in `ScanReturns`.
+Part = tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]
 
 
 @dataclass(frozen=True)
@@ -21,17 +21,21 @@ class Hits:
         float64 (n,): metres from the ray's origin, whatever the length of its direction; inf for
         a miss.
     triangle
-        int32 (n,): row of `faces`; -1 for a miss. Of triangles at exactly the same distance
-        the lowest row is reported.
+        int32 (n,): row of the `faces` of the mesh that is hit; -1 for a miss. Of triangles at
+        exactly the same distance, that of the lowest instance is reported, and of those the
+        lowest row.
     u, v
         float64 (n,): barycentric weights of the triangle's second and third corner; the first
         corner's is ``1 - u - v``. 0 for a miss.
+    instance
+        int32 (n,): number of the instance that is hit; 0 for a plain mesh, -1 for a miss.
     """
 
     distance: NDArray[np.float64]
     triangle: NDArray[np.int32]
     u: NDArray[np.float64]
     v: NDArray[np.float64]
+    instance: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.distance)
@@ -57,7 +61,11 @@ class ScanReturns:
     hits
         int64 (g,): number of hits of each group, kept or not.
     tally
-        int64 (face_count,): hits of each triangle, kept or not; None if not requested.
+        int64 (face_count,): hits of each triangle, kept or not, whichever instance shows it: the
+        rows of all meshes one after the other, in the order in which instances use them. None if
+        not requested.
+    instance
+        int32 (k,): as in `Hits`.
     """
 
     ray: NDArray[np.uint32]
@@ -65,6 +73,7 @@ class ScanReturns:
     triangle: NDArray[np.int32]
     hits: NDArray[np.int64]
     tally: NDArray[np.int64] | None
+    instance: NDArray[np.int32]
 
     def __len__(self) -> int:
         return len(self.ray)
@@ -74,6 +83,7 @@ def joined(parts: list[Part]) -> Part:
     """Join hits that were found in parts, in that order; a single part is not copied."""
     if len(parts) == 1:
         return parts[0]
-    parts = [(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32)), *parts]
-    ray, distance, triangle = map(np.concatenate, zip(*parts, strict=True))
-    return ray, distance, triangle
+    nothing = np.zeros(0, np.int32)
+    parts = [(np.zeros(0, np.uint32), np.zeros(0), nothing, nothing), *parts]
+    ray, distance, triangle, instance = map(np.concatenate, zip(*parts, strict=True))
+    return ray, distance, triangle, instance

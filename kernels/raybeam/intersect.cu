@@ -2,7 +2,9 @@
 //
 // Compiled by NVRTC, which has no standard headers, so there are none here; the tests compile the
 // same text for the CPU. One thread a ray, blocks of 128 threads, a grid of one dimension.
-// STACK (a number) is defined on the command line: the most nodes that can wait.
+// Defined on the command line: STACK, the most nodes that can wait; NESTED, 1 for a scene with
+// instances, 0 for a plain one: one mesh, in its place; MASKED, 1 where parts of triangles are
+// transparent, else 0. A scene pays nothing for what it has not.
 //
 // Threads are independent: no shared memory, no barriers, no votes of a warp, no atomics, so it does
 // not matter which of them run together. Offsets into tables are 64 bits wide; an int is enough for
@@ -14,7 +16,9 @@
 // CuPy adds -ftz=true: subnormal floats are flushed to zero. The bands below allow for that (FLOOR
 // of layout.py), and nodes never come near it: a box is as wide as its padding.
 //
-// All lengths are local: coordinates within [-1, 1], see mesh.py. layout.py makes the tables:
+// All lengths are local: coordinates within [-1, 1], see mesh.py; the scene and each mesh have
+// coordinates of their own, see instances.py. layout.py makes the tables, those of all meshes one
+// after the other:
 //   nodes      8 float4 (one 128-byte line) a node: low x, y, z of four children, then high x, y,
 //              z, then the children's codes as integer bits, then nothing. A code >= 0 is a
 //              node, a negative one ~(first << 3 | count - 1) the triangles of a leaf. An empty
@@ -23,7 +27,11 @@
 //              the second corner and band of c, edge to the third and band of t.
 //   corners    9 doubles a triangle, in the same order.
 //   faces      the caller's number of each triangle.
+//   uvs, masks, opacity  as in `Masks` of opacity.py.
 //   frame      10 doubles: centre (3), scale, low corner of the scene's box (3), high corner (3).
+//   top        as nodes, over the instances: a leaf holds one, by its number.
+//   instances  20 doubles each: matrix from the scene to the mesh, by rows (12), low corner of the
+//              mesh's box (3), high corner (3), the mesh's first node, its number.
 //
 // Two tests a triangle. `may_hit` is Moeller and Trumbore (1997) in float, with bands as wide as
 // its rounding errors can be, so it never loses a hit; it rejects nearly all other triangles.
@@ -35,8 +43,9 @@
 
 typedef long long Count;
 
-// Five blocks of 128 threads to a multiprocessor: aiming at more, nvcc spills registers for sm_90.
-#define KERNEL extern "C" __global__ void __launch_bounds__(128, 5)
+// Five blocks of 128 threads to a multiprocessor, four with instances: aiming at more, nvcc spills
+// registers for sm_90.
+#define KERNEL extern "C" __global__ void __launch_bounds__(128, NESTED ? 4 : 5)
 
 // Counters for runs on the CPU; on a device, nothing.
 #ifndef SEEN
@@ -48,13 +57,19 @@ typedef long long Count;
 #define TINY 8.673617379884035e-19  // 2^-60: replaces a direction component of zero
 #define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
 #define ACROSS 4.0                  // more than the diagonal of any scene
+#define RECORD 20                   // doubles of an instance
 
 struct Scene {
     const float4* nodes;
     const float4* triangles;
     const double* corners;
     const int* faces;
+    const float* uvs;
+    const unsigned char* masks;
+    const Count* opacity;
     const double* frame;
+    const float4* top;
+    const double* instances;
 };
 
 // Local origin and unit direction.
@@ -172,6 +187,28 @@ struct PatternRays {
     }
 };
 
+// Take a ray from the scene's to an instance's coordinates. Returns the length that its direction
+// had there, with the operations of `Scene.enter`.
+__device__ __forceinline__ double enter_mesh(const Scene& scene, int instance, Ray& ray)
+{
+    if (!NESTED) return 1.0;
+    const double* m = scene.instances + RECORD * (Count)instance;
+    const double x = (m[0] * ray.dx + m[1] * ray.dy) + m[2] * ray.dz;
+    const double y = (m[4] * ray.dx + m[5] * ray.dy) + m[6] * ray.dz;
+    const double z = (m[8] * ray.dx + m[9] * ray.dy) + m[10] * ray.dz;
+    const double length = sqrt((x * x + y * y) + z * z);
+    const double u = ((m[0] * ray.ox + m[1] * ray.oy) + m[2] * ray.oz) + m[3];
+    const double v = ((m[4] * ray.ox + m[5] * ray.oy) + m[6] * ray.oz) + m[7];
+    const double w = ((m[8] * ray.ox + m[9] * ray.oy) + m[10] * ray.oz) + m[11];
+    ray.ox = u;
+    ray.oy = v;
+    ray.oz = w;
+    ray.dx = x / length;
+    ray.dy = y / length;
+    ray.dz = z / length;
+    return length;
+}
+
 // ---- the test that decides ----
 
 __device__ __forceinline__ double pick(int axis, double x, double y, double z)
@@ -209,9 +246,25 @@ __device__ __forceinline__ bool decide(const Scene& scene, const Ray& ray, int p
     return (above || below) && out.det != 0;
 }
 
+// Whether the mesh's mask stops a ray that passes inside a triangle, as `Masks.opaque`.
+__device__ __forceinline__ bool opaque(const Scene& scene, int mesh, int place, const Exact& hit)
+{
+    const Count* record = scene.opacity + 4 * (Count)mesh;
+    const int height = (int)record[2], width = (int)record[3];
+    if (height == 0) return true;
+    const float* uv = scene.uvs + 6 * (place + record[0]);
+    const double p = hit.a / hit.det, q = hit.b / hit.det, r = hit.c / hit.det;
+    const double u = (p * uv[0] + q * uv[2]) + r * uv[4];
+    const double v = (p * uv[1] + q * uv[3]) + r * uv[5];
+    const int across = (int)((u - floor(u)) * width), down = (int)((v - floor(v)) * height);
+    const int column = across < width ? across : width - 1;
+    const int row = down < height ? down : height - 1;
+    return scene.masks[record[1] + row * (Count)width + column];
+}
+
 // ---- traversal ----
 
-// The ray in float, from where it enters the scene's box.
+// The ray in float, from where it enters the box of the scene, or of an instance's mesh.
 struct Walk {
     float ox, oy, oz, dx, dy, dz;  // start and direction
     float ix, iy, iz;              // 1 / direction
@@ -250,12 +303,11 @@ __device__ __forceinline__ float reciprocal(float d)
     return 1.0f / (fabsf(d) < (float)TINY ? (d < 0.0f ? -(float)TINY : (float)TINY) : d);
 }
 
-// Prepare the traversal; false when the ray misses the scene's box.
+// Prepare the traversal; false when the ray misses the box, which is 6 doubles.
 __device__ __forceinline__ bool begin(
-    const Scene& scene, const Ray& ray, double t_min, double t_max, Walk& w)
+    const double* low, const Ray& ray, double t_min, double t_max, Walk& w)
 {
-    const double* low = scene.frame + 4;
-    const double* high = scene.frame + 7;
+    const double* high = low + 3;
     double entry = 0.0;
     const bool inside = ray.ox >= low[0] && ray.ox <= high[0] && ray.oy >= low[1] &&
                         ray.oy <= high[1] && ray.oz >= low[2] && ray.oz <= high[2];
@@ -326,18 +378,19 @@ __device__ __forceinline__ void push(Waiting* stack, int& top, int node, float t
     }
 }
 
-__device__ __forceinline__ int pop(const Waiting* stack, int& top, float to)
+__device__ __forceinline__ int pop(const Waiting* stack, int& top, int bottom, float to)
 {
-    while (top > 0) {
+    while (top > bottom) {
         const Waiting entry = stack[--top];
         if (entry.t <= to) return entry.node;
     }
     return DONE;
 }
 
-// Test a node's children; the nearest one hit is next, the others wait.
+// Test a node's children; the nearest one hit is next, the others wait. Those below `bottom` are
+// not of this walk.
 __device__ __forceinline__ int descend(
-    const float4* nodes, int node, const Walk& w, Waiting* stack, int& top)
+    const float4* nodes, int node, const Walk& w, Waiting* stack, int& top, int bottom)
 {
     SEEN(NODE);
     const float4* line = nodes + 8 * (Count)node;
@@ -364,7 +417,7 @@ __device__ __forceinline__ int descend(
         return c0;
     }
     if (met0 || met1 || met2 || met3) return met0 ? c0 : (met1 ? c1 : (met2 ? c2 : c3));
-    return pop(stack, top, w.to);
+    return pop(stack, top, bottom, w.to);
 }
 
 // Result of the float test for a triangle that the ray may hit: bounds of the distance from the
@@ -405,23 +458,25 @@ __device__ __forceinline__ bool may_hit(const float4* record, const Walk& w, Gue
     return true;
 }
 
-// Finds the closest hit: local distance, and place in the tables (-1: none yet).
+// Finds the closest hit: distance local to the scene, place in the tables (-1: none yet), and
+// instance.
 //
 // The test that decides costs as much as several nodes, and the rays of a warp reach their triangles
 // at different times. So triangles that may be the closest wait until all rays of the warp are done,
 // or have no room left; a certain hit shortens the traversal at once.
 struct Closest {
     double t;
-    int place;
+    int place, instance;
     int one, two;              // waiting triangles, -1: none
     float near_one, near_two;  // lower bounds of their distances
 
-    __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), one(-1), two(-1) {}
+    __device__ __forceinline__ Closest(double t_max) : t(t_max), place(-1), instance(0), one(-1), two(-1) {}
 
     // Add a triangle; false when there is no room for another.
     __device__ __forceinline__ bool offer(int at, const Guess& guess, Walk& w)
     {
-        if (guess.sure) w.to = fminf(w.to, guess.far);
+        // A mask may let the ray through.
+        if (guess.sure && !MASKED) w.to = fminf(w.to, guess.far);
         if (one >= 0 && near_one > w.to) one = -1;
         if (two >= 0 && near_two > w.to) two = -1;
         if (one < 0) {
@@ -434,10 +489,10 @@ struct Closest {
         return one < 0 || two < 0;
     }
 
-    // Decide on the waiting triangles.
+    // Decide on the waiting triangles of an instance.
     template <class Rays>
     __device__ __forceinline__ void settle(
-        const Scene& scene, const Rays& rays, Count i, double t_min, Walk& w)
+        const Scene& scene, const Rays& rays, Count i, int inside, double t_min, Walk& w)
     {
 #pragma unroll 1  // one copy of the test
         for (int turn = 0; turn < 2; ++turn) {
@@ -446,32 +501,46 @@ struct Closest {
             Exact hit;
             // Load the ray again: keeping it in double during the traversal costs more in
             // registers than it saves in time.
-            if (!decide(scene, rays.load(scene, i), at, hit) || !(hit.t >= t_min)) continue;
-            const bool tie = hit.t == t && (place < 0 || scene.faces[at] < scene.faces[place]);
-            if (hit.t < t || tie) {
+            Ray ray = rays.load(scene, i);
+            const double length = enter_mesh(scene, inside, ray);
+            if (!decide(scene, ray, at, hit)) continue;
+            hit.t = hit.t / length;
+            if (!(hit.t >= t_min)) continue;
+            bool tie = hit.t == t;
+            if (tie && place >= 0)
+                tie = NESTED && inside != instance ? inside < instance
+                                                   : scene.faces[at] < scene.faces[place];
+            const int mesh = NESTED ? (int)scene.instances[RECORD * (Count)inside + 19] : 0;
+            if ((hit.t < t || tie) && (!MASKED || opaque(scene, mesh, at, hit))) {
                 t = hit.t;
                 place = at;
-                w.to = fminf(w.to, limit(t, w.entry));
+                instance = inside;
+                w.to = fminf(w.to, limit(t * length, w.entry));
             }
         }
         one = two = -1;
     }
 };
 
-// Offer all triangles that the ray may hit and that may be the closest. Nodes and triangles have
-// separate loops (Aila and Laine, 2009), so that the rays of a warp do the same work at a time.
+// Offer all triangles of an instance that the ray may hit and that may be the closest. Nodes and
+// triangles have separate loops (Aila and Laine, 2009), so that the rays of a warp do the same work
+// at a time.
 template <class Rays>
-__device__ __forceinline__ void walk(
-    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max, Closest& best)
+__device__ __forceinline__ void visit(
+    const Scene& scene, const Rays& rays, Count i, int inside, double t_min, Waiting* stack,
+    int bottom, Closest& best)
 {
+    const double* record = scene.instances + RECORD * (Count)inside;
+    Ray ray = rays.load(scene, i);
+    const double length = enter_mesh(scene, inside, ray);
     Walk w;
-    if (!begin(scene, rays.load(scene, i), t_min, t_max, w)) return;
-    Waiting stack[STACK];
-    int top = 0, node = 0;
+    if (!begin(NESTED ? record + 12 : scene.frame + 4, ray, t_min * length, best.t * length, w))
+        return;
+    int top = bottom, node = NESTED ? (int)record[18] : 0;
     do {
         bool room = true;
         while (node != DONE && room) {
-            while (node >= 0) node = descend(scene.nodes, node, w, stack, top);
+            while (node >= 0) node = descend(scene.nodes, node, w, stack, top, bottom);
             while (node < 0 && node != DONE && room) {
                 const int leaf = ~node, place = leaf >> LEAF_BITS;
                 Guess guess;
@@ -479,85 +548,132 @@ __device__ __forceinline__ void walk(
                     room = best.offer(place, guess, w);
                 // The rest of the leaf, one triangle on and one less.
                 const bool more = leaf & ((1 << LEAF_BITS) - 1);
-                node = more ? ~(leaf + (1 << LEAF_BITS) - 1) : pop(stack, top, w.to);
+                node = more ? ~(leaf + (1 << LEAF_BITS) - 1) : pop(stack, top, bottom, w.to);
             }
         }
-        best.settle(scene, rays, i, t_min, w);
+        best.settle(scene, rays, i, inside, t_min, w);
     } while (node != DONE);
+}
+
+// Go on from the nodes of the top that wait to the next instance, the nearest that the ray may hit;
+// DONE if there is none.
+//
+// The ray is prepared again: keeping it while an instance is visited takes twice the registers.
+template <class Rays>
+__device__ __forceinline__ int next_instance(
+    const Scene& scene, const Rays& rays, Count i, double t_min, double t_max,
+    Waiting* stack, int& top)
+{
+    Walk w;
+    if (!begin(scene.frame + 4, rays.load(scene, i), t_min, t_max, w)) return DONE;
+    int node = pop(stack, top, 0, w.to);
+    while (node >= 0) node = descend(scene.top, node, w, stack, top, 0);
+    return node == DONE ? DONE : ~node >> LEAF_BITS;
+}
+
+template <class Rays>
+__device__ __forceinline__ void walk(
+    const Scene& scene, const Rays& rays, Count i, double t_min, Closest& best)
+{
+    Waiting stack[STACK];
+    if (!NESTED) {
+        visit(scene, rays, i, 0, t_min, stack, 0, best);
+        return;
+    }
+    const Waiting root = {0, 0.0f};
+    stack[0] = root;
+    int top = 1, instance;
+    while ((instance = next_instance(scene, rays, i, t_min, best.t, stack, top)) != DONE)
+        visit(scene, rays, i, instance, t_min, stack, top, best);
 }
 
 // ---- kernels: scene, rays in, hits out ----
 
-// Closest hits of rays from memory: local distance and row of the tables; -1 for a miss, whose
-// distance is not written.
+// Closest hits of rays from memory: local distance, row of the tables, and instance, which is
+// written only for scenes that have any; the row is -1 for a miss, of which nothing else is written.
 KERNEL cast_table(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
-    const double* __restrict__ frame,
+    const float* __restrict__ uvs, const unsigned char* __restrict__ masks,
+    const Count* __restrict__ opacity,
+    const double* __restrict__ frame, const float4* __restrict__ top,
+    const double* __restrict__ instances,
     const double* __restrict__ origins, int origin_stride,
     const double* __restrict__ directions, Count count, double t_min, double t_max,
-    double* __restrict__ distance, int* __restrict__ place)
+    double* __restrict__ distance, int* __restrict__ place, int* __restrict__ instance)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (i >= count) return;
-    const Scene scene = {nodes, triangles, corners, faces, frame};
+    const Scene scene = {nodes, triangles, corners, faces, uvs,
+                         masks, opacity,   frame,   top,   instances};
     const TableRays rays = {origins, origin_stride, directions};
     Closest best(t_max);
-    walk(scene, rays, i, t_min, t_max, best);
+    walk(scene, rays, i, t_min, best);
     place[i] = best.place;
     if (best.place >= 0) distance[i] = best.t;
+    if (NESTED && best.place >= 0) instance[i] = best.instance;
 }
 
 // Closest hits of a pattern's rays from one pose after another; otherwise as cast_table.
 KERNEL cast_pattern(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,
-    const double* __restrict__ frame,
+    const float* __restrict__ uvs, const unsigned char* __restrict__ masks,
+    const Count* __restrict__ opacity,
+    const double* __restrict__ frame, const float4* __restrict__ top,
+    const double* __restrict__ instances,
     const double* __restrict__ positions, const double* __restrict__ rotations,
     const double* __restrict__ directions, const double* __restrict__ origins,
     Count rows, Count first, int left, int each, int turned, int shifted,
     const double* __restrict__ delays, const double* __restrict__ rates, int moving,
     Count count, double t_min, double t_max,
-    double* __restrict__ distance, int* __restrict__ place)
+    double* __restrict__ distance, int* __restrict__ place, int* __restrict__ instance)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (i >= count) return;
-    const Scene scene = {nodes, triangles, corners, faces, frame};
+    const Scene scene = {nodes, triangles, corners, faces, uvs,
+                         masks, opacity,   frame,   top,   instances};
     const PatternRays rays = {positions, rotations, directions, origins, rows,
                               first,     left,      each,       turned,  shifted,
                               delays,    rates,     moving};
     Closest best(t_max);
-    walk(scene, rays, i, t_min, t_max, best);
+    walk(scene, rays, i, t_min, best);
     place[i] = best.place;
     if (best.place >= 0) distance[i] = best.t;
+    if (NESTED && best.place >= 0) instance[i] = best.instance;
 }
 
 // Weights of the second and third corner for hits of cast_table, one a ray that is listed.
 KERNEL weigh_table(
     const double* __restrict__ corners, const double* __restrict__ frame,
+    const double* __restrict__ instances,
     const double* __restrict__ origins, int origin_stride,
     const double* __restrict__ directions,
-    const unsigned int* __restrict__ ray, const int* __restrict__ place, Count count,
-    double* __restrict__ u, double* __restrict__ v)
+    const unsigned int* __restrict__ ray, const int* __restrict__ place,
+    const int* __restrict__ instance, Count count, double* __restrict__ u, double* __restrict__ v)
 {
     const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (k >= count) return;
-    const Scene scene = {0, 0, corners, 0, frame};
+    const Scene scene = {0, 0, corners, 0, 0, 0, 0, frame, 0, instances};
     const TableRays rays = {origins, origin_stride, directions};
+    Ray at = rays.load(scene, ray[k]);
+    enter_mesh(scene, NESTED ? instance[ray[k]] : 0, at);
     Exact hit;
-    decide(scene, rays.load(scene, ray[k]), place[ray[k]], hit);
+    decide(scene, at, place[ray[k]], hit);
     u[k] = hit.b / hit.det;
     v[k] = hit.c / hit.det;
 }
 
 // ---- compaction of hits ----
 
-// Compact hits, in ray order: number of the ray, distance in metres, the caller's triangle.
+// Compact hits, in ray order: number of the ray, distance in metres, the caller's triangle, instance.
 // `ends` are the inclusive sums of hits up to each ray.
 KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
-    const int* __restrict__ place, const int* __restrict__ ends, Count count, double scale,
-    unsigned int* __restrict__ ray, double* __restrict__ metres, int* __restrict__ triangle)
+    const int* __restrict__ place, const int* __restrict__ instance,
+    const int* __restrict__ ends, Count count, double scale,
+    unsigned int* __restrict__ ray, double* __restrict__ metres, int* __restrict__ triangle,
+    int* __restrict__ which)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
     if (i >= count || place[i] < 0) return;
@@ -565,4 +681,5 @@ KERNEL pack(
     ray[k] = (unsigned int)i;
     metres[k] = distance[i] / scale;
     triangle[k] = faces[place[i]];
+    which[k] = NESTED ? instance[i] : 0;
 }

@@ -1,14 +1,17 @@
-"""A mesh and its tree as the tables that intersect.cu reads."""
+"""Meshes, instances and their trees as the tables that intersect.cu reads."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .instances import Scene
 from .mesh import LocalMesh
-from .tree import WideTree, build_tree
+from .opacity import Masks, join_masks
+from .tree import WideTree, build_top, build_tree, join
 
 _WIDTH = 4  # seven float4 a node: one 128-byte line
 _LEAF_SIZE = 4
@@ -18,7 +21,7 @@ _FLOOR = 1e-35  # products of tiny edges are off by less where float32 underflow
 
 @dataclass(frozen=True)
 class Layout:
-    """Tables for the device; see the head of intersect.cu for what their columns hold.
+    """Tables of meshes; see the head of intersect.cu for what their columns hold.
 
     Attributes
     ----------
@@ -30,32 +33,79 @@ class Layout:
         float64 (k, 9).
     faces
         int32 (k,).
-    frame
-        float64 (10,).
+    roots
+        int64 (meshes,): the node at which the tree of each mesh begins.
     stack
-        Most nodes that can wait during a traversal.
+        Most nodes that can wait during a traversal of a mesh.
+    masks
+        Opacities of the triangles, in the same order; None if all are opaque.
     """
 
     nodes: NDArray[np.float32]
     triangles: NDArray[np.float32]
     corners: NDArray[np.float64]
     faces: NDArray[np.int32]
+    roots: NDArray[np.int64]
+    stack: int
+    masks: Masks | None
+
+
+@dataclass(frozen=True)
+class Places:
+    """Tables that say where the meshes are.
+
+    Attributes
+    ----------
+    top
+        float32 (m, 32): nodes over the instances.
+    instances
+        float64 (n, 20).
+    frame
+        float64 (10,), of the scene.
+    stack
+        Most nodes of `top` that can wait.
+    """
+
+    top: NDArray[np.float32]
+    instances: NDArray[np.float64]
     frame: NDArray[np.float64]
     stack: int
 
 
-def lay_out(mesh: LocalMesh) -> Layout:
-    """Build the tree over a mesh and flatten both."""
-    tree = build_tree(mesh.corners, _WIDTH, _LEAF_SIZE)
-    corners = mesh.corners[tree.order]
+def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
+    """Build the trees over meshes and flatten all."""
+    trees = [build_tree(mesh.corners, _WIDTH, _LEAF_SIZE) for mesh in meshes]
+    tree, roots = join(trees)
+    corners = [mesh.corners[t.order] for mesh, t in zip(meshes, trees, strict=True)]
+    faces = [mesh.index[t.order] for mesh, t in zip(meshes, trees, strict=True)]
     return Layout(
         _nodes(tree),
-        _records(corners),
-        corners.reshape(-1, 9),
-        mesh.index[tree.order],
-        np.concatenate([mesh.centre, [mesh.scale], *mesh.box]),
-        _stack_need(tree),
+        _joined([_records(table) for table in corners]),
+        _joined(corners).reshape(-1, 9),
+        _joined(faces),
+        roots,
+        max(map(_stack_need, trees)),
+        join_masks([mesh.opacity for mesh in meshes], [tree.order for tree in trees]),
     )
+
+
+def lay_out_places(scene: Scene, roots: NDArray[np.int64]) -> Places:
+    """Build the tree over the instances; a plain scene has none, and tables that are not read."""
+    if scene.matrices is None:
+        return Places(np.zeros((1, 32), np.float32), np.zeros((1, 20)), scene.frame.table, 0)
+    tree = build_top(scene.boxes, _WIDTH)
+    instances = np.zeros((len(scene.mesh), 20))
+    instances[:, :12] = scene.matrices
+    frames = [mesh.frame for mesh in scene.meshes]
+    boxes = np.array([[*frame.low, *frame.high] for frame in frames])
+    instances[:, 12:18], instances[:, 18] = boxes[scene.mesh], roots[scene.mesh]
+    instances[:, 19] = scene.mesh
+    # One more: the top's root waits like the others.
+    return Places(_nodes(tree), instances, scene.frame.table, _stack_need(tree) + 1)
+
+
+def _joined(tables: list[NDArray[Any]]) -> NDArray[Any]:
+    return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
 def _nodes(tree: WideTree) -> NDArray[np.float32]:

@@ -1,25 +1,30 @@
-"""A triangle mesh in the caster's own coordinates."""
+"""A triangle mesh in coordinates of its own."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .opacity import LocalOpacity, Opacity, check_opacity
 from .rays import finite_rows, real_rows, refuse_rows
 from .tree import PAD
 
+# A ray that starts farther from zero than this, in local units, is started at the scene's box:
+# float32 then rounds by the scene's size, not by the distance to it.
+NEAR = 2.0
 TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
+
+Float = NDArray[np.float64]
 
 _BLOCK = 1 << 16  # triangles that are processed together
 
 
 @dataclass(frozen=True)
-class LocalMesh:
-    """Triangles moved to the middle of their box and scaled into [-1, 1].
+class Frame:
+    """Local coordinates: moved to the middle of a box and scaled into [-1, 1].
 
     The translation makes coordinates of hundreds of kilometres accurate enough in float32; the
     scale is a power of two, so it rounds nothing, and makes every error bound of the
@@ -28,9 +33,62 @@ class LocalMesh:
     Attributes
     ----------
     centre
-        float64 (3,), metres: subtracted from the vertices.
+        float64 (3,), metres: subtracted from points.
     scale
         Local units in one metre, a power of two.
+    low, high
+        float64 (3,): least and greatest local coordinates of what is hit, padded as in the tree.
+    """
+
+    centre: Float
+    scale: float
+    low: Float
+    high: Float
+
+    def to_local(self, points: Float) -> Float:
+        """Points (n, 3) in metres to local coordinates."""
+        return (points - self.centre) * self.scale
+
+    @property
+    def table(self) -> Float:
+        """Centre, scale, low and high, as compiled code reads them: float64 (10,)."""
+        return np.concatenate([self.centre, [self.scale], self.low, self.high])
+
+
+def clip(low: Float, high: Float, origins: Float, directions: Float) -> tuple[Float, Float]:
+    """Local distances at which rays enter (0 when they start inside) and leave a box.
+
+    A ray meets the box where ``entry <= leave``.
+
+    Parameters
+    ----------
+    low, high
+        (3,), or (3, n) for a box for each ray.
+    origins
+        (n, 3) or (1, 3), local.
+    directions
+        (n, 3), unit vectors.
+    """
+    entry = np.zeros(len(directions))
+    leave = np.full(len(directions), np.inf)
+    for axis in range(3):
+        along = directions[:, axis]
+        along = np.where(np.abs(along) < TINY, np.copysign(TINY, along), along)
+        one = (low[axis] - origins[:, axis]) / along
+        two = (high[axis] - origins[:, axis]) / along
+        np.maximum(entry, np.minimum(one, two), out=entry)
+        np.minimum(leave, np.maximum(one, two), out=leave)
+    return entry, leave
+
+
+@dataclass(frozen=True)
+class LocalMesh:
+    """Triangles in local coordinates.
+
+    Attributes
+    ----------
+    frame
+        Of the mesh.
     points, rows
         Vertices, float64 (v, 3), local; and int64 (k, 3), the rows of the three of each
         triangle. Triangles without an area are left out.
@@ -40,55 +98,21 @@ class LocalMesh:
         int32 (k,): the row of `faces` that each triangle came from.
     face_count
         Rows of `faces`.
+    opacity
+        Of the triangles, if parts of them are transparent.
     """
 
-    centre: NDArray[np.float64]
-    scale: float
-    points: NDArray[np.float64]
+    frame: Frame
+    points: Float
     rows: NDArray[np.int64]
-    corners: NDArray[np.float64]
+    corners: Float
     index: NDArray[np.int32]
     face_count: int
-
-    def to_local(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Points (n, 3) in metres to local coordinates."""
-        return (points - self.centre) * self.scale
-
-    @cached_property
-    def box(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Least and greatest local coordinates of all triangles, padded as in the tree: (3,)."""
-        points = self.corners.reshape(-1, 3)
-        return points.min(axis=0) - PAD, points.max(axis=0) + PAD
-
-    def clip(
-        self, origins: NDArray[np.float64], directions: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Local distances at which rays enter (0 when they start inside) and leave the box.
-
-        A ray meets the box where ``entry <= leave``.
-
-        Parameters
-        ----------
-        origins
-            (n, 3) or (1, 3), local.
-        directions
-            (n, 3), unit vectors.
-        """
-        low, high = self.box
-        entry = np.zeros(len(directions))
-        leave = np.full(len(directions), np.inf)
-        for axis in range(3):
-            along = directions[:, axis]
-            along = np.where(np.abs(along) < TINY, np.copysign(TINY, along), along)
-            one = (low[axis] - origins[:, axis]) / along
-            two = (high[axis] - origins[:, axis]) / along
-            np.maximum(entry, np.minimum(one, two), out=entry)
-            np.minimum(leave, np.maximum(one, two), out=leave)
-        return entry, leave
+    opacity: LocalOpacity | None = None
 
 
-def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
-    """Check a mesh and convert it to local coordinates; `RayCaster` lists the errors.
+def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = None) -> LocalMesh:
+    """Check a mesh and convert it to local coordinates; `Mesh` lists the errors.
 
     Parameters
     ----------
@@ -96,6 +120,8 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
         (v, 3) real and finite, metres.
     faces
         (f, 3) integers: rows of `vertices`.
+    opacity
+        Where the triangles are opaque; None for everywhere.
     """
     points = real_rows("vertices", vertices)
     rows = _check_faces(faces, len(points))
@@ -103,10 +129,7 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
     points = points.astype(np.float64)
     used = np.zeros(len(points), np.bool_)
     used[rows.reshape(-1)] = True
-    low, high = points[used].min(axis=0), points[used].max(axis=0)
-    centre = low / 2 + high / 2
-    half = float(np.maximum(high - centre, centre - low).max())
-    scale = math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
+    centre, scale = middle(points[used].min(axis=0), points[used].max(axis=0))
     points = (points - centre) * scale
     corners = points[rows]
     solid = np.concatenate(
@@ -118,7 +141,18 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike) -> LocalMesh:
     face_count = len(rows)
     if len(index) < face_count:
         rows, corners = rows[solid], corners[solid]
-    return LocalMesh(centre, scale, points, rows, corners, index, face_count)
+    hit = corners.reshape(-1, 3)
+    low, high = hit.min(axis=0) - PAD, hit.max(axis=0) + PAD
+    frame = Frame(centre, scale, low, high)
+    checked = None if opacity is None else check_opacity(opacity, face_count, index)
+    return LocalMesh(frame, points, rows, corners, index, face_count, checked)
+
+
+def middle(low: Float, high: Float) -> tuple[Float, float]:
+    """Centre and scale of the frame of a box (3,), metres."""
+    centre = low / 2 + high / 2
+    half = float(np.maximum(high - centre, centre - low).max())
+    return centre, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
 
 
 def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cached_property
 from operator import index
 
 import numpy as np
@@ -10,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from .poses import Motion, Poses, check_poses
 from .rays import check_origins, unit_directions
 
+_MOST_STEP = 1 << 10  # beams of a lidar, by far
 _BLOCK = 1 << 14  # rays that are made at a time: their arrays stay in a core's cache
 
 
@@ -66,6 +68,20 @@ class Pattern:
     def origins(self) -> NDArray[np.float64] | None:
         """Starts of the rays (n, 3), metres, read-only and contiguous as `directions`; or None."""
         return None if self._origins is None else self._origins.T
+
+    @cached_property
+    def step(self) -> int:
+        """Rows from a ray to its neighbour along a ring: the step at which rays differ least."""
+        rows = len(self)
+        steps = np.arange(1, min(rows // 32, _MOST_STEP) + 1)
+        if not len(steps):
+            return 1
+        samples = np.arange(32) * (rows // 32)
+        apart = samples[:, None] + np.array([[1], [8], [15]])[:, :, None] * steps  # (3, 32, steps)
+        cosines = np.zeros(apart.shape)
+        for axis in self._directions:
+            cosines += axis[samples][:, None] * axis[apart % rows]
+        return int(steps[np.argmax(cosines.min(axis=0).mean(axis=0))])
 
     def rays(
         self,

@@ -115,7 +115,7 @@ class Collector:
     scan
         Says what to keep and what to count.
     face_count
-        Number of the mesh's triangles.
+        Rows of the tally.
 
     Examples
     --------
@@ -166,10 +166,10 @@ class Collector:
         rows += self._every * np.arange(len(rows))
         return rows
 
-    def tally(self, triangle: NDArray[np.int32]) -> None:
-        """Count all hits of a chunk by triangle, if requested."""
+    def tally(self, rows: NDArray[np.integer[Any]]) -> None:
+        """Count all hits of a chunk by their rows in the tally, if requested."""
         if self._tally is not None:
-            np.add.at(self._tally, triangle.astype(np.intp), 1)
+            np.add.at(self._tally, rows.astype(np.intp), 1)
 
     def add(
         self,
@@ -177,11 +177,14 @@ class Collector:
         ray: NDArray[np.integer[Any]],
         distance: NDArray[np.float64],
         triangle: NDArray[np.int32],
+        instance: NDArray[np.int32],
     ) -> None:
         """Add kept hits of a chunk, whose rays are counted from `start`."""
         number = ray.astype(np.uint32, copy=False)
-        self._kept.append((number + np.uint32(start) if start else number, distance, triangle))
+        number = number + np.uint32(start) if start else number
+        self._kept.append((number, distance, triangle, instance))
 
     def result(self) -> ScanReturns:
         """Return the result of all chunks."""
-        return ScanReturns(*joined(self._kept), self._hits, self._tally)
+        ray, distance, triangle, instance = joined(self._kept)
+        return ScanReturns(ray, distance, triangle, self._hits, self._tally, instance)

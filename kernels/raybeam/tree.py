@@ -46,12 +46,12 @@ class WideTree:
 
 
 def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> WideTree:
-    """Build a tree over triangles.
+    """Build a tree over triangles, or over boxes.
 
     Parameters
     ----------
     corners
-        float64 (k, 3, 3): local corners.
+        float64 (k, c, 3): local corners; of a box, the least and the greatest.
     width
         Most children of a node.
     leaf_size
@@ -67,6 +67,41 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
     order[first[:n]] = np.arange(n, dtype=np.int32)
     code = np.where(leaf, ~(first << LEAF_BITS | (count - 1)), 0).astype(np.int32)
     return _widen(binary, leaf, code, order, width)
+
+
+def build_top(boxes: NDArray[np.float64], width: int) -> WideTree:
+    """Build a tree over instances' boxes (n, 2, 3), as `build_tree`, for one box a leaf.
+
+    Its leaves' places are the instances' own numbers.
+    """
+    tree = build_tree(boxes, width, 1)
+    number = tree.order[np.maximum(~tree.child, 0) >> LEAF_BITS]
+    child = np.where(tree.child < 0, ~(number << LEAF_BITS), tree.child)
+    return WideTree(tree.low, tree.high, child, np.arange(len(boxes), dtype=np.int32))
+
+
+def join(trees: list[WideTree]) -> tuple[WideTree, NDArray[np.int64]]:
+    """Put trees one after the other; returns them as one, and the root of each.
+
+    Triangles are numbered over all trees, in order.
+    """
+    roots = np.cumsum([0, *(len(tree.child) for tree in trees)])
+    if len(trees) == 1:
+        return trees[0], roots[:1]
+    first = np.cumsum([0, *(len(tree.order) for tree in trees)])
+    return WideTree(
+        np.concatenate([tree.low for tree in trees]),
+        np.concatenate([tree.high for tree in trees]),
+        np.concatenate(
+            [
+                np.where(tree.child < 0, tree.child - (f << LEAF_BITS), tree.child + root)
+                for tree, f, root in zip(trees, first[:-1], roots[:-1], strict=True)
+            ]
+        ).astype(np.int32),
+        np.concatenate([t.order + f for t, f in zip(trees, first[:-1], strict=True)]).astype(
+            np.int32
+        ),
+    ), roots[:-1]
 
 
 def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:

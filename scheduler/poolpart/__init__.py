@@ -1,7 +1,7 @@
 """Pool partitions and pipes for Dask clusters."""
 
 from .clusters import start_partitions
-from .devices import assign_devices, own_device
+from .devices import own_device
 from .errors import PipeClosed, PipeFailed, PoolError
 from .fetch import fetch_available, hold_for_driver, take_held
 from .local import local_cluster
@@ -34,7 +34,6 @@ __all__ = [
     "WorkerInfo",
     "WorkerLeft",
     "ask_workers",
-    "assign_devices",
     "fetch_available",
     "forget_pipes",
     "hold_for_driver",

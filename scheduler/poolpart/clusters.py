@@ -16,8 +16,7 @@ from distributed.deploy import ssh
 from tornado.ioloop import PeriodicCallback
 
 from .errors import PoolError
-from .local import check_count
-from .rules import check_name
+from .rules import check_count, check_name
 
 logger = logging.getLogger(__name__)
 
@@ -98,7 +97,7 @@ def start_partitions(
             check_count(f"The number of workers of partition {name!r}", count, least=0)
             for number in range(count):
                 worker = f"{name}-{number}"
-                workers[worker] = describe(cluster, worker, number, {name: slots}, own)
+                workers[worker] = describe(cluster, worker, name, slots, number, own)
         except (TypeError, ValueError) as error:
             raise PoolError(f"Partition {name!r} cannot be started: {error}") from error
 
@@ -175,20 +174,17 @@ class _JobLogs:
 
 
 def _jobs(
-    cluster: Any, name: str, number: int, resources: Mapping[str, int], own: Mapping[str, Any]
+    cluster: Any, name: str, partition: str, slots: int, number: int, own: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Describe a job as a cluster of dask-jobqueue does."""
     options = {**cluster.new_spec["options"], **own}
-    for option, default in (
-        ("processes", 1),
-        ("worker_extra_args", []),
-        ("log_directory", None),
-    ):
+    defaults = {"processes": 1, "worker_extra_args": [], "log_directory": None}
+    for option, default in defaults.items():
         if options.get(option) is None:
             key = f"jobqueue.{options['config_name']}.{option}"
             options[option] = dask.config.get(key, None) or default
-    declared = [f"{partition}={slots}" for partition, slots in resources.items()]
-    options["worker_extra_args"] = [*options["worker_extra_args"], "--resources", *declared]
+    declared = ["--resources", f"{partition}={slots}"]
+    options["worker_extra_args"] = [*options["worker_extra_args"], *declared]
     cluster.job_cls(cluster.scheduler_address, name=name, **options)  # that it takes them
     processes = options["processes"]
     group = {"group": [f"-{process}" for process in range(processes)]} if processes > 1 else {}
@@ -196,18 +192,15 @@ def _jobs(
 
 
 def _processes(
-    cluster: Any, name: str, number: int, resources: Mapping[str, int], own: Mapping[str, Any]
+    cluster: Any, name: str, partition: str, slots: int, number: int, own: Mapping[str, Any]
 ) -> dict[str, Any]:
     """Describe a worker as an SSHCluster does."""
-    options = {
-        key: cluster.scheduler_spec["options"][key] for key in ("connect_options", "remote_python")
-    }
-    options |= own
+    common = cluster.scheduler_spec["options"]
+    options = {key: common[key] for key in ("connect_options", "remote_python")} | dict(own)
     hosts: Sequence[str] = options.pop("hosts", ())
     if isinstance(hosts, str) or not hosts:
         raise ValueError('it needs "hosts", a list of those that its workers are to be on.')
-    threads = max(resources.values())
-    kwargs = {"name": name, "nthreads": threads, "resources": dict(resources)}
+    kwargs = {"name": name, "nthreads": slots, "resources": {partition: slots}}
     kwargs["death_timeout"] = _DEATH_S  # not every SSH server ends processes for its client
     options["kwargs"] = kwargs | options.pop("worker_options", {})
     options["address"] = hosts[number % len(hosts)]

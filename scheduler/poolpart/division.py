@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from dataclasses import replace
 from typing import Any
 
 from distributed import Client
@@ -18,15 +19,16 @@ from .fence import enclose, lower
 from .inherit import begin_inheritance, end_inheritance, workers_told
 from .internals import asks_for, lift_restrictions
 from .page import close_page
-from .rules import Rule
+from .rules import Rule, check_count, divide
 from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of
-from .workers import on_scheduler
+from .workers import WorkerInfo, on_scheduler
 
 PATIENCE_S = 60.0  # for a worker to answer
 _RETURN_S = 10.0  # for workers to declare their former resources, at least
 _STAY_S = 1.0  # for workers that could not be moved to be members again
 _LOOK_EVERY_S = 0.05  # between looks for tasks that have not ended
+_MOVES = "The number of workers to move"
 _UNFINISHED = ("waiting", "queued", "no-worker", "processing")
 
 
@@ -55,39 +57,51 @@ async def _answer(
 async def declare(
     steward: Steward,
     rules: Mapping[str, Rule],
-    chosen: Mapping[str, Sequence[str]],
+    now: Mapping[str, Rule],
+    pool: Mapping[str, tuple[str, ...]],
     seen: Collection[str],
-    gpus: Mapping[str, Sequence[str]],
-) -> str:
+) -> tuple[dict[str, str], list[WorkerInfo]]:
     """Make partitions, and follow their rules from now on; all or none.
 
-    `chosen` are addresses of the first workers, `seen` the partitions that the client saw when it
-    chose, `gpus` the devices of the workers. Returns a note on all partitions, or ""; PoolError if
-    a worker left meanwhile, another client has put it into a partition or made a partition of this
-    name, or other workers have it.
+    `now` are the rules by which workers are chosen at first, `pool` the devices of the workers to
+    choose from, by name, and `seen` the partitions that the client knew of. Returns notes by
+    partition, and the workers that are left. PoolError if there are too few workers, if others have
+    a partition of this name, or if a worker leaves meanwhile.
     """
     # Up to the first await nothing else happens on the scheduler.
-    seats = {name: [_seat(steward, name, a) for a in chosen[name]] for name in rules}
+    seats = {s.info.address: s for s in steward.seats.values() if not s.away}
+    there = [replace(seat.info, resources=steward.wanted(seat)) for seat in seats.values()]
+    # By name: a restarted worker has another address.
+    mine = [worker.with_gpus(pool[worker.name]) for worker in there if worker.name in pool]
+    chosen, notes = divide(now, mine)
     for name in rules:
-        _check_sole(steward, name, seats[name], seen)
-    note = _begin(steward, rules)
-    for address, devices in gpus.items():
-        if devices and (seat := steward.seat_at(address)):
-            seat.info = seat.info.with_gpus(devices)
+        members = {worker.address for worker in there if name in worker.partitions}
+        # One that the client knew of can be made again, of all of it.
+        if others := members - ({w.address for w in chosen[name]} if name in seen else set()):
+            raise PoolError(
+                f"Partition {name!r} exists already, with {names_of(seats[a] for a in others)}, "
+                "which this call did not see, or does not choose: use "
+                f"Pool.partitions()[{name!r}] of a new pool, or give another name."
+            )
+    common = _begin(steward, rules)
+    for worker in mine:
+        if worker.gpus:
+            seats[worker.address].info = seats[worker.address].info.with_gpus(worker.gpus)
     for name, rule in rules.items():
         steward.enter(name, rule)
-        for seat in seats[name]:
-            steward.put(seat, name, rule.slots_of(seat.info))
+        for worker in chosen[name]:
+            steward.put(seats[worker.address], name, rule.slots_of(worker))
     await workers_told()  # before they get tasks
-    everyone = [seat for group in seats.values() for seat in group]
-    late = await steward.arrive(everyone, PATIENCE_S)
-    if away := [seat for seat in everyone if seat in late or seat.gone]:
+    taken = [seats[worker.address] for group in chosen.values() for worker in group]
+    late = await steward.arrive(taken, PATIENCE_S)
+    if away := [seat for seat in taken if seat in late or seat.gone]:
         raise PoolError(
             f"{names_of(away)} left, or did not answer, when assigned to partition "
             f"{' and '.join(sorted({str(seat.partition) for seat in away}))}; the other workers "
             "were assigned. Make a new pool to divide it again."
         )
-    return note
+    told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
+    return told, [worker for worker in mine if seats[worker.address] not in taken]
 
 
 def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
@@ -109,39 +123,6 @@ def _begin(steward: Steward, rules: Mapping[str, Rule]) -> str:
     return note
 
 
-def _seat(steward: Steward, name: str, address: str) -> Seat:
-    seat = steward.seat_at(address)
-    if seat is None:
-        raise PoolError(
-            f"The worker at {address} could not be put into partition {name!r}: it has left. "
-            "Make a new pool and divide that."
-        )
-    if others := sorted(_declared_by(steward, seat) - {name}):
-        raise PoolError(
-            f"Worker {seat.info.name} already declares {', '.join(others)}; a worker belongs to "
-            f"one partition. If another client has just put it there, make a new pool "
-            "(Pool.from_client) and divide what is left."
-        )
-    return seat
-
-
-def _check_sole(steward: Steward, name: str, chosen: Sequence[Seat], seen: Collection[str]) -> None:
-    """Refuse a partition that others have; one that was seen can be made again, of all of it."""
-    seats = steward.seats.values()
-    members = [s for s in seats if not s.away and name in _declared_by(steward, s)]
-    if others := [seat for seat in members if name not in seen or seat not in chosen]:
-        raise PoolError(
-            f"Partition {name!r} exists already, with {names_of(others)}, which this call did "
-            f"not see, or does not choose: use Pool.partitions()[{name!r}] of a new pool, or give "
-            "another name."
-        )
-
-
-def _declared_by(steward: Steward, seat: Seat) -> set[str]:
-    """Partitions that a worker belongs to, or soon will."""
-    return {name for name, slots in steward.wanted(seat).items() if slots}
-
-
 # -- moving workers --------------------------------------------------------------------
 #
 # A worker that leaves gets no new tasks of its partition; waiting tasks go to other members,
@@ -152,7 +133,7 @@ async def grow(
     steward: Steward, name: str, count: int, source: str | None, timeout_s: float
 ) -> list[str]:
     """Move workers into a partition; see `Partition.grow`. Returns their names."""
-    _check(count)
+    check_count(_MOVES, count)
     steward.adopt(name)
     if source == name:
         raise PoolError(f"Partition {name!r} cannot take workers from itself.")
@@ -174,7 +155,7 @@ async def grow(
 
 async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> list[str]:
     """Move workers out of a partition; see `Partition.shrink`. Returns their names."""
-    _check(count)
+    check_count(_MOVES, count)
     steward.adopt(name)
     members, least = _arrived(steward, name), steward.rules[name].minimum
     if len(members) - count < least:
@@ -184,11 +165,6 @@ async def shrink(steward: Steward, name: str, count: int, timeout_s: float) -> l
         )
     target = steward.remainder()
     return await _move(steward, members[:count], None if target == name else target, timeout_s)
-
-
-def _check(count: int) -> None:
-    if not isinstance(count, int) or count < 1:
-        raise PoolError(f"The number of workers to move is {count!r}; give 1 or more.")
 
 
 async def _move(
@@ -213,11 +189,6 @@ async def _move(
         raise PoolError(
             f"{len(late)} of {len(seats)} workers could not be moved within "
             f"{timeout_s:g} s, because their tasks have not ended: {names_of(late)} stay."
-        )
-    # Other moves wait until the workers have arrived; dissolving does not.
-    if target is not None and target not in steward.rules:
-        raise PoolError(
-            f"{names_of(seats)} did not arrive in partition {target!r}, which was dissolved."
         )
     return [seat.info.name for seat in seats if not seat.gone]
 
@@ -285,8 +256,5 @@ async def dissolve(steward: Steward, names: Collection[str] | None, timeout_s: f
 
 
 def _unfinished(scheduler: Any, names: Collection[str]) -> list[Any]:
-    return [
-        task
-        for task in scheduler.tasks.values()
-        if task.state in _UNFINISHED and asks_for(task, names)
-    ]
+    tasks = scheduler.tasks.values()
+    return [task for task in tasks if task.state in _UNFINISHED and asks_for(task, names)]

@@ -133,11 +133,6 @@ class Fences(SchedulerPlugin):
         asked = task.resource_restrictions
         return not asked or self.names.isdisjoint(asked)
 
-    def holds_up(self, task: Any) -> bool:
-        """Whether only fences keep all workers from taking a task."""
-        could: set[Any] = could_take(self.scheduler, task) if self.stop(task) else set()
-        return bool(could) and could <= self.closed
-
     # -- warnings ----------------------------------------------------------------------
 
     def transition(self, key: Any, start: str, finish: str, *args: Any, **kwargs: Any) -> None:
@@ -149,7 +144,10 @@ class Fences(SchedulerPlugin):
             return
         now = time.monotonic()
         task = self.scheduler.tasks[key]
-        if now - self._complained_at < COMPLAIN_EVERY_S or not self.holds_up(task):
+        if now - self._complained_at < COMPLAIN_EVERY_S or not self.stop(task):
+            return
+        could = could_take(self.scheduler, task)
+        if not could or not could <= self.closed:  # it waits also without fences
             return
         self._complained_at = now
         fences = ", ".join(sorted(self.names))

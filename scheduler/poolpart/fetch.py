@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from distributed import Client, get_worker
 
-from .internals import answer_to, as_bytes, ask, ping, take_from_worker, who_has
+from .internals import answer_to, as_bytes, ask, take_from_worker
 
 T = TypeVar("T")
 
@@ -54,7 +54,7 @@ def fetch_available(
         if at is not None:
             return await _take(client, at, list(keys), patience_s)
         try:
-            found = await wait_for(who_has(client, keys), patience_s)
+            found = await wait_for(ask(client, None, "who_has", keys=list(keys)), patience_s)
         except TimeoutError:
             return {}
         by_worker: dict[str, list[str]] = defaultdict(list)
@@ -85,19 +85,13 @@ async def _unless_silent(
         # as slow: on a busy machine that never ended. And a worker keeps each message that nobody
         # reads to its end (the error holds its own stream).
         while not (await asyncio.wait([asking], timeout=patience_s))[0]:
-            if not await _answers(client, address, patience_s):
+            try:
+                await wait_for(ask(client, address, "ping"), patience_s)
+            except (TimeoutError, OSError):
                 return None
         return asking.result()
     finally:
         asking.cancel()
-
-
-async def _answers(client: Client, address: str, patience_s: float) -> bool:
-    try:
-        await wait_for(ping(client, address), patience_s)
-    except (TimeoutError, OSError):
-        return False
-    return True
 
 
 def hold_for_driver(name: str, data: Any) -> str:
@@ -112,24 +106,10 @@ def hold_for_driver(name: str, data: Any) -> str:
 
 
 def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
-    """Fetch what a worker holds under a name, and have the worker forget it.
+    """Fetch bytes that a worker holds under a name, and have the worker forget them.
 
-    Parameters
-    ----------
-    client
-        A client of the cluster.
-    address
-        Address of the worker, as `hold_for_driver` returned it.
-    name
-        Name that the bytes are held under.
-    patience_s
-        Longest time without a sign of life of that worker, in seconds. A transfer may take
-        longer.
-
-    Returns
-    -------
-    bytes-like or None
-        None if they were taken before, or the worker has died.
+    The address is that which `hold_for_driver` returned. Returns None if they were taken before, or
+    the worker has died, or gives no sign of life for so long; a transfer may take longer.
     """
 
     async def take() -> Any:

@@ -89,40 +89,34 @@ class Rules:
     def __init__(self) -> None:
         self._places: list[tuple[Any, str, Any]] = []
 
-    def after(self, owner: Any, name: str, rule: After, *parameters: str) -> None:
+    def after(self, owner: Any, name: str, rule: After, parameter: str) -> None:
         """Call `rule(result, …)` with a method's result and arguments; it returns a result.
 
-        `parameters` are the names of the method's first parameters. PoolError if this version of
-        Dask has no such method; then all rules are removed.
+        `parameter` is the name of the method's only parameter. PoolError if this version of Dask
+        has no such method; then all rules are removed.
         """
-        self._check(owner, name, parameters, in_order=True)
-        self._stand_in(owner, name).after.append(rule)
+        self._stand_in(owner, name, {parameter}).after.append(rule)
         self._places.append((owner, name, rule))
 
     def before(self, owner: Any, name: str, rule: Before, *parameters: str) -> None:
         """Call `rule(keywords)` before a method; it returns the keywords to use."""
-        self._check(owner, name, parameters, in_order=False)
-        self._stand_in(owner, name).before.append(rule)
+        self._stand_in(owner, name, {*parameters}).before.append(rule)
         self._places.append((owner, name, rule))
 
-    def _check(self, owner: Any, name: str, parameters: tuple[str, ...], in_order: bool) -> None:
-        if method := getattr(type(owner), name, None):
-            has = list(inspect.signature(method).parameters)[1:]
-            if has[: len(parameters)] == [*parameters] if in_order else {*parameters} <= {*has}:
-                return
-        self.take_back()
-        raise PoolError(
-            f"{type(owner).__name__} of distributed {distributed.__version__} has no "
-            f"{name}({', '.join(parameters)}), which poolpart needs: use a version that it "
-            "asks for."
-        )
-
-    def _stand_in(self, owner: Any, name: str) -> _Method:
-        method = vars(owner).get(name)
-        if not isinstance(method, _Method):
-            method = _Method(getattr(owner, name))
-            setattr(owner, name, method)
-        return method
+    def _stand_in(self, owner: Any, name: str, parameters: set[str]) -> _Method:
+        method = getattr(type(owner), name, None)
+        if method is None or not parameters <= inspect.signature(method).parameters.keys():
+            self.take_back()
+            raise PoolError(
+                f"{type(owner).__name__} of distributed {distributed.__version__} has no "
+                f"{name}({', '.join(sorted(parameters))}), which poolpart needs: use a version "
+                "that it asks for."
+            )
+        stand_in = vars(owner).get(name)
+        if not isinstance(stand_in, _Method):
+            stand_in = _Method(getattr(owner, name))
+            setattr(owner, name, stand_in)
+        return stand_in
 
     def take_back(self) -> None:
         """Remove these rules."""
@@ -217,7 +211,6 @@ def rule_for_fences(
 
     rules.after(scheduler, "valid_workers", valid_workers, "ts")
     rules.after(scheduler, "decide_worker_rootish_queuing_disabled", rootish, "ts")
-    rule_for_shuffles(rules, scheduler)
     scheduler.idle_task_count = _OpenWorkers(closed, scheduler.idle_task_count)
 
 
@@ -334,9 +327,7 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
     stealing = scheduler.extensions.get("stealing")
     if stealing is None:
         return
-    given: Counter[Any] = (
-        Counter()
-    )  # the new worker; the scheduler counts a task when the old one agrees
+    given = Counter[Any]()  # by new worker: the scheduler counts a task when the old one agrees
     for task in list(worker.processing - worker.long_running):
         if task in asked or task.actor or not asks_for(task, names):
             continue
@@ -507,11 +498,6 @@ def handlers_of(scheduler: Any) -> dict[str, Any]:
     return handlers
 
 
-async def ask_scheduler(client: Client, question: str, **arguments: Any) -> Any:
-    """Call such a handler; None if the scheduler does not have it, which its log tells."""
-    return await getattr(client.scheduler, question)(**arguments)
-
-
 class QueueAndVariable:
     """A `distributed.Queue` and a `distributed.Variable` of one name, used on their scheduler.
 
@@ -568,20 +554,6 @@ def serve_no_longer(scheduler: Any, kind: type[web.Application]) -> None:
     pages[:] = [page for page in pages if not isinstance(page, kind)]
 
 
-def link_from_dashboard(scheduler: Any, page: str, shown: bool) -> None:
-    """List a page in the menu of Dask's own pages, or not; nothing where there is no such menu.
-
-    All of them are made by partial functions that share one dictionary for their template.
-    """
-    for application in scheduler.http_application.applications:
-        for context in getattr(application, "_applications", {}).values():
-            make = getattr(context.application.handlers[0], "_func", None)
-            menus = (one for one in getattr(make, "args", ()) if isinstance(one, dict))
-            pages = next(menus, {}).get("pages", [])
-            if (page in pages) != shown:
-                (pages.append if shown else pages.remove)(page)
-
-
 # -- clients -----------------------------------------------------------------------------
 
 
@@ -601,24 +573,6 @@ def when_done(future: Future, function: Callable[[Future], Any]) -> None:
     future.client.loop.add_callback(wait)
 
 
-async def identities(client: Client) -> dict[str, dict[str, Any]]:
-    """Ask the scheduler for all its workers, by address.
-
-    `Client.scheduler_info(n_workers=-1)` asks too, but returns an attribute, into which the client
-    puts an answer without workers every two seconds: on a busy machine a cluster of hundreds
-    looks empty now and then.
-    """
-    identity: dict[str, Any] = await client.scheduler.identity(n_workers=-1)
-    workers: dict[str, dict[str, Any]] = identity["workers"]
-    return workers
-
-
-async def who_has(client: Client, keys: Collection[str]) -> dict[str, Collection[str]]:
-    """Ask the scheduler which workers have results: {key: addresses}."""
-    found: dict[str, Collection[str]] = await client.scheduler.who_has(keys=list(keys))
-    return found
-
-
 async def take_from_worker(client: Client, address: str, keys: Collection[str]) -> dict[str, Any]:
     """Fetch results straight from a worker, as far as it has them."""
     from distributed.utils_comm import gather_from_workers
@@ -627,19 +581,18 @@ async def take_from_worker(client: Client, address: str, keys: Collection[str]) 
     return dict(data)
 
 
-async def ping(client: Client, address: str) -> None:
-    """Ask a worker for a sign of life."""
-    await client.rpc(address).ping()
-
-
 def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
     """Add a handler to a worker, unless it has it."""
     worker.handlers.setdefault(question, answer)
 
 
-async def ask(client: Client, address: str, question: str, **arguments: Any) -> Any:
-    """Call such a handler of a worker."""
-    return await getattr(client.rpc(address), question)(**arguments)
+async def ask(client: Client, address: str | None, question: str, **arguments: Any) -> Any:
+    """Call such a handler of a worker, or of the scheduler if the address is None.
+
+    None if the scheduler does not have it, which its log tells.
+    """
+    there = client.scheduler if address is None else client.rpc(address)
+    return await getattr(there, question)(**arguments)
 
 
 def as_bytes(data: Any) -> Any:

@@ -19,7 +19,8 @@ from __future__ import annotations
 import threading
 from collections import deque
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
 from typing import Any
 
 from distributed import Status, rejoin, secede
@@ -44,12 +45,12 @@ _waits: list[Waits] = []  # one as long as there are lenders
 _thread = threading.local()
 
 
+@dataclass
 class _Loan:
     """Slots that one task has lent, and whether it has them back."""
 
-    def __init__(self, slots: Resources) -> None:
-        self.slots = slots
-        self.ended = threading.Event()
+    slots: Resources
+    ended: threading.Event = field(default_factory=threading.Event)
 
 
 class Lender:
@@ -101,7 +102,11 @@ def slots_lent(waits: bool = True) -> Iterator[None]:
         return
     loan = _Loan(slots)
     _thread.lends = True
-    has_thread = _leave_pool()
+    has_thread = False
+    # This thread is none of the worker's after `worker_client`, or in an executor of the user's.
+    with suppress(KeyError, AttributeError):
+        secede()
+        has_thread = True
     worker.loop.add_callback(lender.lend, loan)
     try:
         yield
@@ -113,15 +118,6 @@ def slots_lent(waits: bool = True) -> Iterator[None]:
         # Not before: those that have the slots need the worker's threads to end.
         if has_thread and worker.status is not Status.closed:
             rejoin()
-
-
-def _leave_pool() -> bool:
-    """Leave the worker's threads to others; False if this thread is none of them."""
-    try:
-        secede()
-    except (KeyError, AttributeError):  # as worker_client has done; or an executor of the user's
-        return False
-    return True
 
 
 # -- on and off --------------------------------------------------------------------------

@@ -11,7 +11,7 @@ from distributed import Nanny, Scheduler, Security, SpecCluster
 
 from .errors import PoolError
 from .internals import FixedCluster, spare_workers_the_script
-from .rules import check_name
+from .rules import check_count, check_name
 
 LOOPBACK = "127.0.0.1"
 
@@ -128,9 +128,3 @@ def dask_setup(worker: Any) -> None:
     logging.getLogger("distributed.worker").addFilter(
         lambda record: "scheduler during heartbeat" not in str(record.msg)
     )
-
-
-def check_count(name: str, count: object, least: int = 1) -> None:
-    """Check a number; PoolError unless it is whole and large enough."""
-    if not isinstance(count, int) or count < least:
-        raise PoolError(f"{name} is {count!r}; give a whole number, {least} or more.")

@@ -55,21 +55,11 @@ class Chunk:
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of a chunk.
+    """Result of a chunk."""
 
-    Parameters
-    ----------
-    results
-        Results of its first items, at least one; of all, unless one failed or the time was up.
-    seconds
-        Time from start to end.
-    nbytes
-        Estimated size of items and results.
-    """
-
-    results: list[Any]
-    seconds: float
-    nbytes: int
+    results: list[Any]  # of its first items, at least one; of all, unless one failed or time was up
+    seconds: float  # from start to end
+    nbytes: int  # estimated size of items and results
 
 
 def run_chunk(
@@ -188,8 +178,7 @@ class Stage:
     at: int = 0  # number of the argument that is the result of the stage before
 
     def __post_init__(self) -> None:
-        options = (("window", 1), ("chunk", 1), ("retries", 0))
-        for name, least in options:
+        for name, least in (("window", 1), ("chunk", 1), ("retries", 0)):
             value = getattr(self, name)
             if value is not None and (not isinstance(value, int) or value < least):
                 raise ValueError(f"{name} is {value!r}; give a whole number, {least} or more.")
@@ -270,12 +259,11 @@ class Results(Iterator[Any]):
         self._source = ((*row, call) for call, row in zip(calls, before._source, strict=False))
         self._taken = before._taken
         self._look()
-        sent = []
+        sent: dict[Future, Chunk] = {}
         for future, chunk in before._running.items():
-            rows = [(*row, call) for row, call in zip(chunk.rows, calls, strict=False)]
-            if rows:
-                sent.append((future, Chunk(chunk.first, rows)))
-        self._run([chunk for _, chunk in sent], [future for future, _ in sent])
+            if rows := [(*row, call) for row, call in zip(chunk.rows, calls, strict=False)]:
+                sent[future] = Chunk(chunk.first, rows)
+        self._run([*sent.values()], [*sent])
         before._begun = before._closed = True
         before._running.clear()
 
@@ -300,12 +288,6 @@ class Results(Iterator[Any]):
         if self._length == math.inf:
             raise TypeError("The length of a map is that of its iterables; one of them has none.")
         return int(self._length)
-
-    def __enter__(self) -> Results:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __repr__(self) -> str:
         state = "closed" if self._closed else f"{len(self._running)} tasks under way"

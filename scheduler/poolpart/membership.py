@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 from weakref import WeakKeyDictionary
@@ -22,32 +22,18 @@ KEEP_S = 1.0  # a request for each task would take a millisecond
 
 @dataclass(frozen=True)
 class Membership:
-    """Members of a partition at one moment.
+    """Members of a partition at one moment."""
 
-    Parameters
-    ----------
-    names
-        Names of the present members by address.
-    most
-        Most slots of one member, also of one that its nanny is starting again; 0 without members.
-    has_rule
-        Whether the scheduler has a rule for the partition.
-    others
-        Of the workers that were asked for, those that are here and do not belong to it.
-    """
-
-    names: Mapping[str, str]
-    most: float
-    has_rule: bool
-    others: frozenset[str] = frozenset()
+    names: Mapping[str, str]  # of the present members, by address
+    most: float  # slots of one member at most, also of one that its nanny is starting again
+    has_rule: bool  # the scheduler has a rule for the partition
+    strangers: frozenset[str]  # addresses of all other workers
 
 
 _known: WeakKeyDictionary[Client, dict[str, tuple[float, Membership]]] = WeakKeyDictionary()
 
 
-def membership(
-    client: Client, name: str, workers: Collection[str] = (), fresh: bool = False
-) -> Membership:
+def membership(client: Client, name: str, fresh: bool = False) -> Membership:
     """Ask for the members of a partition, at most once a second unless `fresh`.
 
     From then on, tasks from inside tasks of the partition belong to it, if they did not yet, until
@@ -63,7 +49,7 @@ def membership(
     if found is None or fresh or time.monotonic() - when > KEEP_S:
         asked = time.monotonic()
         options = {"asking": client.id, "in_task": task_of_thread() is not None}
-        found = on_scheduler(client, _look, name=name, workers=list(workers), **options)
+        found = on_scheduler(client, _look, name=name, **options)
         known[name] = asked, found
     return found
 
@@ -82,12 +68,11 @@ def check_slots(client: Client, name: str, slots: int, made_by_rule: bool) -> bo
         If it was dissolved, or no member has so many slots. Without any members the task waits:
         the only one may be starting again.
     """
-    found = membership(client, name)
-    if _doubt(found, name, slots, made_by_rule):
-        found = membership(client, name, fresh=True)
-        if doubt := _doubt(found, name, slots, made_by_rule):
-            raise PoolError(doubt)
-    return found.has_rule or made_by_rule
+    for fresh in (False, True):
+        found = membership(client, name, fresh)
+        if not (doubt := _doubt(found, name, slots, made_by_rule)):
+            return found.has_rule or made_by_rule
+    raise PoolError(doubt)
 
 
 def _doubt(found: Membership, name: str, slots: int, made_by_rule: bool) -> str:
@@ -111,12 +96,12 @@ def addresses_of(client: Client, name: str, workers: Sequence[str]) -> list[str]
         If there is no such member. An address at which there is no worker at all is left as it is.
     """
     found = membership(client, name)
-    if unknown := set(workers) - found.names.keys() - set(found.names.values()):
-        found = membership(client, name, unknown, fresh=True)
+    if set(workers) - found.names.keys() - set(found.names.values()):
+        found = membership(client, name, fresh=True)
     addresses = []
     for worker in workers:
         here = [a for a, its_name in found.names.items() if worker in (a, its_name)]
-        if not here and ("://" not in worker or worker in found.others):
+        if not here and ("://" not in worker or worker in found.strangers):
             members = ", ".join(sorted(found.names.values())[:9]) or "none at the moment"
             raise PoolError(
                 f"Worker {worker!r} does not belong to partition {name!r}: give names or "
@@ -126,9 +111,7 @@ def addresses_of(client: Client, name: str, workers: Sequence[str]) -> list[str]
     return addresses
 
 
-async def _look(
-    name: str, workers: Sequence[str], asking: str, in_task: bool, dask_scheduler: Any = None
-) -> Membership:
+async def _look(name: str, asking: str, in_task: bool, dask_scheduler: Any = None) -> Membership:
     steward: Steward | None = dask_scheduler.plugins.get(STEWARD)
     has_rule = steward is not None and name in steward.rules
     here = dask_scheduler.workers
@@ -142,5 +125,5 @@ async def _look(
         if not (in_task and is_inherited(dask_scheduler, name)):
             begin_inheritance([name], dask_scheduler, asking)
         await workers_told()
-    others = frozenset(set(workers) & here.keys() - members.keys())
-    return Membership(members, max(slots, default=0), has_rule, others)
+    strangers = frozenset(here.keys() - members.keys())
+    return Membership(members, max(slots, default=0), has_rule, strangers)

@@ -5,17 +5,16 @@ The scheduler makes it, and it reloads every two seconds, without scripts.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from html import escape
 from typing import Any
 
 from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 from tornado import web
+from tornado.template import Template
 
 from .errors import PoolError
 from .fence import fences_of
-from .internals import link_from_dashboard, serve, serve_no_longer
+from .internals import serve, serve_no_longer
 from .pipe import pipes_of
 from .stats import NAME as STATISTICS
 from .stats import (
@@ -31,9 +30,9 @@ from .workers import on_scheduler
 
 NAME = "poolpart-page"
 PATH = "partitions"
-_LONGEST = 200  # characters of a cell
 
-_HEAD = """<!doctype html>
+# Names come from users: tornado escapes all that is written into a template.
+_PAGE = Template("""<!doctype html>
 <html lang="en">
 <meta charset="utf-8">
 <meta http-equiv="refresh" content="2">
@@ -47,49 +46,36 @@ caption { text-align: left; font-size: 1.2rem; font-weight: 600; }
 th, td { padding: .2rem 1rem .2rem 0; border-bottom: 1px solid #8885; text-align: right; }
 th:first-child, td:first-child { text-align: left; }
 </style>
-"""
-
+{% for title, head, rows in tables %}{% if rows %}<table>
+<caption>{{ title }}</caption>
+<tr>{% for cell in ["", *head] %}<th>{{ cell }}</th>{% end %}</tr>
+{% for row in rows %}<tr>{% for cell in row %}<td>{{ str(cell)[:200] }}</td>{% end %}</tr>
+{% end %}</table>
+{% end %}{% end %}""")
 _COUNTS = ("waiting", "queued", "running", "done", "failed", "seconds")
+_OF_A_WORKER = ("partition", "slots", "busy", "tasks given", "status", "address")
 
 
-def page_of(scheduler: Any) -> str:
+def page_of(scheduler: Any) -> bytes:
     """HTML of the current page."""
-    statistics = statistics_of(scheduler)
     workers = list(scheduler.workers.values())
     names = {name for worker in workers for name, slots in worker.resources.items() if slots}
-    names |= fences_of(scheduler) | {name for name, _ in statistics.tallies if name}
-    partitions = stats_of([*sorted(names), ""], scheduler)
-    stages = [
-        [stage, _shown(p.name), *_counts(counts)]
-        for p in partitions
-        for stage, counts in p.stages.items()
+    names |= fences_of(scheduler) | {name for name, _ in statistics_of(scheduler).ended if name}
+    partitions, stages, pipes = [], [], []
+    for p in stats_of([*sorted(names), ""], scheduler):
+        title = f"{_shown(p.name)}{' (exclusive)' * p.exclusive}"
+        partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
+        stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+    for name, pipe in pipes_of(scheduler).items():
+        state = f"failed: {pipe.failure}" if pipe.failure else "closed" if pipe.closed else "open"
+        pipes.append([name, len(pipe.items), state])
+    tables = [
+        ("Partitions", ["workers", "slots", "busy", *_COUNTS], partitions),
+        ("Stages", ["partition", *_COUNTS], stages),
+        ("Workers", _OF_A_WORKER, [_worker(worker) for worker in workers]),
+        ("Pipes", ["depth", "state"], pipes),
     ]
-    rows = [
-        [f"{_shown(p.name)}{' (exclusive)' * p.exclusive}", p.workers, p.slots, p.busy, *_counts(p)]
-        for p in partitions
-    ]
-    given = ["", "partition", "slots", "busy", "tasks given", "status", "address"]
-    sections = [
-        _HEAD,
-        _table("Partitions", ["", "workers", "slots", "busy", *_COUNTS], rows),
-        _table("Stages", ["", "partition", *_COUNTS], stages),
-        _table("Workers", given, [_worker(worker) for worker in workers]),
-        _table("Pipes", ["", "depth", "state"], _pipes(scheduler)),
-    ]
-    return "".join(sections)
-
-
-def _table(title: str, head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
-    """Make a table, or nothing without rows. Names come from users: all text is escaped."""
-
-    def line(tag: str, cells: Iterable[object]) -> str:
-        texts = (escape(str(cell)[:_LONGEST]) for cell in cells)
-        return "<tr>" + "".join(f"<{tag}>{text}</{tag}>" for text in texts) + "</tr>\n"
-
-    body = "".join(line("td", row) for row in rows)
-    if not body:
-        return ""
-    return f"<table>\n<caption>{title}</caption>\n{line('th', head)}{body}</table>\n"
+    return _PAGE.generate(tables=tables)
 
 
 def _shown(partition: str) -> str:
@@ -105,13 +91,6 @@ def _worker(worker: Any) -> list[object]:
     slots, busy = slots_of(worker, partition), running_on(worker, partition)[1]
     given, status = len(worker.processing), worker.status.name
     return [worker.name, _shown(partition), slots, busy, given, status, worker.address]
-
-
-def _pipes(scheduler: Any) -> Iterator[list[object]]:
-    for name, state in pipes_of(scheduler).items():
-        failed = state.failure and f"failed: {state.failure}"
-        shown = failed or ("closed" if state.closed else "open")
-        yield [name, len(state.items), shown]
 
 
 class _Handler(web.RequestHandler):
@@ -151,7 +130,6 @@ class PageOwners(SchedulerPlugin):
 def partitions_page(client: Client) -> str:
     """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
     on_scheduler(client, _open, owner=client.id)
-    link: str | None
     try:
         link = client.dashboard_link
     except KeyError:  # no such service
@@ -161,7 +139,7 @@ def partitions_page(client: Client) -> str:
             f"The scheduler at {client.scheduler.address} has no HTTP server for a page: start "
             "it with a dashboard address, such as 127.0.0.1:8787."
         )
-    return link.removesuffix("/").removesuffix("/status") + f"/{PATH}"
+    return f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
 
 
 def leave_page(client: Client) -> None:
@@ -177,7 +155,6 @@ async def _open(owner: str, dask_scheduler: Any = None) -> None:
         # A `dask scheduler --dashboard-prefix` is part of the path.
         handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": dask_scheduler})]
         serve(dask_scheduler, PageApplication(handlers))
-        link_from_dashboard(dask_scheduler, PATH, True)
     dask_scheduler.plugins[NAME].owners.add(owner)
     statistics_of(dask_scheduler)
 
@@ -191,5 +168,4 @@ def close_page(scheduler: Any) -> None:
     """Stop serving the page."""
     if NAME in scheduler.plugins:
         serve_no_longer(scheduler, PageApplication)
-        link_from_dashboard(scheduler, PATH, False)
         scheduler.remove_plugin(NAME)

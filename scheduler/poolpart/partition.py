@@ -241,6 +241,7 @@ class Partition:
             Slots that each task takes.
         options
             Others of `Client.compute`, such as ``sync=True`` for the result instead of a future.
+            To keep results on these workers, use ``with partition:`` and ``persist``.
 
         Returns
         -------
@@ -253,20 +254,6 @@ class Partition:
         1000000000.0
         """
         return self.client.compute(collections, resources=self._taking(slots), **options)
-
-    def persist(self, collections: Any, *, slots: int = 1, **options: Any) -> Any:
-        """Compute Dask collections and keep the results on these workers; see `compute`.
-
-        Returns
-        -------
-        collection or list of collections
-            The same collections, backed by futures.
-        """
-        return self.client.persist(collections, resources=self._taking(slots), **options)
-
-    def gather(self, futures: Any, **options: Any) -> Any:
-        """Results of futures, in the same nesting; `options` are those of `Client.gather`."""
-        return self.client.gather(futures, **options)
 
     def scatter(self, data: Any, **options: Any) -> Any:
         """Put data into the memory of these workers; returns futures.

@@ -30,7 +30,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PipeClosed, PipeFailed
-from .internals import QueueAndVariable, ask_scheduler, handlers_of
+from .internals import QueueAndVariable, ask, handlers_of
 from .task_context import own_client
 from .workers import check_client, on_scheduler
 
@@ -277,12 +277,9 @@ class Pipe:
 
     def __iter__(self) -> Iterator[Any]:
         """Yield items until the pipe is closed and empty."""
-        while True:
-            try:
-                item = self.get()
-            except PipeClosed:
-                return
-            yield item
+        with suppress(PipeClosed):
+            while True:
+                yield self.get()
 
 
 def _deadline(timeout_s: float | None) -> float:
@@ -303,22 +300,9 @@ def take_news(
 ) -> dict[str, list[Any]]:
     """Wait until a pipe has an item or a task has ended, and take the items of the pipes.
 
-    Parameters
-    ----------
-    client
-        A client of the cluster.
-    seconds
-        The longest wait.
-    pipes
-        Names of pipes, one at least; one that was closed, has failed or is gone ends the wait as
-        well.
-    keys
-        Keys of tasks; one that the scheduler does not know ends the wait as well.
-
-    Returns
-    -------
-    dict
-        Items by pipe, of those that had some.
+    Pipes go by name, one at least, and tasks by key. A pipe that was closed, has failed or is gone
+    ends the wait as well, as does a task that the scheduler does not know. Returns the items by
+    pipe, of those that had some.
     """
     replies = _ask(client, _TAKE, names=list(pipes), keys=list(keys), seconds=seconds)
     return {name: [*map(loads, r["answer"])] for name, r in replies.items() if r["answer"]}
@@ -326,7 +310,7 @@ def take_news(
 
 def _ask(client: Client, question: str, **arguments: Any) -> Replies:
     check_client(client)
-    replies = client.sync(ask_scheduler, client, question, asker=client.id, **arguments)
+    replies = client.sync(ask, client, None, question, asker=client.id, **arguments)
     return replies or {}  # a scheduler without pipes has no such handler
 
 
@@ -355,14 +339,14 @@ class PipeState:
         """Whether it was closed or has failed."""
         return self.closed or bool(self.failure)
 
+    @property
+    def room(self) -> int:
+        """Items that may be put now."""
+        return max(0, self.capacity - len(self.items))
+
     def publish(self) -> None:
         """Let the Variable say what has changed."""
         self.items.set({name: value for name, value in vars(self).items() if name != "items"})
-
-    @property
-    def full(self) -> bool:
-        """Whether producers have to wait."""
-        return len(self.items) >= self.capacity
 
 
 def pipes_of(scheduler: Any) -> dict[str, PipeState]:
@@ -438,18 +422,15 @@ class Pipes(SchedulerPlugin):
         def put(state: PipeState) -> int:
             if state.ended or asker not in self.scheduler.clients:
                 return 0
-            fitting = items[: room(state)]
+            fitting = items if unbounded else items[: state.room]
             was_empty = not state.items
             state.items.put(fitting)
-            if was_empty or state.full:  # else nobody waits for this
+            if was_empty or not state.room:  # else nobody waits for this
                 self._wake()
             return len(fitting)
 
-        def room(state: PipeState) -> int:
-            return len(items) if unbounded else max(0, state.capacity - len(state.items))
-
         def ready() -> bool:
-            return all(state.ended or room(state) for state in states.values())
+            return unbounded or all(state.ended or state.room for state in states.values())
 
         async def later() -> Replies:
             await self._until(seconds, ready)
@@ -477,7 +458,7 @@ class Pipes(SchedulerPlugin):
             )
 
         def full() -> bool:
-            return any(state.ended or state.full for state in states.values())
+            return any(state.ended or not state.room for state in states.values())
 
         def take(state: PipeState) -> list[bytes]:
             if asker not in self.scheduler.clients:

@@ -15,8 +15,8 @@ from .errors import PoolError
 from .membership import forget_memberships
 from .page import leave_page, partitions_page
 from .partition import Partition
-from .probe import probe_worker
-from .rules import Rule, check_name, divide, named, per_gpu, per_host
+from .probe import worker_gpus
+from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
 from .workers import WorkerInfo, all_workers, ask_workers
 
@@ -70,18 +70,15 @@ class Pool:
             )
         if declaring is not None:
             workers = [worker for worker in workers if declaring & set(worker.resources)]
-        facts = ask_workers(client, probe_worker, [worker.address for worker in workers])
-        asked = []
-        for worker in workers:
-            fact = facts.get(worker.address)
-            if isinstance(fact, BaseException):
+        answers = ask_workers(client, worker_gpus, [worker.address for worker in workers])
+        there = [worker for worker in workers if worker.address in answers]  # others have left
+        for worker in there:
+            if isinstance(error := answers[worker.address], BaseException):
                 raise PoolError(
                     f"Worker {worker.name} at {worker.address} cannot describe its "
-                    f"machine ({type(fact).__name__}: {fact}); is poolpart installed there?"
+                    f"machine ({type(error).__name__}: {error}); is poolpart installed there?"
                 )
-            if fact is not None:  # it may have left
-                asked.append(worker.with_gpus(fact["gpus"]))
-        return cls(client, asked)
+        return cls(client, [worker.with_gpus(answers[worker.address]) for worker in there])
 
     # -- looking -----------------------------------------------------------------------
 
@@ -176,7 +173,7 @@ class Pool:
         ------
         PoolError
             If a partition would have fewer workers than its minimum, or another client makes one
-            of this name, or takes a worker, at the same moment.
+            of this name at the same moment.
 
         Examples
         --------
@@ -221,13 +218,8 @@ class Pool:
             So many workers, wherever they are.
         workers
             These workers, by name or address.
-        slots
-            Tasks that each worker takes at a time; its number of threads by default.
-        minimum
-            Least number of workers, which moving them respects.
-        exclusive
-            Whether to keep other tasks off its workers: un-annotated ones, collections, those of
-            other users. Tasks that a worker already has end there.
+        slots, minimum, exclusive
+            As of every `Rule`.
 
         Returns
         -------
@@ -319,25 +311,18 @@ class Pool:
                     f"The rule of partition {name!r} is {rule!r}: give one such as n_workers(2), "
                     "per_gpu(1) or rest()."
                 )
-        cluster = all_workers(self.client)
-        # By name: a restarted worker has another address.
-        gpus = {worker.name: worker.gpus for worker in self.workers}
-        mine = [w.with_gpus(gpus[w.name]) for w in cluster if w.name in gpus]
-        chosen, notes = divide(now, mine)
-        for name, note in notes.items():
-            logger.warning("Partition %r: %s", name, note)
-        common = ask(
+        notes, left = ask(
             self.client,
             declare,
             rules=dict(rules),
-            chosen={name: [worker.address for worker in chosen[name]] for name in rules},
-            seen={name for worker in cluster for name in worker.partitions},
-            gpus={worker.address: worker.gpus for worker in mine},
+            now=dict(now),
+            pool={worker.name: worker.gpus for worker in self.workers},
+            seen=set(self.partitions()),
         )
-        told = {name: "; ".join(filter(None, (notes.get(name), common))) for name in rules}
-        parts = {name: Partition(name, self.client, told[name]) for name in rules}
+        parts = {name: Partition(name, self.client, note) for name, note in notes.items()}
         for part in parts.values():
             part._by_rule = True
+            if part.note:
+                logger.warning("Partition %r: %s", part.name, part.note)
         forget_memberships()
-        taken = {worker.address for group in chosen.values() for worker in group}
-        return parts, Pool(self.client, [w for w in mine if w.address not in taken])
+        return parts, Pool(self.client, left)

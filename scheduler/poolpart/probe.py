@@ -7,6 +7,7 @@ import ctypes
 import logging
 import subprocess
 import sys
+from functools import cache
 from typing import Any
 
 logger = logging.getLogger(__name__)
@@ -30,13 +31,15 @@ if cuda.cuInit(0) == 0 and cuda.cuDeviceGetCount(ctypes.byref(count)) == 0:
 """
 
 
-def has_driver() -> bool:
-    """Whether this machine has a CUDA driver, which may still not work."""
+@cache  # it takes up to a second; an error is not kept
+def _listing() -> tuple[str, ...]:
     try:
         ctypes.CDLL(_DRIVER)
     except OSError:
-        return False
-    return True
+        return ()
+    command = [sys.executable, "-c", _LIST_GPUS, _DRIVER]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    return tuple(done.stdout.split())
 
 
 def visible_gpus() -> tuple[str, ...]:
@@ -44,25 +47,16 @@ def visible_gpus() -> tuple[str, ...]:
 
     A driver that fails counts as none, with a warning in the log.
     """
-    if not has_driver():
-        return ()
     try:
-        listing = subprocess.run(
-            [sys.executable, "-c", _LIST_GPUS, _DRIVER],
-            capture_output=True,
-            text=True,
-            timeout=60,
-            check=True,
-        )
+        return _listing()
     except (subprocess.CalledProcessError, subprocess.TimeoutExpired) as error:
         logger.warning(
             "No GPU is used, because listing them failed: %s %s", error, error.stderr or ""
         )
         return ()
-    return tuple(listing.stdout.split())
 
 
-async def probe_worker(dask_worker: Any = None) -> dict[str, Any]:
-    """Facts about this worker that the scheduler does not know."""
+async def worker_gpus(dask_worker: Any = None) -> tuple[str, ...]:
+    """CUDA devices of a worker, see `visible_gpus`."""
     # In a thread, to keep the worker's event loop free.
-    return {"gpus": await asyncio.to_thread(visible_gpus)}
+    return await asyncio.to_thread(visible_gpus)

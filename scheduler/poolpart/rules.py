@@ -25,7 +25,8 @@ class Rule:
         Least number of workers: making it with fewer is an error, and moving workers never
         leaves it with fewer.
     exclusive
-        Whether to keep other tasks off its workers.
+        Whether to keep other tasks off its workers: un-annotated ones, collections, those of other
+        users. Tasks that a worker already has end there.
     """
 
     slots: int | None = None
@@ -33,8 +34,11 @@ class Rule:
     exclusive: bool = False
 
     def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """Choose from available workers; the first ones are preferred."""
-        raise NotImplementedError
+        """Choose from available workers; the first ones are preferred.
+
+        Here none: of a partition without a rule, the members were started with its resource.
+        """
+        return []
 
     def wants(
         self, worker: WorkerInfo, members: Sequence[WorkerInfo], everyone: Sequence[WorkerInfo]
@@ -134,15 +138,6 @@ class rest(Rule):  # noqa: N801
         return list(free)
 
 
-@dataclass(frozen=True)
-class Declared(Rule):
-    """Workers that were started with the resource, and no others."""
-
-    def choose(self, free: Sequence[WorkerInfo]) -> list[WorkerInfo]:
-        """None: workers that declare the resource are members without being chosen."""
-        return []
-
-
 def named(*names: str, **common: Any) -> Named:
     """Workers of these names or addresses, also those that join later."""
     return Named(tuple(map(str, names)), **common)
@@ -215,3 +210,9 @@ def check_name(partition: object) -> None:
     """Check the name of a partition; PoolError unless it is one."""
     if not isinstance(partition, str) or not partition:
         raise PoolError(f"The name of a partition is {partition!r}; give one such as 'GPU'.")
+
+
+def check_count(name: str, count: object, least: int = 1) -> None:
+    """Check a number; PoolError unless it is whole and large enough."""
+    if not isinstance(count, int) or count < least:
+        raise PoolError(f"{name} is {count!r}; give a whole number, {least} or more.")

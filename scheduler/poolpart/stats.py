@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from itertools import islice
 from typing import Any, cast
 
@@ -25,15 +25,6 @@ _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
 _WAITING = {"waiting": "waiting", "queued": "queued", "no-worker": "queued", "processing": "given"}
 
 
-@dataclass(slots=True)
-class Tally:
-    """Tasks of one stage in one partition that have ended."""
-
-    done: int = 0
-    failed: int = 0
-    seconds: float = 0.0
-
-
 class Statistics(SchedulerPlugin):
     """Counts the scheduler's tasks that end, from its creation on."""
 
@@ -41,7 +32,8 @@ class Statistics(SchedulerPlugin):
 
     def __init__(self, scheduler: Any) -> None:
         self.scheduler = scheduler
-        self.tallies: dict[tuple[str, str], Tally] = {}  # {(partition, stage): counts}
+        # {(partition, stage): "done", "failed" and "seconds" of its tasks that have ended}
+        self.ended: dict[tuple[str, str], Counter[str]] = defaultdict(Counter)
 
     def transition(
         self, key: Any, start: str, finish: str, *args: Any, stimulus_id: str = "", **kwargs: Any
@@ -50,12 +42,11 @@ class Statistics(SchedulerPlugin):
         if start != "processing" or finish not in ("memory", "erred"):
             return
         task = self.scheduler.tasks[key]
-        tally = self.tallies.setdefault((partition_of(task), task.prefix.name), Tally())
-        tally.done += finish == "memory"
-        tally.failed += finish == "erred"
+        counts: dict[str, Any] = self.ended[partition_of(task), task.prefix.name]
+        counts["done" if finish == "memory" else "failed"] += 1
         for span in kwargs.get("startstops") or ():
             if span["action"] == "compute":
-                tally.seconds += span["stop"] - span["start"]
+                counts["seconds"] += span["stop"] - span["start"]
 
 
 def partition_of(task: Any) -> str:
@@ -155,11 +146,6 @@ class PartitionStats(StageStats):
     exclusive: bool = False
     stages: Mapping[str, StageStats] = field(default_factory=dict)
 
-    @property
-    def occupancy(self) -> float:
-        """Share of busy slots; 0 without slots."""
-        return self.busy / self.slots if self.slots else 0.0
-
 
 def partition_stats(client: Client, name: str) -> PartitionStats:
     """Statistics of a partition, whoever made it.
@@ -196,24 +182,20 @@ def stats_of(names: Sequence[str], dask_scheduler: Any = None) -> list[Partition
     for task in scheduler.tasks.values():
         if count := _WAITING.get(task.state):
             under_way[partition_of(task), task.prefix.name][count] += 1
-    places = sorted(under_way.keys() | statistics.tallies.keys())
+    places = sorted(under_way.keys() | statistics.ended.keys())
     answers = []
     for name in names:
         workers = members(scheduler, name)
         by_worker = [running_on(worker, name) for worker in workers]
         running: Counter[str] = sum((stages for stages, _ in by_worker), Counter())
         stages = {}
-        for place in places:
-            partition, stage = place
+        for partition, stage in places:
             if partition == name:
-                now, ended = under_way[place], statistics.tallies.get(place, Tally())
+                now = under_way[name, stage]
+                ended = statistics.ended.get((name, stage), Counter[str]())
                 runs = min(running[stage], now["given"])
-                stages[stage] = StageStats(
-                    waiting=now["waiting"],
-                    queued=now["queued"] + now["given"] - runs,
-                    running=runs,
-                    **asdict(ended),
-                )
+                queued = now["queued"] + now["given"] - runs
+                stages[stage] = StageStats(now["waiting"], queued, runs, **ended)
         sums = {
             count: sum(getattr(stage, count) for stage in stages.values())
             for count in StageStats.__dataclass_fields__

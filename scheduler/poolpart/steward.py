@@ -37,8 +37,8 @@ from .internals import (
     show,
     wake,
 )
-from .probe import probe_worker
-from .rules import Declared, Rule, n_workers, partition_for, per_gpu, rest
+from .probe import worker_gpus
+from .rules import Rule, n_workers, partition_for, per_gpu, rest
 from .workers import WorkerInfo
 
 logger = logging.getLogger(__name__)
@@ -51,57 +51,25 @@ _PLACE_EVERY_S = 0.1  # applying all rules to a thousand workers takes as long
 
 @dataclass(eq=False)
 class Seat:
-    """Partition and state of one worker, also during a restart by its nanny.
+    """Partition and state of one worker, also during a restart by its nanny."""
 
-    Parameters
-    ----------
-    key
-        Identifies the worker, see `seat_key`.
-    info
-        Description of the worker.
-    nanny
-        Address of its nanny, None for none.
-    found
-        Resources that it was started with.
-    declared
-        Resources that it declares now, as far as known.
-    being_told
-        A request to declare resources is under way.
-    partition
-        Its partition; None for none.
-    slots
-        Its slots of the partition.
-    unplaced
-        It joined after the cluster was divided, and no rule has taken it yet.
-    away
-        It has left, and its nanny may be restarting it.
-    gone
-        It is no longer expected.
-    """
-
-    key: Hashable
+    key: Hashable  # identifies the worker, see `seat_key`
     info: WorkerInfo
-    nanny: str | None = None
-    found: Resources = field(default_factory=dict)
-    declared: Resources = field(default_factory=dict)
-    being_told: bool = False
+    nanny: str | None = None  # its address
+    found: Resources = field(default_factory=dict)  # resources that it was started with
+    declared: Resources = field(default_factory=dict)  # that it declares now, as far as known
+    being_told: bool = False  # a request to declare resources is under way
     partition: str | None = None
-    slots: float = 0
-    unplaced: bool = False
-    away: bool = False
-    gone: bool = False
+    slots: float = 0  # of the partition
+    unplaced: bool = False  # it joined after the division, and no rule has taken it yet
+    away: bool = False  # it has left, and its nanny may be restarting it
+    gone: bool = False  # it is no longer expected
     settling: asyncio.Task[None] | None = None
     giving_up: asyncio.TimerHandle | None = None
 
 
 class Steward(SchedulerPlugin):
-    """Keeps workers in their partitions, also when the client has gone.
-
-    Parameters
-    ----------
-    scheduler
-        The scheduler that it is a plugin of.
-    """
+    """Keeps workers in their partitions, also when the client has gone."""
 
     name = NAME
 
@@ -173,7 +141,7 @@ class Steward(SchedulerPlugin):
                 f"There is no partition {name!r}: no worker declares it, and it was not made "
                 "with Pool.partition or Pool.divide."
             )
-        self.enter(name, Declared(minimum=0))
+        self.enter(name, Rule(minimum=0))
         for seat in members:
             self.put(seat, name, seat.found[name])
 
@@ -196,13 +164,6 @@ class Steward(SchedulerPlugin):
         if seat.giving_up:
             seat.giving_up.cancel()
         return seat
-
-    def seat_at(self, address: str) -> Seat | None:
-        """Seat of the worker at an address, or None."""
-        worker = self.scheduler.workers.get(address)
-        if worker is None:
-            return None
-        return self.seats[seat_key(worker.name, worker.address, worker.nanny)]
 
     def add_worker(self, scheduler: Any, worker: str) -> None:
         """Assign a worker that joins: to its former partition, a declared one, or by rule."""
@@ -258,8 +219,8 @@ class Steward(SchedulerPlugin):
         self._placing = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
         # A worker that is being asked for its GPUs is assigned when it has answered.
-        waiting = [s for s in waiting if s.settling and s.settling.done()]
-        self.settle([seat for seat in waiting if self._place(seat)])
+        asked = [s for s in waiting if s.settling and s.settling.done()]
+        self.settle([seat for seat in asked if self._place(seat)])
 
     def _place(self, seat: Seat) -> bool:
         """Find a partition for a worker without one; returns whether there is one."""
@@ -273,11 +234,11 @@ class Steward(SchedulerPlugin):
         if not any(isinstance(rule, per_gpu) for rule in self.rules.values()):
             return
         try:
-            facts = await call(self.scheduler, seat.info.address, probe_worker)
+            gpus = await call(self.scheduler, seat.info.address, worker_gpus)
         except OSError as error:
             logger.warning("Worker %s cannot list its GPUs: %s", seat.info.name, error)
             return
-        seat.info = seat.info.with_gpus(facts["gpus"])
+        seat.info = seat.info.with_gpus(gpus)
 
     # -- settling workers --------------------------------------------------------------
 

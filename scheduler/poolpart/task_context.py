@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 
 from distributed import Client, Status, default_client, get_client, get_worker
 
@@ -33,7 +33,9 @@ def own_client() -> Client:
             try:
                 return get_client()
             except AssertionError:
-                _close_half_made()
+                with suppress(ValueError):  # it was not made at all
+                    if (client := default_client()).status != "running":
+                        client.close(timeout=_CLOSE_S)
         return get_client()
 
 
@@ -44,15 +46,6 @@ def in_event_loop() -> bool:
     except RuntimeError:
         return False
     return True
-
-
-def _close_half_made() -> None:
-    try:
-        client = default_client()
-    except ValueError:  # it was not made at all
-        return
-    if client.status != "running":
-        client.close(timeout=_CLOSE_S)
 
 
 _LEAVING = (Status.closing, Status.closed, Status.failed)
@@ -80,14 +73,9 @@ def telling_departure() -> Iterator[None]:
     try:
         yield
     except (Exception, asyncio.CancelledError) as error:
-        if not _is_leaving():
-            raise
-        # Without the cause, which may not be picklable.
-        raise WorkerLeft(f"the worker has left ({type(error).__name__}: {error})") from None
-
-
-def _is_leaving() -> bool:
-    try:
-        return get_worker().status in _LEAVING
-    except ValueError:  # not in a task
-        return False
+        with suppress(ValueError):  # not in a task
+            if get_worker().status in _LEAVING:
+                # Without the cause, which may not be picklable.
+                told = f"the worker has left ({type(error).__name__}: {error})"
+                raise WorkerLeft(told) from None
+        raise

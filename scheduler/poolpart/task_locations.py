@@ -16,55 +16,31 @@ _BEATS = 3  # heartbeats that a worker may miss at least
 
 @dataclass(frozen=True)
 class TaskPlace:
-    """One task on the scheduler.
+    """One task on the scheduler."""
 
-    Parameters
-    ----------
-    state
-        Dask's name of its state: waiting, no-worker, queued, processing, memory, erred, ….
-    workers
-        Addresses of workers that run it, or have its result.
-    deaths
-        Workers that died, unexpectedly, while the task was assigned to them.
-    long_running
-        Whether it runs and has seceded.
-    started
-        Whether a worker runs it, as of the worker's last heartbeat.
-    """
-
-    state: str
-    workers: tuple[str, ...]
-    deaths: int
-    long_running: bool = False
-    started: bool = False
+    state: str  # Dask's name of its state: waiting, no-worker, queued, processing, memory, erred, …
+    workers: tuple[str, ...]  # addresses of workers that run it, or have its result
+    deaths: int  # workers that died, unexpectedly, while the task was assigned to them
+    long_running: bool = False  # it runs and has seceded
+    started: bool = False  # a worker runs it, as of the worker's last heartbeat
 
 
 @dataclass(frozen=True)
 class Whereabouts:
     """Members of a partition, their slots, and tasks, at one moment.
 
-    Parameters
-    ----------
-    members
-        Addresses of all workers of the partition.
-    silent
-        Members without a recent heartbeat: stopped, cut off or stuck. The scheduler itself
-        considers a worker dead after its ``worker-ttl``, five minutes.
-    free
-        Slots that no task holds or waits for, by address of the worker; below 0 if a worker has
-        more tasks than slots. Workers that take no tasks at the moment, because Dask has paused
-        them for their memory or they are leaving, and silent ones are left out.
-    slots
-        Slots of the workers that take tasks at the moment, free or not.
-    tasks
-        {key: its location}, for requested keys that the scheduler knows.
+    Workers that take no tasks at the moment, because Dask has paused them for their memory or they
+    are leaving, and silent ones have neither `free` nor `slots`.
     """
 
-    members: frozenset[str] = frozenset()
+    members: frozenset[str] = frozenset()  # addresses of all workers of the partition
+    # Members without a recent heartbeat: stopped, cut off or stuck. The scheduler itself considers
+    # a worker dead after its ``worker-ttl``, five minutes.
     silent: frozenset[str] = frozenset()
+    # {address: slots that no task holds or waits for}; below 0 with more tasks than slots.
     free: dict[str, int] = field(default_factory=dict)
-    slots: int = 0
-    tasks: dict[str, TaskPlace] = field(default_factory=dict)
+    slots: int = 0  # free or not
+    tasks: dict[str, TaskPlace] = field(default_factory=dict)  # by requested key, of known ones
 
     def out_of_reach(self, key: str) -> bool:
         """Whether a task or its result is on silent workers only."""
@@ -93,12 +69,13 @@ def _look(
     partition: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
 ) -> Whereabouts:
     members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(partition)]
-    silent = _silent_workers(dask_scheduler, patience_s)
+    addresses = frozenset(ws.address for ws in members)
+    silent = addresses & _silent_workers(dask_scheduler, patience_s)
     usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
     places = {key: _place(dask_scheduler.tasks[key]) for key in keys if key in dask_scheduler.tasks}
     return Whereabouts(
-        members=frozenset(ws.address for ws in members),
-        silent=frozenset(ws.address for ws in members if ws.address in silent),
+        members=addresses,
+        silent=silent,
         free={ws.address: int(ws.resources[partition] - _in_use(ws, partition)) for ws in usable},
         slots=sum(int(ws.resources[partition]) for ws in usable),
         tasks=places,

@@ -10,7 +10,7 @@ from distributed import Client
 from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
-from .internals import identities
+from .internals import ask
 
 
 @dataclass(frozen=True)
@@ -19,11 +19,9 @@ class WorkerInfo:
 
     Parameters
     ----------
-    name
-        The worker's name. A given name outlives a restart by the nanny; the address, and a
-        default name made from it, do not.
-    address, host
-        Its address, and its host.
+    name, address, host
+        A given name outlives a restart by the nanny; the address, and a default name made from
+        it, do not.
     nthreads
         Its threads.
     memory
@@ -105,7 +103,11 @@ def worker_identities(client: Client) -> dict[str, dict[str, Any]]:
         If the client is closed, or asynchronous.
     """
     check_client(client)
-    workers: dict[str, dict[str, Any]] = client.sync(identities, client)
+    # `Client.scheduler_info(n_workers=-1)` asks too, but returns an attribute, into which the
+    # client puts an answer without workers every two seconds: on a busy machine a cluster of
+    # hundreds looks empty now and then.
+    identity = client.sync(ask, client, None, "identity", n_workers=-1)
+    workers: dict[str, dict[str, Any]] = identity["workers"]
     return workers
 
 
@@ -117,22 +119,10 @@ def all_workers(client: Client) -> list[WorkerInfo]:
 def ask_workers(
     client: Client, question: Callable[..., Any], addresses: Sequence[str]
 ) -> dict[str, Any]:
-    """Run a function on workers, outside their tasks.
+    """Run a function on workers, outside their tasks, by `Client.run`.
 
-    Parameters
-    ----------
-    client
-        Client of their cluster.
-    question
-        Function for `Client.run`.
-    addresses
-        The workers.
-
-    Returns
-    -------
-    dict
-        By address, the result, or the exception raised there. Workers that died before they
-        answered are left out.
+    Returns, by address, the result, or the exception raised there. Workers that died before they
+    answered are left out.
     """
     if not addresses:  # to Client.run that would be all workers
         return {}
@@ -140,9 +130,6 @@ def ask_workers(
     if not any(isinstance(answer, OSError) for answer in answers.values()):
         return dict(answers)
     here = worker_identities(client)
-    return {a: answer for a, answer in answers.items() if not _has_died(answer, a in here)}
-
-
-def _has_died(answer: Any, is_here: bool) -> bool:
-    # The function itself may also have raised an OSError.
-    return isinstance(answer, CommClosedError) or (isinstance(answer, OSError) and not is_here)
+    # A worker that is there still may have raised an OSError itself.
+    lost = {a: OSError if a not in here else CommClosedError for a in answers}
+    return {a: answer for a, answer in answers.items() if not isinstance(answer, lost[a])}

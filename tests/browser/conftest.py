@@ -86,9 +86,8 @@ class Tab:
 
     def value(self, script: str):
         """Value of an expression of JavaScript."""
-        return self.call("Runtime.evaluate", expression=script, returnByValue=True)["result"].get(
-            "value"
-        )
+        told = self.call("Runtime.evaluate", expression=script, returnByValue=True)
+        return told["result"].get("value")
 
     @property
     def text(self) -> str:
@@ -99,39 +98,37 @@ class Tab:
         """Wait until something is true of the page's text; returns what it was."""
         deadline = time.monotonic() + seconds
         while not (found := condition(self.text)):
-            assert time.monotonic() < deadline, (
-                f"it did not come to pass; the page says {self.text!r}"
-            )
+            assert time.monotonic() < deadline, f"the page says {self.text!r}"
             time.sleep(0.1)
         return found
 
     def click(self, label: str) -> None:
         """Press the button with this label."""
-        found = self.value(
-            "(() => { const b = [...document.querySelectorAll('button')]"
-            f".find(b => b.innerText.trim() === {json.dumps(label)});"
-            " if (b) b.click(); return !!b; })()"
+        self._act(
+            f"[...document.querySelectorAll('button')].find(b => b.innerText.trim() === "
+            f"{json.dumps(label)})",
+            "it.click()",
         )
-        assert found, f"there is no button {label!r}"
 
     def choose(self, title: str, value: str) -> None:
         """Choose an entry of the first menu with this title."""
-        found = self.value(
-            "(() => { const r = [...document.querySelectorAll('.row')]"
-            f".find(r => r.firstChild.textContent === {json.dumps(title)});"
-            " const s = r?.querySelector('select');"
-            f" if (s) {{ s.value = {json.dumps(value)}; s.onchange(); }} return !!s; }})()"
+        self._act(
+            f"[...document.querySelectorAll('.row')].find(r => r.firstChild.textContent === "
+            f"{json.dumps(title)})?.querySelector('select')",
+            f"it.value = {json.dumps(value)}; it.onchange()",
         )
-        assert found, f"there is no menu {title!r}"
 
     def tick(self, title: str, on: bool) -> None:
         """Set the first box whose title begins so."""
-        found = self.value(
-            "(() => { const b = [...document.querySelectorAll('label.tick')]"
-            f".find(l => l.textContent.startsWith({json.dumps(title)}))?.querySelector('input');"
-            f" if (b && b.checked !== {json.dumps(on)}) b.click(); return !!b; }})()"
+        self._act(
+            f"[...document.querySelectorAll('label.tick')].find(l => l.textContent.startsWith("
+            f"{json.dumps(title)}))?.querySelector('input')",
+            f"if (it.checked !== {json.dumps(on)}) it.click()",
         )
-        assert found, f"there is no box {title!r}"
+
+    def _act(self, it: str, act: str) -> None:
+        """Do something with an element `it`, which has to be there."""
+        assert self.value(f"(() => {{ const it = {it}; if (it) {{ {act} }} return !!it; }})()"), it
 
     def key(self, name: str) -> None:
         """Press a key."""
@@ -141,15 +138,8 @@ class Tab:
     def press(self, x: float, y: float, *, shift: bool = False) -> None:
         """Click at a place of the window, pixels."""
         for kind in ("mousePressed", "mouseReleased"):
-            self.call(
-                "Input.dispatchMouseEvent",
-                type=kind,
-                x=x,
-                y=y,
-                button="left",
-                clickCount=1,
-                modifiers=8 if shift else 0,
-            )
+            given = {"type": kind, "x": x, "y": y, "modifiers": 8 if shift else 0}
+            self.call("Input.dispatchMouseEvent", button="left", clickCount=1, **given)
 
     def picture(self, path: Path) -> np.ndarray:
         """Take a picture of the page, (height, width, 3), and keep it."""

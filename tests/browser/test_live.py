@@ -14,6 +14,7 @@ from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
+from lidarpool.run.watch import Waiting
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -49,7 +50,7 @@ class Driven:
 
     def __init__(self, client, live, store, most=1):
         self.error, self.most = None, most
-        run, begun = Run(client, store), time.monotonic()
+        run, begun = Run(client, store, print, Waiting()), time.monotonic()
 
         def on_frame(frame):
             live.on_frame(frame)

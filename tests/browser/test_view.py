@@ -37,8 +37,8 @@ def cloud(tmp_path):
 
 
 @pytest.fixture
-def served(cloud):
-    """Return the page of a spiral that a sensor scans in ten turns, while a box drives along x."""
+def view(cloud):
+    """Return the view of a spiral that a sensor scans in ten turns, while a box drives along x."""
     track = Track([0, 1], [[-9, 0, 8], [9, 0, 8]])
     scene = Scene.from_meshes([box("Floor", (20, 20, 0.1))])  # few triangles: browsers are slow
     scene = replace(scene, actors=(Actor(box("Van", (4, 2, 2)), track),))
@@ -48,8 +48,12 @@ def served(cloud):
     pictured = Pictured(scene, sensor_ways(survey), hits, rays, None, None, (), survey.duration_ns)
     sweeps = Sweeps.of(survey, scene)
     assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
-    view = result_view(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
-    with page_server(view, port=0) as page:
+    return result_view(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
+
+
+@pytest.fixture
+def served(view):
+    with page_server(view.answer, port=0) as page:
         yield page
 
 
@@ -196,10 +200,10 @@ def test_each_browser_is_dark_where_its_system_is_until_its_user_wants_otherwise
         tab.value("localStorage.clear()")
 
 
-def test_the_page_says_that_its_server_has_ended(served, new_tab):
-    tab = opened(new_tab, served)
-    tab.wait_for(lambda _: drawn(tab) == COUNT)
-    served.close()
+def test_the_page_says_that_its_server_has_ended(view, new_tab):
+    with page_server(view.answer, port=0) as page:
+        tab = opened(new_tab, page)
+        tab.wait_for(lambda _: drawn(tab) == COUNT)
     tab.key("ArrowRight")
     tab.wait_for(lambda text: "server of this page has ended" in text)
 

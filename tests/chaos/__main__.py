@@ -92,7 +92,7 @@ def _tell(number: int, outcome: Outcome, faults: int) -> None:
     print(
         f"run {number}: {outcome.seconds:5.1f} s, {sum(outcome.done.values())} faults "
         f"({faults} so far), {recovered} scans recovered, {outcome.replayed} batches replayed, "
-        f"silent {outcome.silence}, {state}",
+        f"{state}",
         flush=True,
     )
     if not outcome.sound:

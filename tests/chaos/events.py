@@ -38,12 +38,7 @@ KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE = KINDS = (
     "pause",  # as Dask does if memory is short, and on again some time later
     "damage",  # a bit of a part in storage is flipped; the run is resumed once it has ended
 )
-SIGNALS = {
-    KILL: signal.SIGKILL,
-    TERM: signal.SIGTERM,
-    SEGV: signal.SIGSEGV,
-    STOP: signal.SIGSTOP,
-}
+SIGNALS = {KILL: signal.SIGKILL, TERM: signal.SIGTERM, SEGV: signal.SIGSEGV, STOP: signal.SIGSTOP}
 
 RANDOM = "random time"  # in place of a point
 HOLD_S = 5.0  # longest time that a point is held for somebody else to carry a fault out

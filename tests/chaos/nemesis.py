@@ -19,19 +19,7 @@ from distributed import Worker
 from lidarpool.base.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
-from .events import (
-    DAMAGE,
-    KINDS,
-    PAUSE,
-    RANDOM,
-    RESTART,
-    RETIRE,
-    SIGNALS,
-    STOP,
-    Fault,
-    Fired,
-    Sink,
-)
+from .events import DAMAGE, KINDS, PAUSE, RANDOM, RESTART, RETIRE, SIGNALS, STOP, Fault, Fired, Sink
 
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
@@ -43,11 +31,7 @@ WAKE_MOST_S = 30.0  # for those who are to stop to have stopped, when all is ove
 
 
 def make_plan(
-    seed: int,
-    count: int,
-    worker_points: Sequence[str],
-    driver_points: Sequence[str],
-    scans: int,
+    seed: int, count: int, worker_points: Sequence[str], driver_points: Sequence[str], scans: int
 ) -> list[Fault]:
     """Choose faults: the same for the same arguments.
 

@@ -11,7 +11,6 @@ from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,7 @@ from poolpart import placement_violations
 
 from .arena import Arena
 from .checker import Verdict, judge
-from .events import DAMAGE, Event, Fault
+from .events import DAMAGE, Fault
 from .nemesis import Nemesis
 
 STEPS, POSES = 360, 2
@@ -81,7 +80,6 @@ class Outcome:
     done: Counter[tuple[str, str]]  # {(kind of fault, point): times}
     left: tuple[Fault, ...]  # not carried out
     seconds: float
-    silence: str  # the longest time in which nothing happened, and what ended it
     replayed: int
     misplaced: int
     error: str = ""
@@ -137,26 +135,13 @@ def disturbed(
         shutil.rmtree(place)
     return Outcome(
         verdict=judge(
-            events,
-            what.scan_count,
-            [] if cloud is None else cloud.scan.tolist(),
-            known.rows,
+            events, what.scan_count, [] if cloud is None else cloud.scan.tolist(), known.rows
         ),
         identical=same,
         done=nemesis.done,
         left=tuple(nemesis.left),
         seconds=time.monotonic() - started,
-        silence=_longest_silence(events),
         replayed=0 if result is None else result.replayed,
         misplaced=0 if result is None else len(placement_violations(result.records)),
         error=error,
     )
-
-
-def _longest_silence(events: Sequence[Event]) -> str:
-    log = sorted(events, key=lambda event: event["t"])
-    gaps = [(b["t"] - a["t"], a, b) for a, b in pairwise(log)]
-    if not gaps:
-        return "nothing happened"
-    seconds, before, after = max(gaps, key=lambda gap: gap[0])
-    return f"{seconds:.1f} s from {before['point']} to {after['point']}"

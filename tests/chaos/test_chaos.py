@@ -85,9 +85,3 @@ def test_a_long_plan_has_every_kind_at_every_point_of_the_workers_and_the_rest_a
     assert {f.partition for f in plan if f.point in DRIVER} == {"GPU", "LIDAR"}
     assert {f.partition for f in plan if f.point == RANDOM} == set(PARTITIONS)
     assert len(plan) == 40
-
-
-def test_a_short_plan_has_every_point():
-    plan = make_plan(0, 6, WORKER, DRIVER, scans=100)
-    assert {fault.point for fault in plan} == {*WORKER, *DRIVER, RANDOM}
-    assert len(plan) == 6

@@ -131,7 +131,7 @@ WRONG = {
     ],
     Spin: [("1000", "a number"), (1000, "x", "step_deg"), (1000, 10, 10, "no", "True or False")],
     Survey: [
-        (GRID, [1, 2, 3], "such as [(0, 0, 1)]"),
+        (GRID, [1, 2, 3], "such as (0, 0, 1)"),
         ("velodyne/vlp16", AT, "load_sensor('velodyne/vlp16')"),
         (GRID, AT, "36", "whole number or None"),
         (GRID, (), 36, "drive.tum", "load_trajectory('drive.tum')"),

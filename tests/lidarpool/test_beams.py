@@ -10,9 +10,6 @@ from tests.lidarpool.test_echoes import cast, wall
 
 from lidarpool import Beams, Material, Returns, Sensor, Spin, load_sensor
 from lidarpool.scene.mesh import Mesh
-from lidarpool.sensor.disc import SUBRAYS, disc
-
-SEVERAL = SUBRAYS[1:]
 
 
 def plane(point, normal, size=4000.0):
@@ -46,34 +43,9 @@ def fan(elevations_deg, optics, max_range_m=math.inf):
 # -- the cross-section ---------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("count", SEVERAL)
-def test_the_moments_are_those_of_the_disc(count):
-    """To the third: with them, planes have their exact range and energy."""
-    x, y = disc(count, 2.0).T
-    assert len(x) == count
-    assert np.hypot(x, y).max() <= 1
-    for a, b in [(1, 0), (0, 1), (1, 1), (3, 0), (2, 1), (1, 2), (0, 3)]:
-        assert abs((x**a * y**b).mean()) < 1e-12
-    assert (x * x).mean() == pytest.approx(0.25, rel=1e-9)
-    assert (y * y).mean() == pytest.approx(0.25, rel=1e-9)
-
-
 def beyond(offset):
     """Share of the unit disc beyond a straight edge at an offset from the middle."""
     return (math.acos(offset) - offset * math.sqrt(1 - offset**2)) / math.pi
-
-
-@pytest.mark.parametrize(("count", "most"), [(7, 0.215), (19, 0.09), (61, 0.038), (217, 0.015)])
-def test_the_share_beyond_an_edge_is_nearly_that_of_the_disc(count, most):
-    worst = 0.0
-    for angle in np.radians(np.arange(0, 360, 0.25)):
-        along = np.sort(disc(count, 2.0) @ [math.cos(angle), math.sin(angle)])
-        exact = np.array([beyond(offset) for offset in along])
-        rest = count - np.arange(count)  # sub-rays at each one and beyond
-        worst = max(
-            worst, np.abs(rest / count - exact).max(), np.abs((rest - 1) / count - exact).max()
-        )
-    assert worst <= most
 
 
 @pytest.mark.parametrize("angle_deg", [0, 17, 45, 90, 133])
@@ -137,20 +109,6 @@ def test_a_whole_sensor_reports_the_ground_once(model, subrays):
         found = cast([mesh], sensor, returns=Returns("all", subrays=subrays))
         assert len(found["ray"]) > 40
         assert (found["returns"] == 1).all()
-
-
-@pytest.mark.parametrize("subrays", [7, 61])
-def test_every_plane_is_one_return(subrays):
-    """Of random planes, up to grazing by a third of a degree."""
-    rng = np.random.default_rng(1)
-    beam = Returns("all", subrays=subrays, divergence_mrad=4)
-    for grazing in np.radians(90 * rng.random(40) ** 3 + 0.3):
-        turn = rng.uniform(0, 2 * math.pi)
-        across = math.cos(grazing)
-        normal = (math.sin(grazing), across * math.cos(turn), across * math.sin(turn))
-        found = cast([plane((30.0, 0, 0), normal)], returns=beam)
-        distance, _ = footprint(30.0, grazing, 0.002)
-        assert found["range"] == pytest.approx([distance], abs=0.01)
 
 
 def test_rough_ground_is_seldom_more_than_one_return():

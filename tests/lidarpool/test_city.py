@@ -57,5 +57,5 @@ def test_every_kind_is_made_of_closed_solids_that_face_outward():
 
 @pytest.mark.parametrize(("triangles", "seed"), [(0, 0), (999, 0), (10**9, 0), (10_000, -1)])
 def test_out_of_range(triangles, seed):
-    with pytest.raises(LidarpoolError, match=r"give 1000 to|at least 0"):
+    with pytest.raises(LidarpoolError, match=r"triangles is|seed is"):
         city(triangles, seed)

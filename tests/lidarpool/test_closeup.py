@@ -1,10 +1,10 @@
-"""The part of a scene that is drawn around the way of a carrier."""
+"""The part of a scene that is drawn: around the way of a carrier, and under a roof."""
 
 import numpy as np
 import pytest
 
 from lidarpool import Scene
-from lidarpool.render.closeup import around_ways, cut_out
+from lidarpool.render.closeup import Part, around_ways
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
 
@@ -34,11 +34,12 @@ def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
         moved(box("hut", (4, 4, 3)), -10, 10),
         moved(box("other hut", (4, 4, 3)), 100, 10),
     ])  # fmt: skip
-    part, parents, shares = cut_out(scene, np.array([[-30.0, -20, 0], [30, 20, 27]]))
+    cut = Part.whole(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
+    part, shares = cut.scene, cut.shares
     there = {scene.names[k] for k in np.unique(part.face_object)}
     assert there == {"ground", "tower", "hut"}
     assert part.bounds == pytest.approx(np.array([[-30, -20, 0], [30, 20, 27]]))
-    assert np.array_equal(part.face_object, scene.face_object[parents])
+    assert np.array_equal(part.face_object, scene.face_object[cut.parents])
     ground = part.face_object == 0
     a, b, c = (part.vertices[part.faces[ground, k]] for k in range(3))
     assert np.cross(b - a, c - a)[:, 2].sum() / 2 == pytest.approx(60 * 40)  # none turned over
@@ -47,7 +48,5 @@ def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
 
 
 def test_where_nothing_stands_the_scene_stays_whole():
-    scene = Scene.seed()
-    part, parents, _ = cut_out(scene, np.array([[900.0, 900, 0], [990, 990, 9]]))
-    assert part is scene
-    assert len(parents) == len(scene.faces)
+    whole = Part.whole(Scene.seed())
+    assert whole.cut(np.array([[900.0, 900, 0], [990, 990, 9]])) is whole

@@ -63,16 +63,6 @@ def test_what_is_committed_is_there_once(db):
     again.close()
 
 
-def test_a_part_that_has_a_committed_scan_is_left_out_whole(db):
-    db.commit([receipt(5, 10)])
-    given = [
-        receipt(4, 6), receipt(9, 12), receipt(0, 20), receipt(6, 7),
-        receipt(0, 5), receipt(3, 5), receipt(10, 11),
-    ]  # fmt: skip
-    assert [(p.first, p.stop) for p in db.commit(given)] == [(0, 5), (10, 11)]
-    assert db.missing(0, SCANS) == [(11, 20)]
-
-
 @settings(max_examples=40, deadline=None)
 @given(
     st.lists(

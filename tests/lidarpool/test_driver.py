@@ -23,8 +23,6 @@ from lidarpool.pipeline.messages import (
     ColumnsLost,
     Receipt,
     ScanRange,
-    StorageFailed,
-    StorageHidden,
     Summaries,
     samples_of_scan,
     summary_type,
@@ -302,32 +300,6 @@ def test_the_batches_of_a_worker_that_dies_are_offered_to_others(run):
     assert [n for n in run.workers.tried.values() if n > 1] == [2, 2] == [b.offers for b in lost]
 
 
-def test_columns_on_a_worker_that_dies_are_cast_again_and_nobody_is_blamed(run):
-    run.stages.collectors = {}
-    run.until(lambda: run.at(Place.CAST))
-    for batch in (lost := run.at(Place.CAST)):
-        if batch.worker in run.workers.slots:
-            run.workers.die(batch.worker)
-    run.step()
-    assert all(batch.place is not Place.CAST and not batch.deaths for batch in lost)
-    run.stages.collectors = {"collect-0": "tcp://a:2"}
-    run.end()
-
-
-def test_a_silent_worker_is_left_while_there_are_others(run):
-    run.until(lambda: len(run.at(Place.CASTING)) == 4, idle="cast")
-    run.workers.silent = set(run.workers.slots)
-    slots, run.workers.slots = run.workers.slots, {}
-    run.workers.look = lambda: Whereabouts(frozenset(slots), frozenset(slots), {})
-    run.step()
-    assert len(run.at(Place.CASTING)) == 4, "there is no other worker"
-    del run.workers.look
-    run.workers.slots, run.workers.silent = slots, {"tcp://b:1"}
-    run.step()
-    assert {batch.worker for batch in run.at(Place.CASTING)} >= {"tcp://a:1"}
-    assert run.driver.offered_again == 2
-
-
 def test_a_worker_without_its_scene_gets_it_again(run):
     run.until(lambda: run.at(Place.CASTING), idle="cast")
     batch = run.at(Place.CASTING)[0]
@@ -385,18 +357,12 @@ def test_what_is_lost_on_its_way_is_cast_again(run, how):
 def test_parts_of_a_worker_that_does_not_see_the_storage_are_written_by_the_driver(run):
     run.until(lambda: any(run.stages.orders.values()), idle="collect")
     order = next(orders for orders in run.stages.orders.values() if orders).popleft()
-    run.stages.inbox += [StorageHidden("far"), run.stages.collect(order, held_at="tcp://far:1")]
+    run.stages.inbox.append(run.stages.collect(order, held_at="tcp://far:1"))
     run.step()
     assert order.name in run.storage.sizes() and not run.stages.held
     run.end()
     (note,) = run.driver.notes
-    assert note.startswith(f"far of partition LIDAR cannot see {run.storage.url}")
-
-
-def test_a_storage_that_fails_ends_the_run_with_what_to_do(run):
-    run.stages.inbox.append(StorageFailed("No space left on device"))
-    with pytest.raises(LidarpoolError, match=r"kept in .*parts \(No space left .*--parts"):
-        run.step()
+    assert note.startswith(f"tcp://far:1 of partition LIDAR cannot see {run.storage.url}")
 
 
 def test_a_sorter_that_dies_gets_again_what_was_not_handed_out(run):

@@ -32,7 +32,6 @@ from lidarpool import (
     Sensor,
     Survey,
     Track,
-    load_trajectory,
     read_cloud,
 )
 from lidarpool.base.open3d_module import load_open3d
@@ -40,10 +39,11 @@ from lidarpool.base.storage import Storage
 from lidarpool.base.yamlfile import load_yaml
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.table import TABLE
-from lidarpool.export import crs, parquet, pieces
+from lidarpool.export import las as las_module
+from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.crs import wkt
 from lidarpool.export.formats import Format
+from lidarpool.export.las import wkt
 from lidarpool.export.ros import START_NS
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.export.table import EXPORTS, FORMATS, LAYOUTS
@@ -140,9 +140,6 @@ def test_sweeps_come_back(sweeps, tmp_path):
     (tmp_path / "s.npz").write_bytes((tmp_path / "s.npz").read_bytes()[:300])
     with pytest.raises(LidarpoolError, match="damaged"):
         Sweeps.load(tmp_path / "s.npz")
-    replace(sweeps, sensor=sweeps.sensor[1:]).save(tmp_path / "s.npz")
-    with pytest.raises(LidarpoolError, match=r"damaged.*do not fit together"):
-        Sweeps.load(tmp_path / "s.npz")
 
 
 @pytest.mark.parametrize("name", ["las", "laz"])
@@ -218,15 +215,6 @@ def test_kitti_poses_bring_the_sweeps_of_a_sensor_together(written, cloud):
         np.testing.assert_allclose(apart, np.linalg.norm(own[1:] - own[:-1], axis=1), atol=1e-4)
 
 
-def test_kitti_poses_are_read_as_a_trajectory(written, sweeps):
-    """As KITTI's are: a camera's, which are turned to a carrier's."""
-    folder = written("kitti") / "sequences/01"
-    track = load_trajectory(folder / "poses.txt", times=folder / "times.txt")
-    places = sweeps.pose.positions[5:]
-    turn = matrices(sweeps.pose.quaternions[5:6])[0]
-    np.testing.assert_allclose(track.positions, (places - places[0]) @ turn, atol=1e-6)
-
-
 def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
     folder = written("nuscenes") / "samples"
     assert {path.name for path in folder.iterdir()} == {"front", "rear"}
@@ -238,7 +226,7 @@ def test_nuscenes_has_a_folder_for_each_sensor(written, cloud):
 
 @pytest.mark.parametrize("name", ["mcap", "rosbag2"])
 @pytest.mark.parametrize(("layout", "step"), [("velodyne", 22), ("autoware", 32), ("ouster", 48)])
-def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layout, step):
+def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layout, step, tmp_path):
     store = get_typestore(Stores.ROS2_HUMBLE)
     clouds, frames, fixed, boxes, clocks = {}, {}, {}, [], []
     with AnyReader([written(name, layout)], default_typestore=store) as bag:
@@ -301,6 +289,12 @@ def test_bags_have_points_frames_and_a_clock(written, cloud, sweeps, name, layou
     np.testing.assert_array_equal(rows[channel], points.channel)
     since = points.time - sweeps.begins_ns[sweep]
     np.testing.assert_allclose(rows[time] * (1e9 if time == "time" else 1), since, atol=10)
+    if name == "rosbag2":  # readers of Humble take versions up to 8, whose profiles are text
+        told = load_yaml((tmp_path / "rosbag2/metadata.yaml").read_text())
+        told = told["rosbag2_bagfile_information"]
+        assert told["version"] == 8
+        for one in (part["topic_metadata"] for part in told["topics_with_message_count"]):
+            assert bool(load_yaml(one["offered_qos_profiles"])) == (one["name"] == "/tf_static")
     if layout == "autoware":
         np.testing.assert_allclose(rows["azimuth"], np.radians(points.azimuth), rtol=1e-6)
         np.testing.assert_array_equal(rows["intensity"], np.round(points.intensity * 255))
@@ -347,10 +341,7 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     cloud, sweeps, tmp_path, monkeypatch
 ):
     bare = Cloud(cloud.positions, {name: cloud[name] for name in ("scan", "channel", "object")})
-    with pytest.raises(
-        LidarpoolError,
-        match=r"kitti needs intensity, class, which the cloud lacks: .* kitti in output.write, or",
-    ):
+    with pytest.raises(LidarpoolError, match=r"kitti needs intensity, class, .*output\.write"):
         Format("kitti").write(tmp_path / "kitti", bare, sweeps)
     with pytest.raises(LidarpoolError, match="mcap with the layout ouster needs intensity, time"):
         Format("mcap", "ouster").write(tmp_path / "cloud.mcap", bare, sweeps)
@@ -362,8 +353,6 @@ def test_what_cannot_be_written_is_one_line_and_leaves_nothing(
     assert len(laspy.read(tmp_path / "cloud.laz")) == len(cloud)
     with pytest.raises(LidarpoolError, match="gone does not exist: make it first"):
         Format("pcd").write(tmp_path / "gone/pcd", cloud, sweeps)
-    with pytest.raises(LidarpoolError, match="There is no format 'xyz': use ply, las"):
-        Format("xyz")
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
     with pytest.raises(LidarpoolError, match=r'laspy and lazrs: pip install "lidarpool\[las\]"'):
         Format("las").check_installed()
@@ -422,19 +411,6 @@ def test_any_name_makes_a_topic_a_frame_and_a_folder(cloud, sweeps, tmp_path):
     assert frames == {"base_link", "___front", "base_link_2", "map_2"}
 
 
-def test_readers_of_humble_parse_the_description_of_a_bag(written):
-    """They take profiles as text, as all do up to version 8."""
-    told = load_yaml((written("rosbag2") / "metadata.yaml").read_text())
-    told = told["rosbag2_bagfile_information"]
-    assert told["version"] == 8
-    for one in told["topics_with_message_count"]:
-        topic = one["topic_metadata"]
-        profiles = load_yaml(topic["offered_qos_profiles"]) or []
-        assert [profile["durability"] for profile in profiles] == [1] * (
-            topic["name"] == "/tf_static"
-        )
-
-
 def test_a_start_and_a_coordinate_system_are_in_files_that_hold_them(
     cloud, scene, survey, tmp_path
 ):
@@ -471,7 +447,7 @@ def test_zones_of_utm_need_no_other_package(epsg, middle, north):
 
 
 def test_other_coordinate_systems_come_from_pyproj(monkeypatch):
-    monkeypatch.setattr(crs, "find_spec", lambda name: None)
+    monkeypatch.setattr(las_module, "find_spec", lambda name: None)
     with pytest.raises(LidarpoolError, match=r"EPSG:2056 is not a UTM zone .*: pip install pyproj"):
         wkt(2056)
 
@@ -615,13 +591,11 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
         (r"has no format: use .ply, .las, .*, or give a format", "x.xyz", {}),
-        ("There is no format 'xyz': use", "x", {"format": "xyz"}),
-        ("There is no layout 'sick': use velodyne", "x.mcap", {"layout": "sick"}),
+        ("format is 'xyz'; .* ply, las", "x", {"format": "xyz"}),
+        ("layout is 'sick'; .* velodyne", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),
         ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),
-        ("layout is 3; it must be text", "x.mcap", {"layout": 3}),
-        ("gone does not exist: make it first", "gone/x.laz", {}),
     ):
         with pytest.raises(LidarpoolError, match=told):
             known.save(tmp_path / path, **more)
@@ -663,21 +637,6 @@ def test_a_format_is_named_as_in_a_scenario():
     for entry in ({"layout": "ouster"}, {"format": "mcap", "step": 3}, 5):
         with pytest.raises(LidarpoolError, match="names no format: give a name, or"):
             Format.of(entry)
-
-
-def test_an_error_in_a_thread_ends_the_writing(sweeps, cloud, tmp_path, monkeypatch):
-    def full(storage, name, data):
-        if name.endswith(".bin"):
-            raise OSError(28, "No space left on device")
-        write(storage, name, data)
-
-    write = Storage.write
-    monkeypatch.setattr(Storage, "write", full)
-    monkeypatch.setattr(pieces, "THREADS", 2)
-    monkeypatch.setattr(pieces, "RANGE_PIECES", 1)
-    with pytest.raises(LidarpoolError, match="kitti cannot be written: No space left on device"):
-        Format("kitti").write(tmp_path / "kitti", cloud, sweeps)
-    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize("name", ["kitti", "nuscenes", "parquet", "pcd"])

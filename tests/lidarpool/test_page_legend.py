@@ -16,7 +16,9 @@ HEIGHTS = np.linspace(0, 10, 200)
 def colours_of(*arguments):
     """Colours (n, 3) as bytes, and the legend as JSON."""
     coloured = colouring_of(*arguments)
-    return as_bytes(coloured.colours), json.dumps(legend_of(coloured), ensure_ascii=False)
+    return as_bytes(coloured.paint(arguments[0])), json.dumps(
+        legend_of(coloured), ensure_ascii=False
+    )
 
 
 def test_numbers_go_up_the_colours():

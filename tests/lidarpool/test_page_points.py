@@ -50,15 +50,6 @@ def test_a_camera_sees_what_is_before_it():
     assert len(set(tiles[inside].tolist())) == 3
 
 
-@pytest.mark.parametrize(
-    ("low", "seen"),
-    [((-1, 5, -1), True), ((20, 5, 0), False), ((-1, -9, -1), False), ((-50, 5, 30), False)],
-)
-def test_a_box_is_left_out_only_where_none_of_it_is_seen(low, seen):
-    assert EYE.may_see(np.array([low, np.array(low) + 2.0])) == seen
-    assert EYE.may_see(np.array([[-100.0] * 3, [100.0] * 3]))  # the camera is in it
-
-
 def test_all_parts_of_a_picture_show_as_many_points_unless_they_have_fewer():
     counts = np.array([1000, 10, 0, 500])
     shares = even_shares(counts, 210)
@@ -66,13 +57,6 @@ def test_all_parts_of_a_picture_show_as_many_points_unless_they_have_fewer():
     assert counts @ shares == pytest.approx(210)
     assert counts[0] * shares[0] == pytest.approx(counts[3] * shares[3])
     assert even_shares(counts, 5000).tolist() == [1, 1, 1, 1]
-
-
-def test_a_parallel_projection_sees_the_same_width_near_and_far():
-    places = np.array([[9, 5, 0], [9, 500, 0], [11, 500, 0], [0, -5, 0.0]])
-    at, inside = along_y(parallel=True).seen(places)
-    assert inside.tolist() == [True, True, False, False]
-    assert at[:2] == pytest.approx(np.array([[0.9, 0], [0.9, 0]]))
 
 
 def test_a_filter_keeps_what_is_within_all_limits():

@@ -56,17 +56,15 @@ class Secrets:
         arrays = {"bytes": np.arange(3, dtype=np.uint8), "reals": np.float32([[1, 2], [3, np.nan]])}
         return {"secret": "ä", "asked": asked}, arrays
 
-    def order(self, what):
-        if what != "stop":
-            raise KeyError(what)
-        self.ordered.append(what)
+    def stop(self):
+        self.ordered.append("stop")
 
 
 @pytest.fixture
 def served():
     """Return a page and what it shows."""
     source = Secrets()
-    with page_server(source, port=0) as page:
+    with page_server(lambda *asked: source.answer(*asked), 0, source.stop) as page:
         yield page, source
 
 
@@ -138,7 +136,7 @@ def test_an_answer_that_nobody_waits_for_is_given_up(served):
 
 def test_a_port_that_is_taken_is_no_reason_to_fail(served):
     page, source = served
-    with page_server(source, port=page.port) as other:
+    with page_server(source.answer, port=page.port) as other:
         assert other.port != page.port
         assert ask(other.url, "secret")["secret"] == "ä"
     with pytest.raises(urllib.error.URLError):

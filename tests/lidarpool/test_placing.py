@@ -54,44 +54,37 @@ OBJECTS = {
     "casing": (creation.box((0.8, 0.6, 0.5)), inverted(creation.box((0.7, 0.5, 0.4)))),
     "round casing": (creation.icosphere(3, 4.0), inverted(creation.icosphere(3, 3.8))),
     "torus": (creation.torus(1, 0.3),),
-    "large torus": (creation.torus(10, 3),),
     "capsule": (creation.capsule(12, 2.5),),
     "gear": (gear(1.0),),
     "gear in millimetres": (gear(80.0),),
     "machine with an opening": (creation.torus(6, 4.5), creation.icosphere(3, 2.0)),
-    "two balls": (
-        creation.icosphere(3, 0.5),
-        creation.icosphere(3, 0.5).apply_translation([3, 0, 0]),
-    ),
 }
 
 
-@pytest.mark.parametrize("name", OBJECTS)
-@pytest.mark.parametrize("far", [0.0, 4_000_000.0])
+@pytest.mark.parametrize(
+    ("name", "far"), [*((name, 0.0) for name in OBJECTS), ("casing", 4_000_000.0)]
+)
 def test_an_object_is_seen_from_around_it_and_only_from_outside(name, far):
     scene = scene_of(*OBJECTS[name], at=(far, far, 0))
     placed = place(scene, GRID)
     assert placed.around and "looks like an object" in placed.note and len(placed.poses) == 5
     poses = [np.subtract(pose.position, scene.origin) for pose in placed.poses]
-    middle, diagonal = scene.bounds.mean(axis=0), np.linalg.norm(np.ptp(scene.bounds, axis=0))
+    middle, sides = scene.bounds.mean(axis=0), np.ptp(scene.bounds, axis=0)
     far_m = np.linalg.norm(poses - middle, axis=1)
-    np.testing.assert_allclose(far_m, 1.5 * diagonal, rtol=0.01)
+    np.testing.assert_allclose(far_m, 1.5 * np.linalg.norm(sides), rtol=0.01)
     local = [
         replace(pose, position=tuple(at)) for pose, at in zip(placed.poses, poses, strict=True)
     ]
-    survey = Survey(Sensor.grid(), local)
-    rig = Rig(scene, survey, "auto")
+    rig = Rig(scene, Survey(Sensor.grid(), local), "auto")
     points = []
     for number in range(5):
         returns = list(rig.cast(36 * number, 36 * (number + 1)))
         assert sum(map(len, returns)) > 100, "each pose sees the object"
         points += [one.positions for one in returns]
     low, high = np.concatenate(points).min(axis=0), np.concatenate(points).max(axis=0)
-    sides = np.ptp(scene.bounds, axis=0)
     # No pose sees the underside.
-    assert ((high - low)[:2] > 0.9 * sides[:2]).all() and high[2] > scene.bounds[
-        1, 2
-    ] - 0.1 * sides[2]
+    assert ((high - low)[:2] > 0.9 * sides[:2]).all()
+    assert high[2] > scene.bounds[1, 2] - 0.1 * sides[2]
     assert not Surroundings(scene).views(poses).back.any()
 
 

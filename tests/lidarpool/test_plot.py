@@ -14,7 +14,6 @@ import pytest
 from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
-from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.table import Column
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
@@ -147,15 +146,6 @@ def test_a_damaged_file_is_refused(damage, said, result):
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_some_of_the_points_are_of_every_channel(tmp_path):
-    path = tmp_path / "cloud.ply"
-    layers, rays = 40, 500  # a ray's points follow those of the ray beside it, channel by channel
-    ring = np.tile(np.arange(layers), rays).astype(np.int32)
-    cloud_at(np.stack([ring] * 3, axis=1).astype(float)).save(path)
-    chosen = CloudFile(path).choose(len(ring) // 20)  # every 20th would be of two rings
-    assert len(np.unique(chosen.positions[:, 2])) == layers
-
-
 def test_some_are_drawn_to_another_folder(result, tmp_path):
     before = names(result)
     out = tmp_path / "new" / "folder"
@@ -191,21 +181,18 @@ def test_the_cloud_is_needed_for_its_own_picture_only(result):
         plot(result, "--only", "cloud", *SMALL)
 
 
-def test_a_result_without_a_plan(unplanned, tmp_path):
-    result = make(tmp_path / "result", unplanned)
+@pytest.mark.parametrize(
+    ("coordinates", "pictures", "left_out"),
+    [("world", {"scene.png", "intensity.png", "cloud.png"}, "path"),
+     ("sensor", {"scene.png", "intensity.png"}, "cloud")],
+)  # fmt: skip
+def test_pictures_that_there_are_not(coordinates, pictures, left_out, unplanned, tmp_path):
+    """No path without planning; and points in the axes of their sensors do not fit the scene."""
+    result = make(tmp_path / "result", replace(unplanned, coordinates=coordinates))
     plot(result, *SMALL, "--out", tmp_path / "out")
-    assert names(tmp_path / "out") == {"scene.png", "intensity.png", "cloud.png"}
-    with pytest.raises(LidarpoolError, match=r"no picture 'path': its run planned no path"):
-        plot(result, "--only", "path")
-
-
-def test_points_in_the_axes_of_their_sensors_are_in_no_picture(unplanned, tmp_path):
-    """They do not fit the scene."""
-    result = make(tmp_path / "result", replace(unplanned, coordinates="sensor"))
-    plot(result, *SMALL, "--out", tmp_path / "out")
-    assert names(tmp_path / "out") == {"scene.png", "intensity.png"}
-    with pytest.raises(LidarpoolError, match="no picture 'cloud': its run has points in the axes"):
-        plot(result, "--only", "cloud")
+    assert names(tmp_path / "out") == pictures
+    with pytest.raises(LidarpoolError, match=f"no picture '{left_out}'"):
+        plot(result, "--only", left_out)
 
 
 def test_a_result_in_storage(result, tmp_path):

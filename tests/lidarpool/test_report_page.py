@@ -14,8 +14,8 @@ import yaml
 from lxml import html
 
 from lidarpool import Cloud, Planning, Result, Scene, Survey
-from lidarpool.base.task_book import TaskBook
 from lidarpool.pipeline import COLLECT, GENERATE, INTERSECT, SORT
+from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.cloud_numbers import CountedCloud
@@ -121,7 +121,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
                 "notes": (),
                 "identity": {},
                 "_hit_counts": lambda: np.zeros(len(scene.faces), np.int64),
-                "_sample_rays": lambda: np.zeros((0, 2, 3), np.float32),
+                "sample_rays": np.zeros((0, 2, 3), np.float32),
             }
             | changes
         )
@@ -213,13 +213,6 @@ def test_the_head_says_who_scanned_and_what_a_user_asks_for(write):
     assert order.index("The cloud") < order.index("Sensor and scene") < order.index("Timeline")
 
 
-def test_ranges_are_at_the_head_if_the_cloud_has_them(write):
-    cloud = cloud_of(500, 2, 120, 16)
-    ranges = {**cloud.columns, "range": np.linspace(0.5, 98.7, 500).astype(np.float32)}
-    text, _ = write(cloud=Cloud(cloud.positions, ranges))
-    assert "0.5 to 98.7 m" in text and "size of the cloud" not in text
-
-
 @pytest.mark.parametrize("each", [4, 400])
 def test_the_density_is_that_of_the_surfaces(each):
     """Of a floor and a wall, sparser than a cell has or denser, wherever they are."""
@@ -270,6 +263,9 @@ def test_the_timeline_shows_who_worked_when_and_is_bounded(write):
     assert "; the busiest 24 of 200 rows" in text and f"{20_004:,} tasks in" in text
 
 
+CLOUD = cloud_of(500, 2, 120, 16)
+RANGES = {**CLOUD.columns, "range": np.linspace(0.5, 98.7, 500).astype(np.float32)}
+RANGED = Cloud(CLOUD.positions, RANGES)
 STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
 
 
@@ -283,6 +279,7 @@ STRAY = TaskRecord(TRIAL, "OTHER", "GPU-0", ("GPU",), 0, 1)
         ({"plan": Planning((0, 0), (10, 0), trials=1, particles=5, iterations=1)}, "there are non"),
         ({"tasks": [*records(), STRAY]}, "A task of trial ran on GPU-0, which is not in OTHER."),
         ({}, "left no record"),
+        ({"cloud": RANGED}, "0.5 to 98.7 m"),
     ],
 )
 def test_what_is_unusual_is_told(write, changes, words):

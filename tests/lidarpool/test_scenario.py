@@ -1,6 +1,5 @@
 """Scenario files: defaults, what they build, and a message for each way to get one wrong."""
 
-import itertools
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
@@ -14,8 +13,7 @@ from trimesh.exchange.gltf import export_glb
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.base.yamlfile import read_yaml
-from lidarpool.scenario.scenario import SEED_KEPT, Scenario
+from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor import Noise, Returns, Sensor, Survey
 from lidarpool.sensor.materials import MaterialTable
 
@@ -51,41 +49,22 @@ def everything(loaded):
 
 @pytest.mark.parametrize("source", ["python", "file", "empty sections"])
 def test_the_default_survey(source, scenario):
-    if source == "python":
-        loaded = Scenario()
-    elif source == "file":
-        loaded = Scenario.load(EXAMPLES / "seed.yaml")
-    else:
-        loaded = scenario("scene:\nsensor:\nposes:\ncloud:\nplanning:\npool:\n")
+    loaded = {
+        "python": Scenario,
+        "file": lambda: Scenario.load(EXAMPLES / "seed.yaml"),
+        "empty sections": lambda: scenario("scene:\nsensor:\nposes:\ncloud:\nplanning:\npool:\n"),
+    }[source]()
     scene, survey, planning = everything(loaded)
     assert fingerprint(survey) == fingerprint(DEFAULT)
-    assert survey.scan_count == 108
-    assert survey.ray_count == 120_000
-    assert len(scene.faces) == 76_800
-    assert planning.start == (25, 25)
-    assert planning.target == (-30, -20)
+    assert (survey.scan_count, survey.ray_count, len(scene.faces)) == (108, 120_000, 76_800)
+    assert (planning.start, planning.target) == ((25, 25), (-30, -20))
     np.testing.assert_allclose(planning.radii, 2.0, atol=1e-12)
     centres = [(-20, -20), (20, -20), (-20, 20), (20, 20), (-10, -5), (5, 5)]
     np.testing.assert_allclose(planning.centres, centres, atol=1e-12)
     numbers = (planning.trials, planning.particles, planning.iterations, planning.seed)
     assert numbers == (100, 1000, 300, 0)
-    assert loaded.pool.queue_capacity == 10
-    assert loaded.pool.collectors == 2
-    assert loaded.pool.backend == "auto"
-
-
-def test_the_seed_example_writes_out_the_defaults():
-    stated = read_yaml(EXAMPLES / "seed.yaml")
-    plain, scenario = Scenario().model_dump(), Scenario.load(EXAMPLES / "seed.yaml")
-    loaded = scenario.model_dump()
-    assert stated["cloud"].keys() == plain["cloud"].keys() - {"epsg", "start"}
-    chosen = {"keep_every": SEED_KEPT, "precision_m": Sensor().optics.resolution_m}
-    assert loaded["cloud"] == plain["cloud"] | chosen
-    sensors = (scenario.sensor.sensor(Path()), Sensor(), Sensor.grid())
-    assert len({fingerprint(sensor) for sensor in sensors}) == 1
-    for section in ("planning", "pool"):
-        for name in set(stated[section]) - {"enabled", "start", "target", "obstacles"}:
-            assert stated[section][name] == plain[section][name]
+    pool = loaded.pool
+    assert (pool.queue_capacity, pool.collectors, pool.backend) == (10, 2, "auto")
 
 
 def test_a_model_and_a_unit_of_it(tmp_path):
@@ -144,18 +123,11 @@ def test_mesh_files_are_placed(scenario, crate):
     assert loaded.plan(scene) is None
 
 
-def test_files_relative_to_the_scenario_and_seed_beside_them(scenario, crate):
+def test_seed_beside_files(scenario, crate):
     (crate.parent / "meshes").mkdir()
     crate.rename(crate.parent / "meshes" / "crate.stl")
     scene = scenario("scene: {preset: seed, files: meshes/crate.stl}").build_scene()
     assert scene.names[-2:] == ("Bowl", "crate")
-
-
-def test_a_mesh_file_is_a_scenario(crate):
-    scene, survey, planning = everything(Scenario.load(crate))
-    assert scene.names == ("crate",)
-    assert [pose.position for pose in survey.poses] == [(0, 0, -2), (0, 0, -1), (0, 0, 0)]
-    assert planning is None
 
 
 def test_georeferenced_poses_and_plans_are_local(scenario, crate):
@@ -200,16 +172,7 @@ def test_an_obstacle_whose_name_has_brackets(tmp_path, scenario):
 
 def test_numbers_as_everybody_writes_them(scenario):
     loaded = scenario("cloud: {precision_m: 1e-3}\nsensor: {max_range_m: .inf, step_deg: 20}")
-    assert loaded.cloud.precision_m == 0.001
-    assert fingerprint(loaded.sensor.sensor(Path())) == fingerprint(Sensor.grid(step_deg=20.0))
-
-
-def laughs():
-    """YAML whose last list holds 10^9 others."""
-    rows = [f"a: &a [{', '.join('1' * 10)}]"]
-    for of, name in itertools.pairwise("abcdefghi"):
-        rows.append(f"{name}: &{name} [{', '.join([f'*{of}'] * 10)}]")
-    return "\n".join(rows)
+    assert (loaded.cloud.precision_m, loaded.sensor.step_deg) == (0.001, 20)
 
 
 IDENTITY = "[[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]"
@@ -219,29 +182,18 @@ BAD = [
     # (text, what the message says after the file's name)
     ("sensor: {layers: 0}", r"sensor\.layers is 0; input should be greater than or equal to 1"),
     ("sensor: {layers: '40'}", r"sensor\.layers is '40'; input should be a valid integer"),
-    ("sensor: {layers: }", r"is empty; input should be a valid integer"),
     ("sensor: {layer: 4}", r"sensor\.layer is not a field\. Did you mean 'layers'\?"),
-    ("sensor: {modle: a}", r"sensor\.modle is not a field\. Did you mean 'model'\?"),
     ("sensors: {a: {mount: {positon: [0, 0, 0]}}}", "a.mount.positon .* mean 'position'"),
     ("sensr: {}", r"sensr is not a field\. Did you mean 'sensor'\?"),
     ("sensor: {vertical_fov_deg: .nan}", r"is nan; input should be a finite number"),
     ("sensor: {step_deg: 0.1}", "less than one firing"),
-    ("sensor: {min_range_m: 5, max_range_m: 2}", "must be above min_range_m"),
     ("sensor: {model: velodyne/vlp61}", "no sensor model .* Did you mean 'velodyne/vlp16'"),
-    ("sensor: {model: OS1-64}", r"no sensor model .* Did you mean 'ouster/os1-64'\?"),
     ("sensor: {model: ouster/os1-64, layers: 64}", "a model defines the beams: leave out layers"),
-    ("sensor: {calibration: a.json, rays_per_revolution: 512}", "leave out rays_per_revolution"),
     ("sensor: {columns: 512, rays_per_revolution: 512}", "mean the same: give one of them"),
-    ("sensor: {model: velodyne/vlp16, columns: 1800}", "follow from rate_hz: leave columns out"),
-    ("sensor: {model: livox/mid360}", "has no rays of its own: give calibration: FILE"),
-    ("sensor: {model: ouster/os1-64, columns: 0}", r"sensor\.columns is 0; input should be"),
-    ("sensor: {model: velodyne/vlp16, min_range_m: 200}", "max_range_m is 130"),
     ("sensor: [1]", r"sensor is \[1\]; input should be a valid dictionary"),
     ("poses: []", r"poses is \[\]; .* at least 1 item"),
     ("poses: [0, 0, 1]", r"poses\[0\]: a pose is x, y and z in metres.* given is 0"),
     ("poses: [[0, 0]]", r"poses\[0\]\.position\[2\] is missing"),
-    ("poses: [[0, 0, x]]", r"poses\[0\]\.position\[2\] is 'x'; input should be a valid number"),
-    ("poses: [{yaw_deg: 0}]", r"poses\[0\]\.position is missing"),
     ("poses: [{position: [0, 0, 0], yaw: 5}]", r"poses\[0\]\.yaw is not.*'yaw_deg'"),
     ("poses: &a [*a]", r"s\.yaml, line 1: 'a' contains itself"),
     ("scene: {files: [{unit: m}]}", r"scene\.files\[0\]\.file is missing"),
@@ -254,7 +206,6 @@ BAD = [
     ("planning: {start: [1, 1], target: [1, 1]}", "nothing to plan"),
     ("planning: {obstacles: [Bel]}", "Did you mean 'Bell'"),
     ("planning: {obstacles: [{centre: [0, 0]}]}", "both centre and radius_m"),
-    ("planning: {seed: 99999999999999999999}", "seed is 9+; input should be less than"),
     ("scene: a.stl\nplanning: {enabled: true}", r"give planning\.start and planning\.target"),
     ("scene: a.stl\nplanning: {start: [9, 9]}", "give both planning.start and planning.target"),
     ("pool: {backend: opengl}", "should be 'auto', 'cuda', 'embree' or 'numpy'"),
@@ -262,14 +213,10 @@ BAD = [
     ("hello", "holds only 'hello'"),
     ("a: b: c", "line 1: mapping values are not allowed here"),
     ("steps: 4\nsensor: {}\nsteps: 5", "line 3: 'steps' is given twice"),
-    ("1: 2", "1.* is not a field"),
     ("[" * 50_000, "not valid YAML: maximum recursion depth"),
     ("steps: !!python/object/apply:os.getcwd []", "line 1: could not determine a constructor"),
-    (laughs() + "\nposes: *i", "would unpack to"),
-    ("scene: {files: [!!python/name:os.system ]}", "could not determine a constructor"),
     ("sensor: {layers: " + "9" * 5000 + "}", r"sensor\.layers is 9+\.\.\.|Exceeds the limit"),
     (b"\xff\xfe\x00", "not valid YAML: 'utf-8' codec"),
-    ("steps: '\0'", "not valid YAML: unacceptable character"),
     ('scene: {files: ["~nosuchuser/x.stl"]}', r"'~nosuchuser/x\.stl' cannot be found"),
 ]
 
@@ -313,13 +260,6 @@ def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
     with pytest.raises(LidarpoolError) as raised:
         scenario("scene: [no.glb, nor.stl]").build_scene()
     assert str(raised.value).count("does not exist") == 2
-
-
-def test_bad_files(tmp_path):
-    with pytest.raises(LidarpoolError, match="does not exist"):
-        Scenario.load(tmp_path / "no.yaml")
-    with pytest.raises(LidarpoolError, match="cannot be read: Is a directory"):
-        Scenario.load(tmp_path)
 
 
 def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):

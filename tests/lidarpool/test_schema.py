@@ -38,15 +38,11 @@ BAD: list[dict[str, Any]] = [
     {"sensor": {"layer": 4}},
     {"sensor": {"layers": 0}},
     {"sensor": {"layers": "40"}},
-    {"scene": {"files": [{"unit": "mm"}]}},
     {"scene": {"files": [{"file": "a.stl", "unit": "mile"}]}},
     {"poses": []},
     {"poses": [[0, 0]]},
-    {"poses": [{"yaw_deg": 3}]},
     {"planning": {"obstacles": [{"centre": [1, 2, 3], "radius_m": 1}]}},
-    {"planning": {"start": [1]}},
     {"pool": {"backend": "embre"}},
-    {"pool": {"gpu": 0}},
     {"cloud": {"keep_every": 2.5}},
 ]
 

@@ -4,12 +4,7 @@ from itertools import pairwise
 
 import pytest
 
-from lidarpool.base.task_book import (
-    MISPLACED_MOST,
-    RECORDS_MOST,
-    StageTotals,
-    TaskBook,
-)
+from lidarpool.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
 from poolpart import TaskRecord
 
 

@@ -9,7 +9,6 @@ import pytest
 
 from lidarpool import LidarpoolError, Mounted, Pose, Sensor, Survey, Track, load_trajectory
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.trajectory import matrices
 
 RNG = np.random.default_rng(5)
@@ -162,24 +161,3 @@ class TestSurveys:
         survey = Survey(sensors=mounted, poses=[(0, 0, 1), (9, 0, 1)])
         starts = [survey.scan(k).start_ns for k in (0, 36, 72, 108)]
         assert starts == [0, 200_000_000, 0, 200_000_000]
-
-
-def scenario(files, text):
-    path = files.folder / "s.yaml"
-    path.write_text(text)
-    return path
-
-
-def test_a_scenario(files):
-    text = (
-        "trajectory: {file: drive.tum, interpolation: smooth, duration_s: 1}\n"
-        "sensors:\n"
-        "  front: {model: velodyne/vlp16, mount: {position: [1, 0, 0], pitch_deg: 10}}\n"
-        "  rear: {layers: 4, rate_hz: 20, mount: {position: [-1, 0, 0], yaw_deg: 180}}\n"
-    )
-    loaded = Scenario.load(scenario(files, text))
-    survey = loaded.survey(loaded.build_scene())
-    assert [carried.name for carried in survey.sensors] == ["front", "rear"]
-    assert survey.steps_each == (360, 720)
-    assert survey.trajectory.smooth
-    assert survey.sensors[0].mount.pitch_deg == 10

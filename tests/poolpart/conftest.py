@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import time
 import uuid
+from collections import Counter
 from contextlib import ExitStack
 
 import pytest
 from distributed import Client, Nanny, Scheduler
+from distributed.comm import tcp
 from tests.clusters import QUIET, cluster_of
 
-from poolpart import Pipe, Pool, local_cluster
+from poolpart import Partition, Pipe, Pool, local_cluster
 from poolpart.internals import FixedCluster
 
 
@@ -48,6 +50,16 @@ def client(_threads):
     with Client(_threads) as client:
         yield client
     wait_until(lambda: not _threads.scheduler.tasks)
+
+
+@pytest.fixture
+def a(client):
+    return Partition("A", client)
+
+
+@pytest.fixture
+def b(client):
+    return Partition("B", client)
 
 
 @pytest.fixture(scope="session")
@@ -124,6 +136,19 @@ def make_pipe():
     yield make
     for pipe in made:
         pipe.delete()
+
+
+@pytest.fixture
+def received(monkeypatch):
+    """Bytes that this process, with client and scheduler, receives: {peer: bytes}."""
+    counts, read = Counter(), tcp.read_bytes_rw
+
+    async def count(stream, n):
+        counts[stream.socket.getpeername()[:2]] += n
+        return await read(stream, n)
+
+    monkeypatch.setattr(tcp, "read_bytes_rw", count)
+    return counts
 
 
 def wait_until(condition, timeout_s=120.0):

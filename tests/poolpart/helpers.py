@@ -48,22 +48,17 @@ def addresses(client):
 
 
 def kill(client, name):
-    """Kill a worker's process; returns the address that it had."""
-    address = addresses(client)[name]
-    kill_nannied(client, address)
-    return address
-
-
-def kill_nannied(client, address):
-    """Kill the process of a worker that has a nanny, as soon as that would start it again.
+    """Kill a worker's process as soon as its nanny would start it again; returns its address.
 
     A nanny ends when its first worker dies before it has heard that this one is up. It looks 20
     times a second, on a busy machine less often.
     """
+    address = addresses(client)[name]
     pid = client.run(os.getpid, workers=[address])[address]
     while client.run(_hears_of_worker, workers=[address], nanny=True) != {address: True}:
         time.sleep(0.01)
     os.kill(pid, signal.SIGKILL)
+    return address
 
 
 def _hears_of_worker(dask_worker):

@@ -1,38 +1,29 @@
 """Which CUDA device a worker uses: shared evenly, kept, and found free by whoever is restarted."""
 
 import os
-import shutil
 import signal
-import subprocess
 from collections import Counter
 from types import SimpleNamespace
-from unittest.mock import patch
 
-import dask
 import pytest
-from distributed import Client, Nanny, Scheduler, SpecCluster
+from distributed import Client, Nanny
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.clusters import QUIET, cluster_of
 
-from poolpart import Pool, assign_devices, devices, own_device, probe
+from poolpart import Pool, devices, own_device, probe
 
-# What a worker sees is in an environment variable: a letter for each device.
-DRIVER = """
-#include <stdlib.h>
-#include <string.h>
-int cuInit(unsigned flags) { return 0; }
-int cuDeviceGetCount(int *count) { *count = strlen(getenv("FAKE_GPUS")); return 0; }
-int cuDeviceGetUuid_v2(unsigned char *uuid, int device) {
-  memset(uuid, getenv("FAKE_GPUS")[device], 16);
-  return 0;
-}
+# Each worker sees two devices.
+PRELOAD = """
+from poolpart import probe
+probe.visible_gpus = lambda: ("x", "y")
 """
 
 
 # -- the choice, without a cluster -----------------------------------------------------
 
 
-def cluster_of(**partitions):
+def scheduler_of(**partitions):
     """What the choice needs of a scheduler; the workers' partitions by address."""
     workers = {
         address: SimpleNamespace(address=address, extra={}, resources=dict.fromkeys(names, 1))
@@ -43,19 +34,19 @@ def cluster_of(**partitions):
 
 def assign(scheduler, **visible):
     """Devices of workers by address; a letter in `visible` is a device that it sees."""
-    return devices._assign(visible, dask_scheduler=scheduler)
+    return {a: devices._assign(a, gpus, dask_scheduler=scheduler) for a, gpus in visible.items()}
 
 
 def test_rotated_lists_all_use_their_first():
     """As those of dask-cuda, where each worker sees all devices, its own one first."""
-    scheduler = cluster_of(a="P", b="P", c="P")
+    scheduler = scheduler_of(a="P", b="P", c="P")
     assert assign(scheduler, a="xyz", b="yzx", c="zxy") == {"a": 0, "b": 0, "c": 0}
-    assert assign(scheduler, a="xyz", gone="x") == {"a": 0}
+    assert assign(scheduler, a="xyz", gone="x") == {"a": 0, "gone": None}
 
 
 def test_members_of_a_partition_spread_whatever_others_use():
     """One that has left the partition keeps the device, which counts less."""
-    scheduler = cluster_of(other="Q", idle="", a="P", b="P", c="R")
+    scheduler = scheduler_of(other="Q", idle="", a="P", b="P", c="R")
     assign(scheduler, other="xy")
     assign(scheduler, idle="y")
     assert assign(scheduler, a="xy", b="xy") == {"a": 0, "b": 1}
@@ -66,15 +57,12 @@ def test_members_of_a_partition_spread_whatever_others_use():
 def test_shared_evenly_whatever_the_order_of_the_lists_and_whoever_is_restarted(gpus, n, data):
     names = "uvwxy"[:gpus]
     views = {f"w{i}": data.draw(st.permutations(names)) for i in range(n)}
-    scheduler = cluster_of(**dict.fromkeys(views, "P"))
+    scheduler = scheduler_of(**dict.fromkeys(views, "P"))
     asked = data.draw(st.permutations(list(views)))
-    if data.draw(st.booleans()):
-        assign(scheduler, **views)
-    for address in asked:
-        assign(scheduler, **{address: views[address]})
+    assign(scheduler, **{address: views[address] for address in asked})
     for number, victim in enumerate(asked[: data.draw(st.integers(0, n))]):
         del scheduler.workers[victim]
-        scheduler.workers |= cluster_of(**{f"again{number}": "P"}).workers
+        scheduler.workers |= scheduler_of(**{f"again{number}": "P"}).workers
         views[f"again{number}"] = views.pop(victim)
         assign(scheduler, **{f"again{number}": views[f"again{number}"]})
     ordinals = assign(scheduler, **views)
@@ -88,23 +76,10 @@ def test_shared_evenly_whatever_the_order_of_the_lists_and_whoever_is_restarted(
 
 
 def test_without_a_driver_nobody_is_asked(start, monkeypatch):
-    monkeypatch.setattr(probe, "has_driver", lambda: False)
+    monkeypatch.setattr(probe, "visible_gpus", lambda: ())
     client = start({"a": {}})
     assert client.submit(own_device).result() is None
-    assert assign_devices(client, Pool.from_client(client)) == {}
     assert client.cluster.scheduler.workers.popitem()[1].extra == {}
-
-
-def test_two_clients_get_the_same_answer(start, monkeypatch):
-    monkeypatch.setattr(probe, "has_driver", lambda: True)
-    monkeypatch.setattr(probe, "visible_gpus", lambda: ("x", "y"))
-    client = start({name: {} for name in "abc"})
-    with Client(client.cluster) as other:
-        given = assign_devices(client, Pool.from_client(client))
-        assert sorted(given.values()) in ([0, 0, 1], [0, 1, 1])
-        assert assign_devices(other, Pool.from_client(other)) == given
-        own = {a: other.submit(own_device, workers=[a], pure=False).result() for a in given}
-    assert own == given
     with pytest.raises(ValueError, match="worker"):
         own_device()
 
@@ -112,37 +87,18 @@ def test_two_clients_get_the_same_answer(start, monkeypatch):
 @pytest.fixture
 def nameless(tmp_path):
     """Client of a cluster of two nannies without names, each of which sees two devices."""
-    compiler = shutil.which("cc") or shutil.which("gcc")
-    if compiler is None:
-        pytest.skip("no C compiler to make a driver with")
-    source = tmp_path / "driver.c"
-    source.write_text(DRIVER)
-    library = tmp_path / "libcuda.so.1"
-    subprocess.run([compiler, "-w", "-shared", "-fPIC", "-o", library, source], check=True)
-    # Where to look for libraries has to be known before the worker's process begins.
-    environ = {"LD_LIBRARY_PATH": str(tmp_path), "FAKE_GPUS": "xy"}
-    before = {f"distributed.nanny.pre-spawn-environ.{name}": environ[name] for name in environ}
-    options = {"nthreads": 2, "host": "127.0.0.1", "dashboard": False, "silence_logs": 50}
-    scheduler = {
-        "cls": Scheduler,
-        "options": {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0", "dashboard": False},
-    }
+    (tmp_path / "devices.py").write_text(PRELOAD)
+    options = {"nthreads": 2, "host": "127.0.0.1", "dashboard": False, "silence_logs": QUIET}
 
     async def make(address):
-        with dask.config.set(before):
-            return [await Nanny(address, **options) for _ in range(2)]
+        preload = [str(tmp_path / "devices.py")]
+        return [await Nanny(address, preload=preload, **options) for _ in range(2)]
 
     async def end(nannies):
         for nanny in nannies:
             await nanny.close()
 
-    # Nannies leave the variables of their workers in this process as well.
-    with (
-        patch.dict(os.environ),
-        dask.config.set({"distributed.worker.multiprocessing-method": "spawn"}),
-        SpecCluster(scheduler=scheduler, silence_logs=50) as cluster,
-        Client(cluster) as client,
-    ):
+    with cluster_of({}, {}, host="127.0.0.1") as cluster, Client(cluster) as client:
         nannies = client.sync(make, client.scheduler.address)
         try:
             yield client
@@ -153,15 +109,19 @@ def nameless(tmp_path):
 def test_a_worker_without_a_name_that_its_nanny_starts_again(nameless, wait_until):
     client = nameless
     part, _ = Pool.from_client(client).partition("GPU", max_workers_per_gpu=1)
-    before = assign_devices(client, Pool.from_client(client))
-    assert sorted(before.values()) == [0, 1]
+
+    def ask(address):
+        """Both of its slots at once."""
+        return client.gather([part.submit(own_device, workers=address) for _ in range(4)])
+
+    held = {worker.address: ask(worker.address)[0] for worker in part.workers}
+    assert sorted(held.values()) == [0, 1]
     for device in (1, 0):
-        now = assign_devices(client, Pool.from_client(client))
-        victim = next(address for address, held in now.items() if held == device)
+        victim = next(address for address, own in held.items() if own == device)
         os.kill(client.run(os.getpid, workers=[victim])[victim], signal.SIGKILL)
         wait_until(lambda victim=victim: victim not in client.cluster.scheduler.workers)
         wait_until(lambda: len(part) == 2)
-        (newcomer,) = {worker.address for worker in part.workers} - now.keys()
-        # Both of its slots at once, and by a task of its own rather than by the client.
-        asked = [part.submit(own_device, workers=newcomer) for _ in range(4)]
-        assert client.gather(asked) == [device] * 4
+        del held[victim]
+        (newcomer,) = {worker.address for worker in part.workers} - held.keys()
+        held[newcomer], *others = ask(newcomer)
+        assert {held[newcomer], *others} == {device}

@@ -69,17 +69,3 @@ def test_a_writer_goes_on_where_one_has_died(start, tmp_path):
     path.write_bytes(thumbnails(5) + b"half")
     runpy.run_path(str(EXAMPLE))["run"](client, path, 9)
     assert path.read_bytes() == thumbnails(9)
-
-
-def test_an_error_of_a_picture_reaches_the_driver(start, tmp_path):
-    client = start({name: {} for name in "abc"})
-    example = runpy.run_path(str(EXAMPLE))
-    run = example["run"]
-    run.__globals__["shrink"] = lambda picture: 1 / 0
-    with pytest.raises(Exception, match=r"picture 0: division by zero"):
-        run(client, tmp_path / "out.bin", 3)
-    assert not pipes_of(client.cluster.scheduler)
-
-
-def test_it_is_short():
-    assert len(EXAMPLE.read_text().splitlines()) < 60

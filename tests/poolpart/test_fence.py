@@ -122,14 +122,6 @@ def actors(client):
     return [future.result().where().result() for future in futures]
 
 
-def array(client):
-    blocks = dask.array.ones((40, 40), chunks=(4, 4)).map_blocks(
-        lambda block: block * 0 + len(here()), dtype=float, meta=dask.array.ones((0, 0))._meta
-    )
-    names = {len(name): name for name in ("B-0", "plain")}
-    return [names[int(length)] for length in set(blocks.compute().ravel())]
-
-
 def shuffled(client):
     """Outputs of a peer-to-peer shuffle, which chooses their workers itself."""
     whole = dask.array.ones((200, 200), chunks=(10, 200)).rechunk((200, 10), method="p2p").persist()
@@ -148,7 +140,6 @@ def shuffled(client):
         dependent,
         preferring_the_partition,
         actors,
-        array,
         shuffled,
     ],
 )
@@ -202,22 +193,6 @@ def complaints(warned):
     """What was said of waiting tasks; what earlier tests have left may be warned of as well."""
     said = [str(warning.message) for warning in list(warned)]
     return [text for text in said if text.startswith("Tasks wait")]
-
-
-def test_what_is_computed_again_stays_out(start):
-    client = start({"A-0": {}, "one": {}, "two": {}})
-    first = client.submit(here, workers=["one"], allow_other_workers=True, pure=False)
-    assert first.result() == "one"
-    enclose(client, A=["A-0"])
-    scheduler = scheduler_of(client)
-    address = state_of(client, "one").address
-
-    async def lose(dask_scheduler):
-        await dask_scheduler.remove_worker(address, stimulus_id="test", expected=True)
-
-    client.run_on_scheduler(lose)
-    assert client.submit(str, first).result(LONG_S) == "two"
-    assert {w.name for w in scheduler.workers.values() if w.has_what} == {"two"}
 
 
 def test_tasks_wait_where_all_workers_are_behind_fences_and_everybody_is_told(client, wait_until):

@@ -5,11 +5,9 @@ import os
 import signal
 import time
 import uuid
-from collections import Counter
 
 import numpy as np
 from distributed import Event, wait
-from distributed.comm import tcp
 from distributed.comm.addressing import parse_host_port
 from tests.poolpart.helpers import LONG_S, twice, wait_for
 
@@ -118,23 +116,10 @@ def hold(name):
     return hold_for_driver(name, data), os.getpid()
 
 
-def received(monkeypatch):
-    """Count the bytes that this process, with client and scheduler, receives: {peer: bytes}."""
-    counts, read = Counter(), tcp.read_bytes_rw
-
-    async def count(stream, n):
-        counts[stream.socket.getpeername()[:2]] += n
-        return await read(stream, n)
-
-    monkeypatch.setattr(tcp, "read_bytes_rw", count)
-    return counts
-
-
-def test_held_bytes_are_fetched_once_and_do_not_pass_the_scheduler(processes, monkeypatch):
-    counts = received(monkeypatch)
+def test_held_bytes_are_fetched_once_and_do_not_pass_the_scheduler(processes, received):
     name = f"part-{uuid.uuid4().hex}"
     address, _ = Partition("GPU", processes).submit(hold, name).result(LONG_S)
-    assert counts.total() < SIZE / 8  # they have stayed where they were made
+    assert received.total() < SIZE / 8  # they have stayed where they were made
     other = Partition("OTHER", processes).workers[0].address
     assert take_held(processes, other, name) is None
     assert take_held(processes, address, "another") is None
@@ -143,8 +128,8 @@ def test_held_bytes_are_fetched_once_and_do_not_pass_the_scheduler(processes, mo
     assert take_held(processes, address, name) is None
     # The client connects to the worker's address; the scheduler is called from another port.
     worker = parse_host_port(address.removeprefix("tcp://"))
-    assert counts.pop(worker) >= SIZE
-    assert counts.total() < SIZE / 8
+    assert received.pop(worker) >= SIZE
+    assert received.total() < SIZE / 8
 
 
 def test_what_a_dead_worker_had_is_given_up_soon(nannies):

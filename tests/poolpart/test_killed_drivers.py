@@ -4,12 +4,11 @@ import subprocess
 import sys
 
 import pytest
-from distributed import Client, Scheduler, SpecCluster, Worker
+from distributed import Client
+from tests.clusters import cluster_of
 from tests.poolpart.helpers import LONG_S, declared, declared_by_themselves
 
 from poolpart import Partition, Pool, n_workers, rest, steward
-
-QUIET = 50
 
 # Says that it is ready, does one thing when it is told to, and stays.
 DRIVER = """
@@ -30,13 +29,8 @@ RULES = '{"A": n_workers(2, exclusive=True), "B": rest(exclusive=True)}'
 @pytest.fixture
 def cluster():
     """Client of a cluster of four workers in this process, which others can reach."""
-    options = {"host": "127.0.0.1", "dashboard": False}
-    workers = {n: {"cls": Worker, "options": {"nthreads": 1, **options}} for n in "abcd"}
-    scheduler = {"cls": Scheduler, "options": {"dashboard_address": "127.0.0.1:0", **options}}
-    with (
-        SpecCluster(workers=workers, scheduler=scheduler, silence_logs=QUIET) as cluster,
-        Client(cluster) as client,
-    ):
+    workers = {name: {} for name in "abcd"}
+    with cluster_of(workers, {}, host="127.0.0.1") as cluster, Client(cluster) as client:
         yield client
 
 

@@ -140,8 +140,8 @@ def test_one_thread_and_one_slot_each_are_enough_at_any_depth(start, workers):
     assert slots_there(part) == [1] * workers
 
 
-def submit_into(part, number, slots=1):
-    return part.submit(work, number, slots=slots).result()
+def submit_into(part, number):
+    return part.submit(work, number).result()
 
 
 def fail_below():
@@ -164,8 +164,6 @@ def test_errors_and_timeouts_give_the_slots_back(start):
     part = one_worker(start, slots=2, nthreads=2)
     assert part.submit(fail_below).result(LONG_S) == 3
     assert part.submit(not_wait_long, "lending-timeout").result(LONG_S)
-    with pytest.raises(PoolError, match=r"asks for 5 slots .* partition 'A' have 2 at most"):
-        part.submit(submit_into, part, 1, slots=5).result(LONG_S)
     with pytest.raises(ValueError, match="invalid literal"):
         part.submit(_raise_from_below).result(LONG_S)
     assert slots_there(part) == [2]
@@ -186,7 +184,7 @@ def test_a_parent_that_is_cancelled_keeps_its_worker_until_it_ends(start, wait_u
     client = start({"a": {}, "b": {}})
     part, _ = Pool.from_client(client).partition("A", workers=["a"], minimum=0)
     future = part.submit(wait_below, "lending-cancelled", "lending-begun")
-    assert wait_for_in(client, "lending-begun")
+    assert Event("lending-begun", client).wait(LONG_S)
     wait_until(lambda: slots_there(part) == [1])  # lent
     with pytest.raises(PoolError, match=r"could not be moved within 0\.2 s"):
         part.shrink(timeout_s=0.2)
@@ -198,10 +196,6 @@ def test_a_parent_that_is_cancelled_keeps_its_worker_until_it_ends(start, wait_u
     assert part.shrink(timeout_s=LONG_S) == ["a"]
     assert part.grow(timeout_s=LONG_S)
     assert part.submit(descend, 2).result(LONG_S) == 9
-
-
-def wait_for_in(client, event):
-    return Event(event, client).wait(LONG_S)
 
 
 def hold(gate):
@@ -267,7 +261,7 @@ def test_whoever_dies_while_the_parent_waits(nannies, wait_until, who):
     part = Pool.from_client(nannies).divide({"A": rest()})["A"]
     gate = f"lending-dies-{who}"
     parent = part.submit(across, part, gate)
-    assert wait_for_in(nannies, f"{gate}-begun")
+    assert Event(f"{gate}-begun", nannies).wait(LONG_S)
     scheduler = nannies.cluster.scheduler
     wait_until(lambda: any(t.key.startswith("wait_and_say") for t in scheduler.tasks.values()))
     wait_until(lambda: scheduler.tasks[parent.key].processing_on is not None)

@@ -21,7 +21,6 @@ def calls(part):
         lambda: part.submit(here),
         lambda: part.map(twice, [1]),
         lambda: part.compute(dask.delayed(1)),
-        lambda: part.persist(dask.delayed(1)),
         block,
     )
 

@@ -57,19 +57,6 @@ def divided(start):
     return client, Pool.from_client(client).divide(rules)
 
 
-def test_tasks_of_a_worker_that_leaves_end_in_their_partition(divided):
-    client, parts = divided
-    tasks = [parts["A"].submit(recorded, "s", "A", brief) for _ in range(100)]
-    left = parts["A"].shrink(2)
-    assert len(left) == 2
-    assert {name: len(part) for name, part in parts.items()} == {"A": 1, "B": 1, "C": 4}
-    records = [record for _, record in client.gather(tasks)]
-    assert len({(r.worker, r.start) for r in records}) == 100
-    assert not any(record.misplaced for record in records)
-    ran = client.gather([parts["A"].submit(brief) for _ in range(20)])
-    assert set(ran) == set(members(parts["A"]))
-
-
 def test_what_has_not_started_is_shared_out_evenly(divided, wait_until):
     client, parts = divided
     event = Event("evenly", client)

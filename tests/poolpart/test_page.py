@@ -3,11 +3,11 @@
 import re
 import urllib.error
 import urllib.request
-from contextlib import contextmanager
 from html import escape
 
 import pytest
-from distributed import Client, Scheduler, SpecCluster, Worker, get_worker
+from distributed import Client, get_worker
+from tests.clusters import cluster_of
 from tests.poolpart.helpers import LONG_S
 
 from poolpart import Partition, Pipe, Pool, PoolError
@@ -40,25 +40,14 @@ def broken():
     raise ValueError("broken")
 
 
-@contextmanager
-def cluster(dashboard):
-    scheduler = {"host": "127.0.0.1", "dashboard": dashboard, "dashboard_address": "127.0.0.1:0"}
-    workers = {NASTY: {"resources": {"A": 2}}, "plain": {}}
-    options = {"nthreads": 2, "dashboard": False, "host": "127.0.0.1"}
-    with (
-        SpecCluster(
-            workers={n: {"cls": Worker, "options": {**options, **o}} for n, o in workers.items()},
-            scheduler={"cls": Scheduler, "options": scheduler},
-            silence_logs=50,
-        ) as cluster,
-        Client(cluster) as client,
-    ):
-        yield client
-
-
 @pytest.fixture(scope="module", params=[True, False], ids=["dashboard", "no dashboard"])
 def client(request):
-    with cluster(request.param) as client:
+    workers = {NASTY: {"resources": {"A": 2}}, "plain": {"nthreads": 2}}
+    options = {"dashboard": request.param}
+    with (
+        cluster_of(workers, options, host="127.0.0.1") as cluster,
+        Client(cluster) as client,
+    ):
         yield client
 
 
@@ -81,16 +70,6 @@ def test_it_is_served_and_taken_away(client):
     Pool.from_client(client).dissolve()
     assert get(url)[0] == 404
     assert applications == before
-
-
-def test_pages_of_dask_link_to_it_for_as_long_as_it_is_there(client):
-    url = Pool.from_client(client).page()
-    status, _, text = get(url.replace("partitions", "status"))
-    linked = '<a href="partitions">Partitions</a>'
-    assert (linked in text) == (status == 200)  # without a dashboard there are no such pages
-    assert text.count("Partitions</a>") <= 1
-    Pool.from_client(client).dissolve()
-    assert linked not in get(url.replace("partitions", "status"))[2]
 
 
 def test_what_it_tells(client, wait_until):

@@ -2,6 +2,7 @@
 
 import time
 import uuid
+from collections import Counter
 from functools import partial
 
 import dask
@@ -9,35 +10,22 @@ import dask.array as da
 import dask.bag
 import numpy as np
 import pytest
-from distributed import Client, Event, Variable, secede
+from distributed import Client, Event, secede
 from tests.poolpart.helpers import here, twice, wait_for
 
-from poolpart import Partition, Pool, PoolError, own_client
+from poolpart import Partition, Pool, PoolError
 
 
 def stamp():
     return time.monotonic()
 
 
-@pytest.fixture
-def a(client):
-    return Partition("A", client)
-
-
-@pytest.fixture
-def b(client):
-    return Partition("B", client)
-
-
 def test_tasks_run_on_its_workers_and_on_all_of_them(a, b):
+    assert [worker.name for worker in a.workers] == ["A-0", "A-1"]
+    assert (len(a), a.slots, len(b), b.slots) == (2, 4, 1, 1)
     in_a, in_b = ([part.submit(here) for _ in range(200)] for part in (a, b))
     assert {future.result() for future in in_a} == {"A-0", "A-1"}
     assert {future.result() for future in in_b} == {"B-0"}
-
-
-def test_members_are_what_the_workers_declare(a, b):
-    assert [worker.name for worker in a.workers] == ["A-0", "A-1"]
-    assert (len(a), a.slots, len(b), b.slots) == (2, 4, 1, 1)
 
 
 def test_equal_calls_run_each_by_itself(a):
@@ -73,37 +61,26 @@ def test_a_partition_can_be_given_to_a_task_of_another(a, b):
     assert a.submit(submit_to, b, 100).result() == ("B-0", 9900)
 
 
+tries = Counter()  # the workers are threads of this process
+
+
 def fail_at_first(name, item):
-    """Fail until it was called for the third time with an item; a `Variable` counts."""
-    count = Variable(f"{name}-{item}", client=own_client())
-    tries = count.get() + 1 if item % 3 == 0 else 3
-    count.set(tries)
-    if tries < 3:
-        raise ValueError(f"item {item}, try {tries}")
+    """Fail until it was called for the third time with a third item."""
+    tries[name, item] += 1
+    if item % 3 == 0 and tries[name, item] < 3:
+        raise ValueError(f"item {item}, try {tries[name, item]}")
     return item
 
 
-@pytest.fixture
-def counted(client):
-    """Name of counters for `fail_at_first`, one for each of twelve items."""
-    name = uuid.uuid4().hex
-    counters = [Variable(f"{name}-{item}", client=client) for item in range(12)]
-    for counter in counters:
-        counter.set(0)
-    yield name
-    for counter in counters:
-        counter.delete()
-
-
-def test_tasks_that_fail_run_again(a, counted):
-    assert a.submit(fail_at_first, counted, 0, retries=2).result() == 0
+def test_tasks_that_fail_run_again(a):
+    assert a.submit(fail_at_first, "tasks", 0, retries=2).result() == 0
     with pytest.raises(ValueError, match="item 9, try 2"):
-        a.submit(fail_at_first, counted, 9, retries=1).result()
+        a.submit(fail_at_first, "tasks", 9, retries=1).result()
 
 
 @pytest.mark.parametrize("chunk", [None, 1, 5])
-def test_items_that_fail_are_tried_again(a, counted, chunk):
-    call = partial(fail_at_first, counted)
+def test_items_that_fail_are_tried_again(a, chunk):
+    call = partial(fail_at_first, f"chunks of {chunk}")
     assert list(a.map(call, range(12), retries=2, chunk=chunk)) == list(range(12))
 
 
@@ -176,9 +153,7 @@ def test_collections_are_computed_on_its_workers(b, client):
     total = ones("a").sum()
     assert b.compute(total).result() == b.compute(total, sync=True) == 4
     first, second = b.compute([ones("a").sum(), dask.delayed(here, pure=False)()])
-    assert b.gather([first, second]) == [4, "B-0"]
-    kept = b.persist(ones("b"))
-    assert kept.sum().compute() == 4
+    assert client.gather([first, second]) == [4, "B-0"]
     assert dask.bag.range(4, 2).map(lambda _: here()).compute() != ["B-0"] * 4
 
 
@@ -186,10 +161,12 @@ def test_in_a_block_everything_is_on_its_workers(a, b, client):
     with b:
         assert ones("c").sum().compute() == 4
         assert dask.compute(dask.delayed(here, pure=False)())[0] == "B-0"
+        kept = ones("b").persist()
         assert client.submit(here, pure=False).result() == "B-0"
         with a:
             assert client.submit(here, pure=False).result() in ("A-0", "A-1")
         assert set(client.gather(client.map(places, range(3)))[0].flat) == {1}
+    assert kept.sum().compute() == 4
     assert not dask.get_annotations()
     with pytest.raises(ZeroDivisionError), b:
         1 / 0  # noqa: B018
@@ -199,7 +176,7 @@ def test_in_a_block_everything_is_on_its_workers(a, b, client):
 def test_data_is_put_on_its_workers(a, client):
     address = {worker.address for worker in a.workers}
     data = a.scatter({"x": 1, "y": 2})
-    assert a.gather(data) == {"x": 1, "y": 2}
+    assert client.gather(data) == {"x": 1, "y": 2}
     assert {w for held in client.who_has(list(data.values())).values() for w in held} <= address
     assert set(client.who_has(a.scatter(3, broadcast=True)).popitem()[1]) == address
     with pytest.raises(PoolError, match="Partition 'C' has no workers to keep data"):

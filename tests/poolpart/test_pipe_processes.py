@@ -1,6 +1,5 @@
 """Pipes between processes, one of which may be killed."""
 
-import itertools
 import os
 import signal
 import subprocess
@@ -19,11 +18,6 @@ def consume(pipe):
     return list(pipe)
 
 
-def produce(pipe, number, count):
-    for item in range(count):
-        pipe.put((number, item))
-
-
 def greet_and_get(greetings, pipe):
     """Say that this consumer is there, then wait for an item."""
     greetings.put(os.getpid())
@@ -39,34 +33,6 @@ def kill_a_waiting_consumer(client, greetings, pipe):
     consumer.cancel()
     os.kill(pid, signal.SIGKILL)
     assert other.submit(os.getpid).result(LONG_S) != pid  # the nanny has started another
-
-
-def test_items_from_and_to_several_processes(processes, make_pipe):
-    pipe = make_pipe(processes, capacity=5)
-    io, gpu, other = (Partition(name, processes) for name in ("IO", "GPU", "OTHER"))
-    consumers = [part.submit(consume, pipe) for part in (gpu, other)]
-    producers = [io.submit(produce, pipe, number, 50) for number in range(3)]
-    for producer in producers:
-        producer.result(LONG_S)
-    pipe.close()
-    received = [consumer.result(LONG_S) for consumer in consumers]
-    assert sorted(itertools.chain(*received)) == [(n, i) for n in range(3) for i in range(50)]
-    for items in received:  # each producer's items stay in order
-        for number in range(3):
-            mine = [item for n, item in items if n == number]
-            assert mine == sorted(mine)
-
-
-def test_large_items_and_nested_ones(processes, make_pipe):
-    pipe = make_pipe(processes, capacity=2)
-    consumer = Partition("GPU", processes).submit(consume, pipe)
-    items = [bytes(5_000_000), {"keys": ["a", 1, None], "x": 2.5}]
-    for item in items:
-        pipe.put(item)
-    pipe.close()
-    large, nested = consumer.result(LONG_S)
-    assert large == items[0]
-    assert nested == items[1]
 
 
 def test_a_consumer_that_is_killed_while_it_waits_swallows_nothing(processes, make_pipe):

@@ -5,9 +5,9 @@ import math
 
 import pytest
 from distributed import Client, LocalCluster
-from tests.poolpart.helpers import declared, here, join
+from tests.poolpart.helpers import declared, here
 
-from poolpart import Partition, Pool, PoolError, probe
+from poolpart import Pool, PoolError, WorkerInfo, probe
 
 PLAIN = {name: {} for name in ("a", "b", "c")}
 
@@ -114,24 +114,6 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
         pool.partition("Q", workers=["a"])
 
 
-def test_tasks_that_wait_for_a_partition_run_once_it_is_made(start, wait_until):
-    client = start(PLAIN)
-    waiting = [Partition("P", client).submit(here) for _ in range(5)]
-    scheduler = client.cluster.scheduler
-    wait_until(lambda: len(scheduler.unrunnable) == 5)
-    part, _ = Pool.from_client(client).partition("P", workers=["b"])
-    assert client.gather(waiting) == ["b"] * 5
-    assert len(part) == 1
-
-
-def test_workers_that_join_later_with_the_resource_belong(start, wait_until):
-    client = start({"a": {"resources": {"P": 1}}, "b": {}})
-    part = Pool.from_client(client).partitions()["P"]
-    join(client, "late")
-    wait_until(lambda: len(part) == 2)
-    assert [worker.name for worker in part.workers] == ["a", "late"]
-
-
 # -- GPUs ------------------------------------------------------------------------------
 
 
@@ -167,15 +149,15 @@ def test_slots_that_are_missing_are_named_with_their_purpose(start):
 
 
 @pytest.mark.parametrize("slots", [0.5, -1, math.inf])
-def test_slots_that_are_no_whole_number(start, slots):
-    pool = Pool.from_client(start({"w": {"resources": {"GPU": slots}}}))
+def test_slots_that_are_no_whole_number(slots):
+    pool = Pool(None, [WorkerInfo("w", "tcp://w", "h", 1, resources={"GPU": slots})])
     pool.require({"IO": 0})
     with pytest.raises(PoolError, match=f"Worker w declares GPU={slots:g}: give it a whole number"):
         pool.require({"GPU": 0})
 
 
-def test_a_worker_in_two_partitions(start):
-    pool = Pool.from_client(start({"w": {"resources": {"GPU": 1, "IO": 4}}}))
+def test_a_worker_in_two_partitions():
+    pool = Pool(None, [WorkerInfo("w", "tcp://w", "h", 1, resources={"GPU": 1, "IO": 4})])
     pool.require({"GPU": 1})
     with pytest.raises(PoolError, match="Worker w declares GPU and IO: give each worker one"):
         pool.require({"GPU": 1, "IO": 1})

@@ -31,8 +31,10 @@ def fake_driver(tmp_path, monkeypatch):
         command = [compiler, "-w", "-shared", "-fPIC", *defines, "-o", library, source]
         subprocess.run(command, check=True)
         monkeypatch.setattr(probe, "_DRIVER", str(library))
+        probe._listing.cache_clear()
 
-    return install
+    yield install
+    probe._listing.cache_clear()
 
 
 def said(caplog):

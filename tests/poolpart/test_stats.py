@@ -42,13 +42,13 @@ def test_tasks_that_wait_run_and_end(client, wait_until):
     part = Partition("A", client)
     empty = part.stats()
     assert (empty.name, empty.workers, empty.slots, empty.busy) == ("A", 1, 2, 0)
-    assert (empty.done, empty.occupancy, empty.stages, empty.exclusive) == (0, 0.0, {}, False)
+    assert (empty.done, empty.stages, empty.exclusive) == (0, {}, False)
 
     running = [part.submit(held, i) for i in range(5)]
     last = part.submit(after, running)
     wait_until(lambda: part.stats().waiting == 1)
     stats = part.stats()
-    assert (stats.running, stats.queued, stats.busy, stats.occupancy) == (2, 3, 2, 1.0)
+    assert (stats.running, stats.queued, stats.busy) == (2, 3, 2)
     assert stats.stages["held"] == StageStats(running=2, queued=3)
 
     go.set()
@@ -94,21 +94,6 @@ def test_a_task_that_is_computed_again(start, wait_until):
 
 async def lose(address, dask_scheduler):
     await dask_scheduler.remove_worker(address, stimulus_id="test", expected=True)
-
-
-def test_a_task_whose_worker_dies_while_it_runs(start, wait_until):
-    client = start({"one": {"resources": {"A": 1}}, "two": {"resources": {"A": 1}}})
-    go.clear()
-    part = Partition("A", client)
-    tasks = [part.submit(held, i) for i in range(2)]
-    wait_until(lambda: part.stats().running == 2)
-    address = next(iter(client.cluster.scheduler.workers))
-    client.run_on_scheduler(lose, address=address)
-    wait_until(lambda: part.stats().queued == 1)
-    assert (part.stats().running, part.stats().done) == (1, 0)
-    go.set()
-    client.gather(tasks)
-    assert (part.stats().done, part.stats().failed) == (2, 0)
 
 
 def test_a_task_that_lends_its_slots_and_the_one_that_has_them_are_one(client, wait_until):

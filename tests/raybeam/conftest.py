@@ -9,7 +9,9 @@ import ctypes
 import importlib.resources
 import shutil
 import subprocess
+from collections.abc import Callable
 from contextlib import nullcontext
+from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import ClassVar
@@ -67,9 +69,10 @@ def pointed(argument):
 class Kernels:
     """Stands for CuPy's RawModule: the kernels of intersect.cu, run thread by thread."""
 
-    library: ClassVar[ctypes.CDLL]
+    compile_for: ClassVar[Callable[..., ctypes.CDLL]]
 
     def __init__(self, code, options):
+        self.library = self.compile_for("-DNESTED=1" in options, "-DMASKED=1" in options)
         for option in options:
             if option.startswith("-DSTACK="):
                 assert int(option.partition("=")[2]) <= STACK
@@ -134,10 +137,10 @@ class SourceBackend(CudaBackend):
         return HOST
 
 
-def compiled(compiler, folder):
+def compiled(compiler, folder, nested, masked):
     """intersect.cu made a library for the CPU."""
-    library = folder / "intersect.so"
-    flags = cuda_backend.flags(STACK)
+    library = folder / f"intersect{nested:d}{masked:d}.so"
+    flags = cuda_backend.flags(STACK, nested, masked)
     with importlib.resources.as_file(
         importlib.resources.files("raybeam") / "intersect.cu"
     ) as kernels:
@@ -154,11 +157,12 @@ def compiled(compiler, folder):
 
 @pytest.fixture(scope="session")
 def source_backend(tmp_path_factory):
-    """`SourceBackend`, its library made by g++."""
+    """`SourceBackend`, its libraries made by g++ when they are needed."""
     compiler = shutil.which("g++")
     if compiler is None:
         pytest.skip("g++ is not here to compile the kernels for the CPU")
-    Kernels.library = compiled(compiler, tmp_path_factory.mktemp("source"))
+    folder = tmp_path_factory.mktemp("source")
+    Kernels.compile_for = staticmethod(cache(partial(compiled, compiler, folder)))
     return SourceBackend
 
 

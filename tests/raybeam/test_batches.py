@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from benchmarks import seams
 
-from raybeam import RayCaster, available_backends
+from raybeam import RayCaster
 
 FIELDS = ("distance", "triangle", "u", "v")
 
@@ -79,20 +79,6 @@ def test_kernels_have_the_bits_of_numpy_at_seams(kernels, shapes, name):
     want = RayCaster(vertices, faces, "numpy").cast(origin, directions)
     assert want.hit.all()
     same(RayCaster(vertices, faces, kernels).cast(origin, directions), want)
-
-
-def test_embree_and_numpy_agree(shapes):
-    if reason := available_backends()["embree"]:
-        pytest.skip(f"embree: {reason}")
-    vertices, faces = shapes["vase"]()
-    origins, directions = rays(10_000, 8)
-    one = RayCaster(vertices, faces, "embree").cast(origins, directions)
-    two = RayCaster(vertices, faces, "numpy").cast(origins, directions)
-    equal = one.triangle == two.triangle
-    assert equal.mean() > 0.995
-    np.testing.assert_allclose(one.distance[equal], two.distance[equal], rtol=0, atol=1e-6)
-    both = one.hit & two.hit
-    assert np.abs(one.distance[both] - two.distance[both]).max() < 0.05
 
 
 RESULT_BYTES = 8 + 4 + 8 + 8  # of a ray: distance, triangle, u, v

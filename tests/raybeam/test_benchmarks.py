@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 
 import pytest
-from benchmarks import cuda_kernel, raycast_moving
+from benchmarks import cuda_kernel, instances, raycast_moving
 
 from raybeam import available_backends
 
@@ -18,6 +18,16 @@ def test_moving_sensors_of_all_numbers_of_beams(capsys):
     lines = capsys.readouterr().out.splitlines()
     assert [int(line.split()[0]) for line in lines] == [16, 16, 64, 64, 128, 128]
     assert all("x bare; moving" in line and "hits 0 %" not in line for line in lines)
+
+
+@pytest.mark.slow
+def test_forests_of_instances_hit_as_one_mesh_does(capsys):
+    if reason := available_backends()["embree"]:
+        pytest.skip(f"embree: {reason}")
+    assert instances.main(["--quick"]) == 0
+    _, many, few, flat = (line.split("|") for line in capsys.readouterr().out.splitlines())
+    assert "10,002" in many[3]
+    assert few[-2] == flat[-2] != " 0 % "
 
 
 def test_the_devices_benchmark_says_so_without_a_device(capsys):

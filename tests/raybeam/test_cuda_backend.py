@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 
 from raybeam import Pattern
+from raybeam.instances import plain
 from raybeam.mesh import local_mesh
 from raybeam.scan import check_scan
 
@@ -29,7 +30,7 @@ def test_arrays_are_kept_until_the_device_has_read_them(source_backend, shapes, 
     monkeypatch.setattr(type(source_backend._library().empty(1)), "set", copy)
     stream = SimpleNamespace(synchronize=synchronize)
     monkeypatch.setattr(cuda, "get_current_stream", lambda: stream)
-    engine = source_backend(mesh)
+    engine = source_backend(plain(mesh))
     engine.scan(check_scan(Pattern(np.eye(3)), [0, 0, 0]))
     assert len(read) > 1
     assert all(read)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 import shutil
 import subprocess
+from itertools import product
 
 import pytest
 
@@ -13,9 +14,10 @@ from raybeam.cuda_backend import flags, source
 # The oldest and the newest in the fast tests.
 CARDS = [75, 120, *(pytest.param(card, marks=pytest.mark.slow) for card in (80, 86, 89, 90, 100))]
 AS_CUPY = "-ftz=true"  # what it adds of itself
-FLAGS = (*flags(64), AS_CUPY)
+# {(whether there are instances, whether there are masks): options}
+FLAGS = {kind: (*flags(64, *kind), AS_CUPY) for kind in product((False, True), repeat=2)}
 # Of a multiprocessor's 65,536: as many threads as the walk is meant to have under way on each.
-REGISTERS = {"cast_": 65_536 // 640, "": 65_536 // 1024}
+WALKING = {False: 65_536 // 640, True: 65_536 // 512}
 
 
 @pytest.fixture(scope="module")
@@ -26,14 +28,14 @@ def nvcc():
     return found
 
 
-def report(nvcc, folder, card):
+def report(nvcc, folder, card, kind):
     """Registers, stack, and bytes of spill stores and loads of each kernel, by name."""
     known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True).stdout
     if f"compute_{card}" not in known.split():
         pytest.skip(f"this nvcc does not know sm_{card}")
     (folder / "kernels.cu").write_text(source())
     done = subprocess.run(
-        [nvcc, *FLAGS, f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v",
+        [nvcc, *FLAGS[kind], f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v",
          "-o", str(folder / "out.cubin"), str(folder / "kernels.cu")],
         capture_output=True, text=True,
     )  # fmt: skip
@@ -48,26 +50,27 @@ def report(nvcc, folder, card):
     return {name: tuple(map(int, numbers)) for name, *numbers in rows}
 
 
+@pytest.mark.parametrize("kind", FLAGS)
 @pytest.mark.parametrize("card", CARDS)
-def test_compiles_without_spills(nvcc, tmp_path, card):
-    kernels = report(nvcc, tmp_path, card)
+def test_compiles_without_spills(nvcc, tmp_path, card, kind):
+    kernels = report(nvcc, tmp_path, card, kind)
     assert len(kernels) == source().count("\nKERNEL ")
     for name, (stack, stores, loads, registers) in kernels.items():
         assert (stores, loads) == (0, 0), name
         # The nodes that wait and nothing else: what has to be looked up is not kept there.
         walks = name.startswith("cast_")
         assert stack == (8 * 64 if walks else 0), name
-        most = next(most for start, most in REGISTERS.items() if name.startswith(start))
-        assert registers <= most, name
+        assert registers <= (WALKING[kind[0]] if walks else 65_536 // 1024), name
 
 
+@pytest.mark.parametrize("kind", FLAGS)
 @pytest.mark.parametrize("card", CARDS)
-def test_nvrtc_compiles_as_cupy_does(card):
+def test_nvrtc_compiles_as_cupy_does(card, kind):
     cupy = pytest.importorskip("cupy", reason="CuPy is not installed")
     nvrtc = cupy.cuda.nvrtc
     program = nvrtc.createProgram(source(), "intersect.cu", (), ())
     try:
-        nvrtc.compileProgram(program, (*FLAGS, f"-arch=sm_{card}"))
+        nvrtc.compileProgram(program, (*FLAGS[kind], f"-arch=sm_{card}"))
     except nvrtc.NVRTCError:
         log = nvrtc.getProgramLog(program)
         if "invalid value for --gpu-architecture" in log:

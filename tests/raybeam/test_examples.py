@@ -8,7 +8,7 @@ import importlib
 import pytest
 
 
-@pytest.mark.parametrize("name", ["caster", "pattern", "registry", "scan", "workspace"])
+@pytest.mark.parametrize("name", ["caster", "pattern", "registry", "scan"])
 def test_examples(name):
     done = doctest.testmod(importlib.import_module(f"raybeam.{name}"))
     assert done.attempted > 0

@@ -42,15 +42,16 @@ def test_local_coordinates():
     mesh = local_mesh(vertices, faces)
     assert np.abs(mesh.corners).max() <= 1
     assert np.abs(mesh.corners).max() > 0.5
-    assert np.log2(mesh.scale) % 1 == 0
+    assert np.log2(mesh.frame.scale) % 1 == 0
     assert mesh.face_count == 40
-    back = mesh.corners / mesh.scale + mesh.centre
+    back = mesh.corners / mesh.frame.scale + mesh.frame.centre
     np.testing.assert_allclose(back, vertices[faces[mesh.index]], rtol=0, atol=1e-9)
 
 
 def test_unused_vertices_do_not_count():
     far = np.concatenate([POINTS, [[1e9, 0, 0]]])
-    assert local_mesh(far, [[0, 1, 2]]).scale == local_mesh(POINTS, [[0, 1, 2]]).scale
+    far_scale = local_mesh(far, [[0, 1, 2]]).frame.scale
+    assert far_scale == local_mesh(POINTS, [[0, 1, 2]]).frame.scale
 
 
 def test_triangles_without_area_are_left_out():

@@ -196,9 +196,7 @@ class OutsideCluster:
 
 
 @pytest.fixture(scope="module")
-def outside(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> Iterator[Callable[..., OutsideCluster]]:
+def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., OutsideCluster]]:
     """Start clusters from the `dask` command line that end with the module."""
     clusters: list[OutsideCluster] = []
 

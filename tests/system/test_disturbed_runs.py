@@ -32,45 +32,26 @@ def test_frames_come_in_order_and_every_scan_once(
     client, undisturbed, same_cloud, all_records, left_over
 ):
     frames: list[Frame] = []
-    result = simulate(Scene.seed(), SURVEY, client=client, on_frame=frames.append)
+    cloud = undisturbed.cloud
+
+    def on_frame(frame: Frame) -> None:
+        frames.append(frame)
+        if frame.scan % 50 == 0:  # its points are in storage
+            mine = cloud.scan == frame.scan
+            assert np.array_equal(frame.points().positions, cloud.positions[mine])
+
+    result = simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame)
     assert [frame.scan for frame in frames] == list(range(SURVEY.scan_count))
     assert result.rays == sum(frame.rays for frame in frames) == SURVEY.ray_count
     assert result.hits == result.hit_counts.sum() == sum(frame.hits for frame in frames) > 0
     assert len(result.points) == sum(frame.count for frame in frames)
-    assert same_cloud(result.cloud, undisturbed.cloud)
+    assert same_cloud(result.cloud, cloud)
     assert (np.diff(result.cloud.scan.astype(np.int64)) >= 0).all()
     assert placement_violations(result.records) == []
     places = {(record.stage, record.partition) for record in result.records}
     long = {(stage, "LIDAR") for stage in ("generate", "sort", "collect")}
     assert places == {("intersect", "GPU"), *long}
     assert left_over(client) == ([], [], [])
-
-
-def test_points_of_a_frame_are_in_storage_when_it_comes(cluster_client, undisturbed):
-    cloud = undisturbed.cloud
-
-    def on_frame(frame: Frame) -> None:
-        if frame.scan % 50 == 0:
-            points = frame.points()
-            mine = cloud.scan == frame.scan
-            assert len(points) == frame.count == mine.sum()
-            assert np.array_equal(points.positions, cloud.positions[mine])
-
-    simulate(Scene.seed(), SURVEY, client=cluster_client, on_frame=on_frame)
-
-
-def test_who_writes_a_part_of_the_same_scans_writes_the_same_bytes(
-    client, cluster_client, tmp_path
-):
-    """So a second writer of a batch does no harm: its file replaces one that is equal."""
-    written = []
-    for name, workers in (("processes", client), ("threads", cluster_client)):
-        simulate(Scene.seed(), SURVEY, client=workers, folder=tmp_path / name)
-        parts = (tmp_path / name / "parts").glob("*.npz")
-        written.append({path.name.partition("-")[2]: path.read_bytes() for path in parts})
-    both = written[0].keys() & written[1].keys()
-    assert both, "the first scan is a part by itself"
-    assert all(written[0][name] == written[1][name] for name in both)
 
 
 def test_a_partition_that_stays_empty_ends_the_run(tmp_path):
@@ -120,21 +101,6 @@ def test_a_worker_that_dask_pauses_gets_no_more_batches(client, undisturbed, sam
     assert placement_violations(result.records) == []
 
 
-def test_where_all_are_paused_it_says_what_to_do(client, tmp_path):
-    def on_frame(frame: Frame) -> None:
-        if frame.scan == 30:
-            for name in ("GPU-0", "GPU-1"):
-                _pause(client, name, on=True)
-
-    options = {"folder": tmp_path / "run", "patience_s": 2.0}
-    try:
-        with pytest.raises(LidarpoolError, match=r"'GPU' have taken no tasks .* --memory-limit"):
-            simulate(Scene.seed(), SURVEY, client=client, on_frame=on_frame, **options)
-    finally:
-        for name in ("GPU-0", "GPU-1"):
-            _pause(client, name, on=False)
-
-
 @pytest.mark.parametrize("kind", [ZeroDivisionError, KeyboardInterrupt])
 def test_an_error_in_the_callback_passes_through_and_stops_the_run(
     cluster_client, undisturbed, same_cloud, kind, left_over
@@ -165,22 +131,3 @@ def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch,
     with pytest.raises(KeyboardInterrupt):
         simulate(Scene.seed(), SURVEY, planning, client=cluster_client)
     assert left_over(cluster_client) == ([], [], [])
-
-
-def test_trials_cancelled_by_somebody_end_the_run(cluster_client, left_over):
-    planning = Planning((25, 25), (-30, -20), trials=500)
-    pumps = []
-    original = TrialPump.__init__
-
-    def spy(self, *arguments) -> None:
-        original(self, *arguments)
-        pumps.append(self)
-
-    def cancel(progress) -> None:
-        cluster_client.cancel(list(pumps[0]._running), force=True)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(TrialPump, "__init__", spy)
-        with pytest.raises(LidarpoolError, match=r"trial \d+ was cancelled"):
-            simulate(Scene.seed(), SURVEY, planning, client=cluster_client, on_progress=cancel)
-    assert left_over(cluster_client)[1:] == ([], [])

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import errno
 import gc
-import json
-import os
 import re
 import subprocess
 from collections.abc import Callable, Iterator
@@ -18,7 +15,6 @@ from distributed import Client
 
 import lidarpool.report.output as lidarpool_output
 from lidarpool import LidarpoolError, simulate
-from lidarpool.base.storage import Storage
 from lidarpool.report.output import FILES
 from lidarpool.scenario.scenario import Scenario
 
@@ -129,39 +125,3 @@ def test_the_disk_of_the_result_is_full(
     assert (done.code, done.err) == (0, "")
     assert (out / "cloud.ply").read_bytes() == expected
     assert {path.name for path in out.iterdir()} == set(FILES)
-
-
-def test_the_storage_of_the_parts_is_full_for_the_workers(
-    expected, cluster, lidarpool, tmp_path, monkeypatch, no_pictures
-):
-    """The driver's disk has room, that of the parts has not."""
-    written: list[str] = []
-    write = Storage.write
-
-    def write_or_fail(storage: Storage, name: str, data: Any) -> None:
-        written.append(name)
-        if len(written) > 6:  # the run's mark and the driver's probe are the first
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        write(storage, name, data)
-
-    (tmp_path / "s.yaml").write_text(SCENARIO)
-    out, parts = tmp_path / "out", tmp_path / "parts"
-    command = ["run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster, "-q", "--resume"]
-    command += ["--parts", parts]
-    with monkeypatch.context() as patch:
-        patch.setattr(Storage, "write", write_or_fail)
-        failed = lidarpool(*command)
-    assert failed.code == 2
-    assert re.fullmatch(
-        rf"lidarpool: The points cannot be kept in {parts}/run-\w+ \(No space left on device\): "
-        r"make room there, or give another place with --parts\. "
-        rf"\d+ of 108 scans are kept in {out}/run: "
-        r"continue with --resume \(in Python resume=True\)\.\n",
-        failed.err,
-    )
-    done = lidarpool(*command)
-    assert (done.code, done.err) == (0, "")
-    assert (out / "cloud.ply").read_bytes() == expected
-    report = json.loads((out / "report.json").read_text())
-    assert 0 < report["resumed_scans"] < 108
-    assert not any(path.is_file() for path in parts.rglob("*"))

@@ -7,13 +7,12 @@ import re
 import signal
 import subprocess
 import sys
-import time
-import uuid
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
+from tests.commands import RunningCommand
 
 from lidarpool.report.output import FILES
 
@@ -45,85 +44,6 @@ import time
 import lidarpool.report.pictures as pictures
 pictures.draw_scene = lambda *_, **__: time.sleep(600)
 """
-
-
-ENDS_WITHIN_S = 300  # on a busy machine; a second or two on an idle one
-
-
-class RunningCommand:
-    """The command in a process group of its own, as a shell starts it."""
-
-    def __init__(self, folder: Path, scenario: str, *options: str, prelude: str = "") -> None:
-        (folder / "s.yaml").write_text(scenario)
-        self.tag = uuid.uuid4().hex
-        self.log = folder / f"{self.tag}.log"
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [
-                    sys.executable,
-                    "-c",
-                    prelude + "from lidarpool.__main__ import main; main()",
-                    "run",
-                    "s.yaml",
-                    "--out",
-                    "out",
-                    "--overwrite",
-                    *options,
-                ],
-                cwd=folder,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                env={
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(sys.path),
-                    "TEST_RUN_TAG": self.tag,
-                },
-            )
-
-    def wait_for(self, pattern: str) -> RunningCommand:
-        """Wait until the run says something."""
-        stop = time.monotonic() + ENDS_WITHIN_S
-        while not re.search(pattern, self.said):
-            assert self.process.poll() is None, self.said
-            assert time.monotonic() < stop, self.said
-            time.sleep(0.02)
-        return self
-
-    @property
-    def said(self) -> str:
-        """What it has written so far, its workers included."""
-        return self.log.read_text()
-
-    def signal(self, number: int, *, group: bool = False) -> int:
-        """Send a signal, wait for the end, return the exit code."""
-        (os.killpg if group else os.kill)(self.process.pid, number)
-        return self.process.wait(ENDS_WITHIN_S)
-
-    @property
-    def processes(self) -> set[int]:
-        """Processes of this run that are alive, workers included."""
-        found = set()
-        for entry in Path("/proc").iterdir():
-            if entry.name.isdigit():
-                try:
-                    if self.tag.encode() in (entry / "environ").read_bytes():
-                        found.add(int(entry.name))
-                except (OSError, ProcessLookupError):
-                    continue  # it has ended, or is another user's
-        return found
-
-    def wait_until_alone(self, seconds: float = ENDS_WITHIN_S) -> None:
-        """Wait until no process is left."""
-        stop = time.monotonic() + seconds
-        while self.processes:
-            assert time.monotonic() < stop, self.processes
-            time.sleep(0.1)
-
-    def close(self) -> None:
-        for process in self.processes:
-            os.kill(process, signal.SIGKILL)
-        self.process.wait(300)
 
 
 @pytest.fixture
@@ -222,21 +142,6 @@ def test_ctrl_c_while_the_workers_start(start, untouched):
     assert untouched()
 
 
-@pytest.mark.parametrize("when", ["end_on_signals", "interrupt_on_signals"])
-def test_nohup_is_obeyed(when):
-    script = (
-        "import signal\n"
-        f"from lidarpool.base.interrupts import {when}, deferred_interrupts\n"
-        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
-        f"{when}()\n"
-        "signal.raise_signal(signal.SIGHUP)\n"
-        "with deferred_interrupts(): signal.raise_signal(signal.SIGHUP)\n"
-        "print('still here')\n"
-    )
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"still here\n", b"")
-
-
 def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypatch, no_pictures):
     """It is not said that nothing has happened, and there is nothing to resume."""
     replace = Path.replace
@@ -285,10 +190,18 @@ def test_a_terminal_spares_workers_and_what_clears_up_behind_them():
     ]  # fmt: skip
 
 
-def test_a_second_ctrl_c_ends_it_at_once():
-    script = (
-        "import signal, time\n"
-        "from lidarpool.base.interrupts import deferred_interrupts, interrupt_on_signals\n"
+# {what a signal comes to: a script, its exit code, and what it prints and says}
+SIGNALLED = {
+    "a program under nohup": (
+        "signal.signal(signal.SIGHUP, signal.SIG_IGN)\n"
+        "for obey in (end_on_signals, interrupt_on_signals):\n"
+        "    obey()\n"
+        "    signal.raise_signal(signal.SIGHUP)\n"
+        "    with deferred_interrupts(): signal.raise_signal(signal.SIGHUP)\n"
+        "print('still here')\n",
+        (0, "still here\n", ""),
+    ),
+    "one that was interrupted": (
         "interrupt_on_signals()\n"
         "try: signal.raise_signal(signal.SIGINT)\n"
         "except KeyboardInterrupt: pass\n"
@@ -296,27 +209,28 @@ def test_a_second_ctrl_c_ends_it_at_once():
         "time.sleep(1.1)\n"
         "with deferred_interrupts():\n"
         "    signal.raise_signal(signal.SIGINT)\n"
-        "    print('still here')\n"
-    )
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert (ended.returncode, ended.stdout) == (130, b"")
-    assert ended.stderr.startswith(b"lidarpool: stopped at once")
-
-
-def test_a_ctrl_c_where_python_drops_what_is_raised_comes_again():
-    script = (
-        "import signal, time\n"
-        "from lidarpool.base.interrupts import interrupt_on_signals\n"
+        "    print('still here')\n",
+        (130, "", "lidarpool: stopped at once"),
+    ),
+    "where Python drops what is raised": (
         "class Future:\n"
         "    def __del__(self): signal.raise_signal(signal.SIGINT)\n"
         "interrupt_on_signals()\n"
         "try:\n"
         "    Future()\n"
         "    time.sleep(50)\n"
-        "except KeyboardInterrupt: print('interrupted')\n"
-    )
-    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, check=False)
-    assert (ended.returncode, ended.stdout, ended.stderr) == (0, b"interrupted\n", b"")
+        "except KeyboardInterrupt: print('interrupted')\n",
+        (0, "interrupted\n", ""),
+    ),
+}
+
+
+@pytest.mark.parametrize("where", SIGNALLED)
+def test_a_signal_does_what_it_should(where):
+    script, (code, out, err) = SIGNALLED[where]
+    script = f"import signal, time\nfrom lidarpool.base.interrupts import *\n{script}"
+    ended = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert (ended.returncode, ended.stdout, ended.stderr[: len(err)]) == (code, out, err)
 
 
 def test_workers_follow_a_driver_that_was_killed(start, untouched):

@@ -21,7 +21,7 @@ NEW = sorted({*FILES} - {"path.png"})  # the earlier run planned a path, this on
 SCRIPT = """
 import json, os, signal, sys
 from pathlib import Path
-from lidarpool.report.output import _InFolder
+from lidarpool.report.output import _move
 
 root, files, earlier = Path(sys.argv[1]), json.loads(sys.argv[2]), json.loads(sys.argv[3])
 
@@ -32,14 +32,13 @@ def publish(out, k):
         (out / name).write_text("earlier")
     for name in files:
         (whole / name).write_text("new")
-    target = _InFolder(out)
     def count(event, arguments):
         if (event == "open" or event.startswith("os.")) and str(arguments[0]).startswith(str(out)):
             left[0] -= 1
             if not left[0]:
                 os.kill(os.getpid(), signal.SIGKILL)
     sys.addaudithook(count)
-    target.publish(whole, files, lambda: None)
+    _move(whole, out, files, [], lambda: None)
 
 killed = k = 1
 while killed:

@@ -13,12 +13,10 @@ from typing import Any
 import fsspec
 import pytest
 from fsspec.registry import _registry
-from tests.lidarpool.test_store import JOB, add
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_resume import DRIVERS, SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
-from lidarpool import LidarpoolError
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, unpack
 from lidarpool.run.store import RunStore
@@ -65,102 +63,31 @@ def run(environment, cluster, lidarpool, tmp_path) -> Callable[..., Any]:
     return run
 
 
-@pytest.fixture
-def check(tmp_path, monkeypatch) -> Callable[[str], dict[str, Any]]:
-    """Check the result, and the parts that there were in a folder of the bucket; the report."""
+def test_parts_go_to_the_bucket_until_the_result_is_whole(run, tmp_path, monkeypatch):
     found: dict[str, list[PartColumns]] = {}  # {where: parts, before they went}
     remove = RunStore.remove
 
-    def look(store: RunStore) -> str:
+    def look(store: RunStore) -> None:
         storage = store.storage
         names = sorted(name for name in storage.sizes() if name.endswith(".npz"))
         found[storage.url] = [unpack(storage.read(name)) for name in names]
-        left = remove(store)
+        remove(store)
         assert storage.sizes() == {}
-        return left
 
     monkeypatch.setattr(RunStore, "remove", look)
-
-    def check(folder: str) -> dict[str, Any]:
-        out = tmp_path / "out"
-        assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
-        report = json.loads((out / "report.json").read_text())
-        ((url, parts),) = found.items()
-        assert url.startswith(f"{BUCKET}/{folder}/run-")
-        assert [part.first for part in parts[1:]] == [part.stop for part in parts[:-1]]
-        assert (parts[0].first, parts[-1].stop) == (0, 108)
-        assert sum(len(part) for part in parts) == report["points"] == 995
-        assert not (out / "run").exists()
-        return report
-
-    return check
-
-
-def test_parts_go_to_the_bucket_until_the_result_is_whole(run, check):
     done = run("whole")
     assert (done.code, done.err) == (0, "")
-    check("whole")
-
-
-# Ends its worker a moment after the third upload has begun.
-DIES = """
-import os, signal, threading
-from lidarpool.base.storage import Storage
-from lidarpool.run.store import RunStore
-write, count = Storage.write, []
-def write_and_die(storage, name, data):
-    count.append(name)
-    if len(count) == 3:
-        threading.Timer(0.001, os.kill, (os.getpid(), signal.SIGKILL)).start()
-    return write(storage, name, data)
-Storage.write = write_and_die
-"""
-
-
-@pytest.mark.slow
-@pytest.mark.sample
-def test_a_collector_dies_while_it_uploads(run, check, outside, environment):
-    """The stages begin on the worker with more slots, which dies, and go on on the other."""
-    cluster = outside()
-    cluster.add(("GPU", 1), ("LIDAR", 4), **environment)
-    doomed = cluster.add(("LIDAR", 8), preload=DIES, **environment)
-    cluster.wait()
-    done = run("died", scheduler=cluster.address)
-    assert (done.code, done.err) == (0, "")
-    assert cluster.processes.pop(doomed).wait(300) == -9
-    report = check("died")
-    assert report["replayed"] > 0
-
-
-@pytest.mark.parametrize("place", ["s3://no/x", "s9://surveys/x"])
-def test_a_place_that_there_cannot_be(place, run, tmp_path):
-    refused = run("", "--parts", place)
-    assert refused.code == 2
-    assert len(refused.err.splitlines()) == 1
-    assert place in refused.err
-    assert not (tmp_path / "out" / "run").exists()
-
-
-@pytest.mark.slow
-def test_a_bucket_that_the_workers_cannot_reach(run, check, monkeypatch):
-    """Parts come to it through the driver."""
-    monkeypatch.setattr(Storage, "sees", lambda *_: False)
-    done = run("far")
-    assert (done.code, done.err) == (0, "")
-    (note,) = (n for n in check("far")["notes"] if "cannot see" in n)
-    assert note.startswith(f"LIDAR of partition LIDAR cannot see {BUCKET}/far/run-")
+    out = tmp_path / "out"
+    assert sha256((out / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
+    ((url, parts),) = found.items()
+    assert url.startswith(f"{BUCKET}/whole/run-")
+    assert [part.first for part in parts[1:]] == [part.stop for part in parts[:-1]]
+    assert (parts[0].first, parts[-1].stop) == (0, 108)
+    assert sum(len(part) for part in parts) == 995
+    assert not (out / "run").exists()
 
 
 # -- runs and results ----------------------------------------------------------------------------
-
-
-def result_at(url: str) -> dict[str, Any]:
-    """Report of a whole result, which has left nothing of its run behind."""
-    out = Storage.at(url)
-    assert out.sizes().keys() >= {"cloud.ply", "report.json", "sweeps.npz"}
-    assert Storage.at(f"{url}/run").sizes() == Storage.at(f"{url}/run/parts").sizes() == {}
-    assert sha256(out.read("cloud.ply")).hexdigest() == DEFAULT_CLOUD_SHA256
-    return json.loads(out.read("report.json"))
 
 
 @pytest.mark.slow
@@ -174,7 +101,10 @@ def test_a_result_goes_to_the_bucket(cluster, lidarpool, tmp_path, environment):
     assert refused.code == 2 and "holds path.png, which no result there lists" in refused.err
     done = lidarpool(*arguments, "--only", "cloud", "--json", "-q", "--overwrite")
     assert (done.code, done.err) == (0, "")
-    report = result_at(url)
+    out = Storage.at(url)
+    assert Storage.at(f"{url}/run").sizes() == Storage.at(f"{url}/run/parts").sizes() == {}
+    assert sha256(out.read("cloud.ply")).hexdigest() == DEFAULT_CLOUD_SHA256
+    report = json.loads(out.read("report.json"))
     told = json.loads(done.out)
     assert told["folder"] == url and told["files"]["cloud.ply"] == f"{url}/cloud.ply"
     assert set(report["files"]) == Storage.at(url).sizes().keys()
@@ -199,17 +129,8 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     (tmp_path / "s.yaml").write_text(SCENARIO + "output: {write: [nuscenes]}\n")
     url, here = f"{BUCKET}/results/sweeps", tmp_path / "here"
     Storage.at(f"{url}/nuscenes").write("map.json", b"of an earlier result")
-    run = [
-        "run",
-        tmp_path / "s.yaml",
-        "--scheduler",
-        cluster,
-        "--only",
-        "cloud",
-        "-q",
-        "--overwrite",
-        "--out",
-    ]
+    run = ["run", tmp_path / "s.yaml", "--scheduler", cluster, "--only", "cloud", "-q"]
+    run += ["--overwrite", "--out"]
     for place in (here, url):
         assert lidarpool(*run, place).code == 0
     report = json.loads(Storage.at(url).read("report.json"))
@@ -234,31 +155,6 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     assert not Storage.at(url).has("nuscenes") and not Storage.at(url).has("report.json")
 
 
-def test_damage_is_repaired_and_foreign_objects_stay(environment):
-    url = f"{BUCKET}/results/damaged"
-    store = RunStore(JOB, url)
-    for scan in range(0, 6, 2):
-        add(store, scan, scan + 2)
-    storage, names = store.storage, store.points().names
-    data = storage.read(names[1])
-    storage.write(names[1], data[:500] + bytes([data[500] ^ 4]) + data[501:])
-    foreign = {"a.npz", f"{names[0]}.bak", f".tmp-{names[0]}"}
-    for name in foreign:
-        storage.write(name, b"mine")
-    Storage.at(f"{storage}/deeper").write(names[0], b"mine")
-    store.save(now=True)
-    again = RunStore(JOB, url, resume=True)
-    assert again.notes == [f"cast again: scans 2 to 3; {names[1]} was damaged in {url}/parts"]
-    assert add(again, 2, 4)
-    again.tidy()
-    assert len(again.points().load()) == 18
-    assert f"{url}/parts holds what is not of this run and stays there" in again.remove()
-    assert storage.sizes().keys() == foreign and Storage.at(url).sizes() == {}
-    with pytest.raises(LidarpoolError, match=r"stays there, .* and 1 more: move it elsewhere"):
-        RunStore(JOB, url)
-    assert Storage.at(f"{storage}/deeper").sizes() == {names[0]: 4}
-
-
 @pytest.mark.parametrize(
     ("url", "words"),
     [
@@ -267,10 +163,12 @@ def test_damage_is_repaired_and_foreign_objects_stay(environment):
         ("s9://surveys/x", "Protocol not known: s9"),
     ],
 )
-def test_a_result_that_cannot_go_there(url, words, lidarpool, environment):
-    refused = lidarpool("demo", "--out", url)
-    assert refused.code == 2 and words in refused.err
+@pytest.mark.parametrize("option", ["--out", "--parts"])
+def test_a_place_that_there_cannot_be(option, url, words, lidarpool, run, tmp_path):
+    refused = lidarpool("demo", "--out", url) if option == "--out" else run("", "--parts", url)
+    assert refused.code == 2 and (words in refused.err or option == "--parts")
     assert len(refused.err.splitlines()) == 1
+    assert not (tmp_path / "out" / "run").exists()
 
 
 def test_a_place_is_looked_at_before_a_run(lidarpool, environment, tmp_path):

@@ -3,23 +3,14 @@
 from __future__ import annotations
 
 import json
-import os
-import re
-import shutil
-import sys
-import time
 from hashlib import sha256
 from pathlib import Path
 
-import numpy as np
 import pytest
 from distributed import Client
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
-import lidarpool as package
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
-from lidarpool.base.software import sources
-from poolpart import worker_identities
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
 
@@ -103,43 +94,3 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
         pytest.raises(LidarpoolError, match=r"sources 12345678\), the run .*: install the same"),
     ):
         simulate(Scene.seed(), survey, planning, client=client, backend="numpy", on_frame=on_frame)
-
-
-@pytest.mark.slow
-def test_a_worker_with_other_sources_that_joins_late_casts_nothing(
-    outside, cluster_client, tmp_path, same_cloud
-):
-    copy = tmp_path / "other" / "lidarpool"
-    shutil.copytree(Path(package.__file__).parent, copy)
-    returns = copy / "scan" / "returns.py"
-    text = returns.read_text()
-    assert "found.distance" in text
-    returns.write_text(text.replace("found.distance", "found.distance * 1.01"))
-
-    survey = Survey(
-        Sensor.grid(rays_per_revolution=360, layers=8, step_deg=5), [(0, 0, 1)], steps=72
-    )
-    expected = simulate(Scene.seed(), survey, client=cluster_client, backend="numpy")
-    cluster = outside()
-    ours = cluster.add(("GPU", 1), ("LIDAR", 4))
-    cluster.wait()
-    with Client(cluster.address, set_as_default=False) as client:
-
-        def on_frame(frame: Frame) -> None:
-            if frame.scan == 10:
-                path = os.pathsep.join([str(copy.parent), *sys.path])
-                cluster.add(("GPU", 1), PYTHONPATH=path)
-                cluster.wait()
-            if frame.scan > 10:  # the driver looks once a second who has joined
-                time.sleep(0.05)
-
-        result = simulate(Scene.seed(), survey, client=client, backend="numpy", on_frame=on_frame)
-        late = list(cluster.processes)[-1]
-        (address,) = (a for a, w in worker_identities(client).items() if w["name"] == late)
-    assert same_cloud(result.cloud, expected.cloud)
-    [note] = [note for note in result.notes if note.startswith(f"worker {late} at {address} has")]
-    other, ours_there = re.findall(r"lidarpool \S+ \(sources (\w{8})\)", note)
-    assert other != ours_there == sources()
-    casts = {record.worker for record in result.records if record.stage == "intersect"}
-    assert casts == {ours}
-    assert np.array_equal(result.hit_counts, expected.hit_counts)

@@ -9,15 +9,7 @@ import laspy
 import numpy as np
 import pytest
 
-from lidarpool import (
-    Beams,
-    Column,
-    Scene,
-    Sensor,
-    Survey,
-    read_cloud,
-    simulate,
-)
+from lidarpool import Beams, Column, Scene, Sensor, Survey, read_cloud, simulate
 
 
 @dataclass(frozen=True)

@@ -6,25 +6,18 @@ import json
 import os
 import re
 import signal
-import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
 
-import dask
 import pytest
 import yaml
-from distributed import Client, SpecCluster, SSHCluster
-from tests.clusters import import_jobqueue
+from tests.commands import RunningCommand
 from tests.daemons import LOOPBACK, Slurm, needs_slurm, needs_sshd, slurm, ssh_server, wait_until
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_tls import new_files
-
-from lidarpool import Result, Scene, simulate
-from lidarpool.scenario.scenario import Scenario
-from poolpart import placement_violations, start_partitions, worker_identities
 
 pytestmark = pytest.mark.slow
 
@@ -82,38 +75,17 @@ HOSTS: dict[str, dict[str, Any]] = {
 }
 
 
-class Command:
-    """The command with a cluster file, in a process group of its own, as a shell starts it."""
+class Command(RunningCommand):
+    """The command with a cluster file."""
 
     def __init__(
         self, folder: Path, cluster: dict[str, Any] | None, scenario: dict[str, Any] = FEWER
     ) -> None:
-        (folder / "s.yaml").write_text(yaml.safe_dump(scenario))
         (folder / "cluster.yaml").write_text(yaml.safe_dump(cluster))
-        place = ["--cluster", "cluster.yaml"] if cluster else []
         self.out = folder / ("out" if cluster else "local")
-        self.log = self.out.with_suffix(".log")
-        with self.log.open("wb") as log:
-            self.process = subprocess.Popen(
-                [
-                    *(sys.executable, "-m", "lidarpool", "run", "s.yaml", "--out", self.out),
-                    *("--backend", "numpy", "--only", "cloud", *place),
-                ],
-                cwd=folder,
-                stdout=log,
-                stderr=log,
-                start_new_session=True,
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
-            )
-
-    def wait_for(self, pattern: str) -> None:
-        """Wait until it says something."""
-        wait_until(lambda: bool(re.search(pattern, self.said)) or self.process.poll() is not None)
-        assert re.search(pattern, self.said), self.said
-
-    @property
-    def said(self) -> str:
-        return self.log.read_text()
+        options = ["--out", str(self.out), "--backend", "numpy", "--only", "cloud"]
+        options += ["--cluster", "cluster.yaml"] if cluster else []
+        super().__init__(folder, yaml.safe_dump(scenario), *options)
 
     def result(self) -> tuple[str, dict[str, Any]]:
         """Wait for the end; returns the cloud's checksum and the report."""
@@ -173,8 +145,8 @@ def test_jobs_that_are_cancelled_during_a_run_of_the_command(empty_queue, tmp_pa
 def test_jobs_of_a_run_that_is_stopped_go_away(empty_queue, tmp_path, number):
     run = Command(tmp_path, slurm_file(tmp_path), LONG)
     run.wait_for(r"survey +[1-9]")
-    os.killpg(run.process.pid, number)
-    assert run.process.wait(300) == (130 if number != signal.SIGKILL else -signal.SIGKILL)
+    ended = run.signal(number, group=True)
+    assert ended == (130 if number != signal.SIGKILL else -signal.SIGKILL)
     if number == signal.SIGKILL:  # workers notice that their scheduler is gone
         wait_until(lambda: not empty_queue.jobs())
     assert empty_queue.jobs() == {}
@@ -187,15 +159,6 @@ def test_a_job_that_the_queue_refuses_takes_the_others_with_it(empty_queue, tmp_
     assert "cluster.yaml: dask_jobqueue.SLURMCluster was not started" in run.said
     assert "invalid partition specified: nowhere" in run.said
     assert "Traceback" not in run.said
-    assert empty_queue.jobs() == {}
-
-
-@needs_slurm
-def test_the_log_of_a_job_that_did_not_start_its_worker(empty_queue, tmp_path):
-    run = Command(tmp_path, slurm_file(tmp_path, python="/nowhere/python"))
-    run.wait_for(rf"note: The log {tmp_path}/gpu-\d+.err ends: .*/nowhere/python: No such file")
-    run.process.send_signal(signal.SIGINT)
-    assert run.process.wait(300) == 130
     assert empty_queue.jobs() == {}
 
 
@@ -223,52 +186,6 @@ def configure_certificates(folder: Path, monkeypatch: pytest.MonkeyPatch) -> Non
     comm = {"require-encryption": True, "tls": tls}
     (folder / "dask.yaml").write_text(yaml.safe_dump({"distributed": {"comm": comm}}))
     monkeypatch.setenv("DASK_CONFIG", str(folder / "dask.yaml"))
-
-
-def run_disturbed(cluster: SpecCluster, disturb: Callable[[Client], None]) -> Result:
-    """Run the default survey, disturbed once half way."""
-    scenario = Scenario()
-    scene: Scene = scenario.build_scene()
-    half = scenario.survey(scene).scan_count // 2
-    with Client(cluster, set_as_default=False) as client:
-        return simulate(
-            scene,
-            scenario.survey(scene),
-            client=client,
-            on_frame=lambda frame: disturb(client) if frame.scan == half else None,
-            wait_s=120,
-            patience_s=120,
-        )
-
-
-def assert_default_cloud(result: Result, folder: Path) -> None:
-    result.cloud.save(folder / "cloud.ply")
-    assert sha256((folder / "cloud.ply").read_bytes()).hexdigest() == DEFAULT_CLOUD_SHA256
-    assert placement_violations(result.records) == []
-
-
-@needs_slurm
-@pytest.mark.parametrize("victim", ["gpu", "lidar"])
-def test_a_job_that_is_cancelled_half_way(empty_queue, tmp_path, small_batches, victim):
-    # How long a SpecCluster waits for a worker to come back before it starts another.
-    with (
-        dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}),
-        import_jobqueue().SLURMCluster(**job_arguments(tmp_path)) as cluster,
-    ):
-        start_partitions(cluster, JOBS)
-        number, _ = empty_queue.jobs()[victim]
-
-        def cancel(client: Client) -> None:
-            empty_queue.ask("scancel", number)
-            wait_until(lambda: number not in empty_queue.ask("squeue", "--noheader", "--format=%i"))
-
-        result = run_disturbed(cluster, cancel)
-        wait_until(lambda: len(cluster.scheduler_info["workers"]) == 4)  # another was submitted
-        again, state = empty_queue.jobs()[victim]
-        assert state == "RUNNING"
-        assert int(again) != int(number) or victim == "gpu"  # of which there are two
-    assert_default_cloud(result, tmp_path)
-    wait_until(lambda: not empty_queue.jobs())
 
 
 def ssh_file(folder: Path, ssh: dict[str, object], **scheduler: Any) -> dict[str, Any]:
@@ -305,23 +222,6 @@ def test_what_a_host_says_that_cannot_start_its_process(ssh, tmp_path, where):
     run = Command(tmp_path, file)
     assert run.process.wait(300) == 2
     assert re.search(r"was not started \(.*/nowhere/python.*No such file", run.said), run.said
-    wait_until(lambda: not processes_in(tmp_path))
-
-
-@needs_sshd
-@pytest.mark.parametrize("victim", ["GPU-0", "LIDAR-0"])
-def test_a_worker_that_is_killed_half_way(ssh, tmp_path, small_batches, victim):
-    options = {"worker_options": {"host": LOOPBACK, "local_directory": str(tmp_path)}}
-    with SSHCluster([LOOPBACK], connect_options=ssh, scheduler_options=SCHEDULER) as cluster:
-        start_partitions(cluster, {name: own | options for name, own in HOSTS.items()})
-
-        def kill(client: Client) -> None:
-            workers = worker_identities(client)
-            (address,) = (a for a, w in workers.items() if w["name"] == victim)
-            os.kill(client.run(os.getpid, workers=[address])[address], signal.SIGKILL)
-
-        result = run_disturbed(cluster, kill)
-    assert_default_cloud(result, tmp_path)
     wait_until(lambda: not processes_in(tmp_path))
 
 

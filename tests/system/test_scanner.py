@@ -8,11 +8,9 @@ from lidarpool import (
     Actor,
     Material,
     Noise,
-    Pose,
     Returns,
     Scanner,
     Scene,
-    Sensor,
     Survey,
     Track,
     load_sensor,
@@ -41,12 +39,3 @@ def test_sweeps_of_a_moving_sensor_are_those_of_a_run(cluster_client, same_cloud
     for number in range(2):
         rows = np.flatnonzero(cloud["scan"] // 36 == number)
         assert len(rows) > 500 and same_cloud(scanner.sweep(track, number=number), cloud.part(rows))
-
-
-def test_stations_are_sweeps_of_as_many_numbers(cluster_client, same_cloud):
-    sensor, poses = Sensor.grid(360, 16), [Pose((0, 0, 1), 20, 5, -3), Pose((2, 1, 1.5))]
-    cloud = simulate(Scene.seed(), Survey(sensor, poses, **OPTIONS), client=cluster_client).cloud
-    scanner = Scanner(Scene.seed(), sensor, **OPTIONS)
-    for number, pose in enumerate(poses):
-        rows = np.flatnonzero(cloud["scan"] // 36 == number)
-        assert len(rows) > 50 and same_cloud(scanner.sweep(pose, number=number), cloud.part(rows))

@@ -15,10 +15,7 @@ def test_init_writes_a_scenario_and_says_what_to_do_next(tmp_path, lidarpool):
     folder = tmp_path / "my surveys" / "hall"
     outcome = lidarpool("init", folder)
     assert (outcome.code, outcome.err) == (0, "")
-    assert sorted(path.name for path in folder.iterdir()) == [
-        "scenario.schema.json",
-        "scenario.yaml",
-    ]
+    assert {path.name for path in folder.iterdir()} == {"scenario.schema.json", "scenario.yaml"}
     assert outcome.out.endswith(f"next: lidarpool check '{folder / 'scenario.yaml'}'\n")
     assert Scenario.load(folder / "scenario.yaml").model_dump() == Scenario().model_dump()
     first = (folder / "scenario.yaml").read_text().splitlines()[0]
@@ -43,10 +40,8 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     assert (outcome.code, outcome.err) == (0, "")
     assert outcome.out.startswith("a/b/scenario.yaml is a survey of my room.stl, #1: é.glb:")
     made = Scenario.load("a/b/scenario.yaml")
-    assert [(entry.file, entry.unit) for entry in made.scene.files] == [
-        ("../../my room.stl", "mm"),
-        ("../../#1: é.glb", "mm"),
-    ]
+    files = [(entry.file, entry.unit) for entry in made.scene.files]
+    assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
     assert len(made.build_scene().names) == 2
     assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"

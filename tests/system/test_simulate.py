@@ -57,25 +57,6 @@ def test_every_ray_from_within_a_closed_room_hits_its_sides(client):
     assert np.array_equal(cloud.channel, rays)
 
 
-def test_keep_every_takes_every_nth_hit_of_each_scan(client):
-    poses = [(1, 1, 0)]
-    full = simulate(room(), Survey(SENSOR, poses, 10, keep_every=1), client=client).cloud
-    thin = simulate(room(), Survey(SENSOR, poses, 10, keep_every=7), client=client).cloud
-    for scan in range(10):
-        assert np.array_equal(
-            thin.positions[thin.scan == scan], full.positions[full.scan == scan][::7]
-        )
-
-
-def test_ranges_bound_what_is_seen(client):
-    sensor = Sensor.grid(
-        rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7, max_range_m=4.5
-    )
-    cloud = simulate(room(), Survey(sensor, [(0, 0, 0)], 52, keep_every=1), client=client).cloud
-    assert 0 < len(cloud) < 90 * 8
-    assert np.linalg.norm(cloud.positions, axis=1).max() <= 4.51
-
-
 def test_a_survey_that_sees_nothing_gives_an_empty_cloud(client):
     result = simulate(room(), Survey(SENSOR, [(100, 100, 100)], 5), client=client)
     assert result.hits == len(result.cloud) == 0

@@ -14,7 +14,7 @@ from tests.clusters import thread_cluster
 from lidarpool import LidarpoolError
 from lidarpool.run.connection import TlsFiles, connected
 from lidarpool.run.local import local_cluster
-from lidarpool.run.waiting import Waiting
+from lidarpool.run.watch import Waiting
 from poolpart import Pool
 
 

@@ -36,6 +36,7 @@ static inline int __float_as_int(float f) { return bits<int>(f); }
 static inline float __int_as_float(int i) { return bits<float>(i); }
 
 using std::fabs;
+using std::floor;
 using std::fmax;
 using std::fmin;
 using std::sqrt;

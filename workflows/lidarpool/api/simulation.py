@@ -14,12 +14,12 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..pipeline import Frame
 from ..plan import Planning
 from ..run.bars import bars_here
-from ..run.conductor import NoPage, Page, conducted
+from ..run.conductor import Page, conducted
 from ..run.connection import local_client
 from ..run.job import Job
 from ..run.progress import Progress
 from ..run.store import RunStore
-from ..run.waiting import Waiting
+from ..run.watch import Waiting
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.world import check_backend_here
@@ -156,13 +156,13 @@ def simulate(
         tell=logger.info,
         on_frame=on_frame or (lambda frame: None),
     ) as (result, _):
-        store.db.unlock()
+        store.db.close()
         return Result(**vars(result))
 
 
 def _page(job: Job, wanted: bool) -> AbstractContextManager[Page]:
     if not wanted:
-        return nullcontext(NoPage())
+        return nullcontext(Page())
     from ..live.run_page import live_run  # with Matplotlib, for its colours
 
     return live_run(job)

@@ -48,10 +48,7 @@ class Allowance:
     def take(self, count: int) -> None:
         """Take so many bytes, before they are made.
 
-        Raises
-        ------
-        LidarpoolError
-            If that is more than the limit.
+        LidarpoolError if that is more than the limit.
         """
         self.taken += count
         if self.taken > self.limit:
@@ -84,10 +81,7 @@ def bytes_of(count: int) -> str:
 def check_fits(path: Path) -> None:
     """Refuse a file that is larger than the memory, before it is read.
 
-    Raises
-    ------
-    LidarpoolError
-        If it is; OSError if there is none.
+    LidarpoolError if it is; OSError if there is none.
     """
     if (size := path.stat().st_size) > memory():
         raise LidarpoolError(

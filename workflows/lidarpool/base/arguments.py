@@ -31,6 +31,7 @@ from .errors import LidarpoolError
 P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
+Kind = tuple[Callable[[Any], bool], str]  # whether a value fits, and what fits in words
 
 # {annotation: description of allowed values}
 _KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
@@ -83,10 +84,10 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
             given = signature.bind(*args, **kwargs).arguments
         except TypeError:
             return function(*args, **kwargs)  # Python reports too many, too few and unknown ones
-        hints = _hints(function)
+        kinds = _kinds(function)
         for name, value in given.items():
-            if name in hints and value is not signature.parameters[name].default:
-                _check(name, value, *hints[name])
+            if name in kinds and value is not signature.parameters[name].default:
+                _check(name, value, *kinds[name])
         return function(*args, **kwargs)
 
     return refusing
@@ -100,10 +101,10 @@ def checked_fields(cls: C) -> C:
     after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
 
     def __post_init__(self: Any) -> None:  # noqa: N807
-        for name, (hint, limits) in _hints(cls).items():
+        for name, kind in _kinds(cls).items():
             value = getattr(self, name)
             if value is not getattr(cls, name, inspect.Parameter.empty):
-                _check(name, value, hint, limits)
+                _check(name, value, *kind)
         after(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
@@ -134,19 +135,20 @@ def _with_article(name: str) -> str:
 
 
 @cache
-def _hints(thing: Any) -> dict[str, tuple[Any, dict[str, Any]]]:
-    """Annotations that can be checked, and the limits of the values: {name: both}."""
+def _kinds(thing: Any) -> dict[str, tuple[Kind, dict[str, Any]]]:
+    """Return what arguments or fields must be, if that can be checked, with their limits."""
     if isinstance(thing, type):
         names = set(thing.__dict__["__dataclass_fields__"])
     else:
         names = {*thing.__annotations__} - {"return"}
     hints, declared = get_type_hints(thing), get_type_hints(thing, include_extras=True)
-    return {name: (hints[name], _limits(declared[name])) for name in names if _words(hints[name])}
+    kinds = {name: (_kind(hints[name]), _limits(declared[name])) for name in names}
+    return {name: (kind, limits) for name, (kind, limits) in kinds.items() if kind[1]}
 
 
-def _check(name: str, value: object, hint: Any, limits: dict[str, Any]) -> None:
-    if type(value) is not hint and not _fits(value, hint):  # most are of the very type
-        words = _words(hint)
+def _check(name: str, value: object, kind: Kind, limits: dict[str, Any]) -> None:
+    fits, words = kind
+    if not fits(value):
         such = [_EXAMPLES[word] for word in words.split() if word in _EXAMPLES]
         example = f"[{such[0]}]" if such and words.startswith("a list") else "".join(such[:1])
         words += f", such as {example}" if example else ""
@@ -176,45 +178,44 @@ def _range(limits: Mapping[str, Any]) -> str:
     return ", ".join(f"{_LIMITS[name][1]} {number}" for name, number in numbers.items())
 
 
-def _fits(value: object, hint: Any) -> bool:
+def _kind(hint: Any) -> Kind:
+    """Whether a value fits an annotation, and what fits in words.
+
+    Without words it is not checked here: arrays, for example.
+    """
     origin, args = get_origin(hint), get_args(hint)
     if origin in (Union, UnionType):
-        return any(_fits(value, one) for one in args)
+        kinds = [_kind(one) for one in args]
+        words = [of for _, of in kinds]
+        told = " or ".join(words) if all(words) else ""
+        return lambda value: any(fits(value) for fits, _ in kinds), told
     if origin is Literal:
-        return any(value is one or value == one for one in args)
+        return lambda value: value in args, f"one of {', '.join(map(str, args))}"
     if origin in (Sequence, Iterable, tuple):
-        if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, Iterable):
-            return False
-        # An iterator can be read only once: leave it to the function.
-        return origin is Iterable or all(_fits(one, args[0]) for one in value)
+        inner, of = _kind(args[0])
+        of = of.removeprefix("a ").replace("number", "numbers")
+
+        def all_fit(value: Any) -> bool:
+            if isinstance(value, (str, bytes, Mapping)) or not isinstance(value, Iterable):
+                return False
+            # An iterator can be read only once: leave it to the function.
+            return origin is Iterable or all(map(inner, value))
+
+        return all_fit, f"a list of {of}" if of else ""
     if origin is Callable:
-        return callable(value)
+        return callable, "a function"
     if origin is Mapping:
-        return isinstance(value, Mapping)
+        return lambda value: isinstance(value, Mapping), "a dict"
     if hint in _KINDS:
-        return isinstance(value, _KINDS[hint][0]) and (hint is bool or not isinstance(value, bool))
+        kinds_of, words_of = _KINDS[hint]
+        refused = () if hint is bool else bool
+        return lambda v: isinstance(v, kinds_of) and not isinstance(v, refused), words_of
+    if not isinstance(hint, type) or hint is Any:
+        return lambda value: True, ""
     if getattr(hint, "_is_protocol", False):
-        # Of the class first: a property may take its time.
         names = [name for name in vars(hint) if not name.startswith("_")]
-        return all(hasattr(type(value), name) or hasattr(value, name) for name in names)
-    return not isinstance(hint, type) or isinstance(value, hint)
-
-
-def _words(hint: Any) -> str:
-    """Describe allowed values; empty if they are not checked here, such as arrays."""
-    origin, args = get_origin(hint), get_args(hint)
-    if origin in (Union, UnionType):
-        words = [_words(one) for one in args]
-        return " or ".join(words) if all(words) else ""
-    if origin is Literal:
-        return f"one of {', '.join(map(str, args))}"
-    if origin in (Sequence, Iterable, tuple):
-        of = _words(args[0]).removeprefix("a ").replace("number", "numbers")
-        return f"a list of {of}" if of else ""
-    if origin is Callable:
-        return "a function"
-    if origin is Mapping:
-        return "a dict"
-    if hint in _KINDS:
-        return _KINDS[hint][1]
-    return _with_article(hint.__name__) if isinstance(hint, type) and hint is not Any else ""
+        # Of the class first: a property may take its time.
+        return lambda value: all(
+            hasattr(type(value), name) or hasattr(value, name) for name in names
+        ), _with_article(hint.__name__)
+    return lambda value: isinstance(value, hint), _with_article(hint.__name__)

@@ -27,6 +27,15 @@ def explained(what: str, advice: str = "") -> Iterator[None]:
         raise LidarpoolError(told) from error
 
 
+@contextmanager
+def prefixed(what: object) -> Iterator[None]:
+    """Begin a LidarpoolError of the body with what it is about: «leg 3: …»."""
+    try:
+        yield
+    except LidarpoolError as error:
+        raise LidarpoolError(f"{what}: {error}") from error
+
+
 class Mistakes:
     """Collects errors and reports them together."""
 

@@ -21,10 +21,7 @@ def load_open3d() -> Any:
     a browser. So the extension is loaded below a package that has not been run, and that is taken
     away again: whoever says `import open3d`, before or after, gets the whole package.
 
-    Raises
-    ------
-    LidarpoolError
-        If Open3D is not installed, or lacks a library of the system.
+    LidarpoolError if Open3D is not installed, or lacks a library of the system.
     """
     # Interrupted while it loads, an extension module cannot be loaded again.
     with deferred_interrupts(), _LOCK:

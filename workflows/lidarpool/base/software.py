@@ -29,19 +29,10 @@ _FUNCTIONS = "^(exp|log|arcsin|arccos|tan|power)$"
 
 
 def software(backend: str = "") -> dict[str, str]:
-    """Describe the software of this process.
+    """Describe the software of this process: equal software gives equal bytes.
 
-    Parameters
-    ----------
-    backend
-        Ray-casting backend that it casts with; "" if it does not cast.
-
-    Returns
-    -------
-    dict
-        ``lidarpool``: version and a hash of the installed sources; where it casts, ``numpy`` and
-        the ``backend`` with their versions and instruction sets as well. Equal software gives
-        equal bytes.
+    ``lidarpool`` is its version and a hash of the installed sources. Where it casts with a
+    ray-casting `backend`, ``numpy`` and ``backend`` are versions and instruction sets as well.
     """
     found = {"lidarpool": f"{__version__} (sources {sources()})"}
     if backend:
@@ -100,17 +91,7 @@ def software_there(backend: str = "") -> Callable[[], dict[str, str]]:
 def call_alike(wanted: str, function: Callable[..., T], *arguments: Any) -> T:
     """Call a function in a task, if its worker has the sources of the run.
 
-    Parameters
-    ----------
-    wanted
-        ``lidarpool`` in the `software` of the run's driver.
-    function, arguments
-        The call.
-
-    Raises
-    ------
-    LidarpoolError
-        If not; it names both.
+    `wanted` is ``lidarpool`` in the `software` of the run's driver. LidarpoolError if not.
     """
     here = software()["lidarpool"]
     if here != wanted:

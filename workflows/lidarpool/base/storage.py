@@ -37,6 +37,8 @@ def is_url(place: str | Path) -> bool:
 class Storage:
     """A folder of files, by path or URL; small when pickled.
 
+    Its methods raise OSError if the storage fails, and LidarpoolError if it cannot be opened.
+
     Parameters
     ----------
     url
@@ -54,11 +56,8 @@ class Storage:
     def at(cls, place: str | Path, *, durable: bool = True) -> Storage:
         """Storage at a path, made absolute, or a URL.
 
-        Raises
-        ------
-        LidarpoolError
-            If the URL holds a password, which would get into databases and reports, or only a
-            scheme.
+        LidarpoolError if the URL holds a password, which would get into databases and reports, or
+        only a scheme.
         """
         text = str(place)
         if not is_url(text):
@@ -86,12 +85,17 @@ class Storage:
         """Whether it is a link to a folder elsewhere; the folders above it may be links."""
         return self.is_local and Path(self.url).is_symlink()
 
-    @property
-    def _remote(self) -> tuple[Any, str]:
-        """File system and folder of a URL."""
-        system, folder = self._opened
-        system.invalidate_cache()  # other processes write there, too
-        return system, folder
+    @contextmanager
+    def _remote(self) -> Iterator[tuple[Any, str]]:
+        """File system and folder of a URL; any error of its library becomes an OSError."""
+        try:
+            system, folder = self._opened
+            system.invalidate_cache()  # other processes write there, too
+            yield system, folder
+        except (OSError, LidarpoolError):
+            raise
+        except Exception as error:
+            raise OSError(f"{type(error).__name__}: {error}") from error
 
     @cached_property
     def _opened(self) -> tuple[Any, str]:
@@ -113,30 +117,17 @@ class Storage:
         return f"{self.url}/{name}"
 
     def prepare(self) -> None:
-        """Make the folder.
-
-        Raises
-        ------
-        OSError
-            If that cannot be done.
-        """
+        """Make the folder."""
         if self.is_local:
             Path(self.url).mkdir(parents=True, exist_ok=True)
             return
-        with suppress(FileExistsError), _as_os_error():
-            system, folder = self._remote
+        with suppress(FileExistsError), self._remote() as (system, folder):
             # An object store has no folders, and s3fs would make a bucket for a mistyped name.
             if folder.startswith("/"):
                 system.makedirs(folder, exist_ok=True)
 
     def claim(self) -> None:
-        """Make the folder, and check that files can be written and removed.
-
-        Raises
-        ------
-        LidarpoolError
-            If not; it says what to do.
-        """
+        """Make the folder; LidarpoolError if files cannot be written and removed there."""
         name = f"{_TEMPORARY}{secrets.token_hex(4)}"
         try:
             self.prepare()
@@ -153,26 +144,12 @@ class Storage:
             ) from error
 
     def write(self, name: str, data: Any) -> None:
-        """Write a file, completely or not at all, and flush it if durable.
-
-        Parameters
-        ----------
-        name
-            Its name.
-        data
-            Its content: bytes, or a list of them.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
+        """Write bytes, or a list of them, completely or not at all; flush them if durable."""
         pieces = data if isinstance(data, list) else [data]
         if self.is_local:
             self._write_file(name, pieces)
             return
-        with _as_os_error():
-            system, folder = self._remote
+        with self._remote() as (system, folder):
             system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
 
     def _write_file(self, name: str, pieces: list[Any]) -> None:
@@ -195,29 +172,15 @@ class Storage:
             flush(target.parent)
 
     def read(self, name: str) -> bytes:
-        """Read a file.
-
-        Raises
-        ------
-        OSError
-            If it cannot be read.
-        """
+        """Read a file."""
         if self.is_local:
             return Path(self.url, name).read_bytes()
-        with _as_os_error():
-            system, folder = self._remote
+        with self._remote() as (system, folder):
             return bytes(system.cat_file(f"{folder}/{name}"))
 
     def put(self, path: Path, name: str) -> None:
-        """Copy a file of this machine, or a folder of files, into the storage.
-
-        Raises
-        ------
-        OSError
-            If that fails, as in `get`.
-        """
-        with _as_os_error():
-            system, folder = self._remote
+        """Copy a file of this machine, or a folder of files, into the storage."""
+        with self._remote() as (system, folder):
             for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
                 if file.is_file():
                     below = file.relative_to(path).as_posix() if file != path else ""
@@ -225,8 +188,7 @@ class Storage:
 
     def get(self, name: str, path: Path) -> None:
         """Copy a file of the storage to this machine."""
-        with _as_os_error():
-            system, folder = self._remote
+        with self._remote() as (system, folder):
             system.get_file(f"{folder}/{name}", str(path))
 
     def sees(self, name: str, data: bytes) -> bool:
@@ -243,10 +205,7 @@ class Storage:
     def entries(self) -> dict[str, int | None]:
         """Everything in the folder: {name: bytes of a file, None for a folder or link}.
 
-        Raises
-        ------
-        OSError
-            If the folder cannot be listed; a missing one is empty.
+        A missing folder is empty.
         """
         found: dict[str, int | None] = {}
         if self.is_local:
@@ -256,45 +215,29 @@ class Storage:
                         plain = entry.is_file(follow_symlinks=False)
                         found[entry.name] = entry.stat().st_size if plain else None
             return found
-        with suppress(FileNotFoundError), _as_os_error():
-            system, folder = self._remote
+        with suppress(FileNotFoundError), self._remote() as (system, folder):
             for one in system.ls(folder, detail=True):
                 plain = one["type"] == "file" and not one.get("islink")
                 found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
         return found
 
     def remove(self, names: list[str]) -> None:
-        """Remove files; no error for missing ones.
-
-        Raises
-        ------
-        OSError
-            If a file cannot be removed.
-        """
+        """Remove files; no error for missing ones."""
         for name in names:
             if self.is_local:
                 Path(self.url, name).unlink(missing_ok=True)
             else:
-                with suppress(FileNotFoundError), _as_os_error():
-                    system, folder = self._remote
+                with suppress(FileNotFoundError), self._remote() as (system, folder):
                     system.rm_file(f"{folder}/{name}")
 
     def has(self, name: str) -> bool:
-        """Whether there is a file or folder of this name; OSError if that cannot be told."""
-        with _as_os_error():
-            system, folder = self._remote
+        """Whether there is a file or folder of this name."""
+        with self._remote() as (system, folder):
             return bool(system.exists(f"{folder}/{name}"))
 
     def discard(self, name: str) -> None:
-        """Remove a file or folder of the storage with its content, if it exists.
-
-        Raises
-        ------
-        OSError
-            If it cannot be removed.
-        """
-        with suppress(FileNotFoundError), _as_os_error():
-            system, folder = self._remote
+        """Remove a file or folder of the storage with its content, if it exists."""
+        with suppress(FileNotFoundError), self._remote() as (system, folder):
             system.rm(f"{folder}/{name}", recursive=True)
 
     def tidy(self) -> None:
@@ -309,17 +252,6 @@ class Storage:
         if self.is_local:
             with suppress(OSError):
                 Path(self.url).rmdir()
-
-
-@contextmanager
-def _as_os_error() -> Iterator[None]:
-    """Convert any error of a storage library to an OSError."""
-    try:
-        yield
-    except (OSError, LidarpoolError):
-        raise
-    except Exception as error:
-        raise OSError(f"{type(error).__name__}: {error}") from error
 
 
 def flush(path: Path) -> None:

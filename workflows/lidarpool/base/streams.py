@@ -8,14 +8,9 @@ from typing import Any, TextIO
 
 
 class Unheard:
-    """A stream whose writes do not fail once its reader has gone: a run goes on without.
+    """A stream whose writes do not fail once its reader has `gone`: a run goes on without.
 
-    Parameters
-    ----------
-    stream
-        The stream; each write is flushed.
-    gone
-        Errors that mean that nobody reads it; others are raised.
+    Each write is flushed; other errors are raised.
     """
 
     def __init__(self, stream: TextIO, gone: type[OSError] = OSError) -> None:

@@ -11,14 +11,9 @@ _sink: Sink | None = None  # of this process
 
 
 def trace(point: str, /, **fields: Any) -> None:
-    """Report that a run has reached a named point; does nothing without a listener.
+    """Report that a run has reached a named point, ``stage.event``, with some plain values.
 
-    Parameters
-    ----------
-    point
-        Name of the point, ``stage.event``.
-    fields
-        Plain values to report.
+    Does nothing without a listener.
     """
     if _sink is not None:
         _sink(point, fields)

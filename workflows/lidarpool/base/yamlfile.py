@@ -9,7 +9,7 @@ from typing import Any
 import yaml
 
 from .allowance import Allowance, check_fits
-from .errors import LidarpoolError
+from .errors import LidarpoolError, prefixed
 
 _NODE_BYTES = 500  # of a value, while the loader has it
 
@@ -93,12 +93,11 @@ def read_yaml(
         something other than a mapping.
     """
     try:
-        check_fits(path)
-        content = load_yaml(path.read_text("utf-8-sig"))
+        with prefixed(path):
+            check_fits(path)
+            content = load_yaml(path.read_text("utf-8-sig"))
     except FileNotFoundError as error:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
     except yaml.MarkedYAMLError as error:

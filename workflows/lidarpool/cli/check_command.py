@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 @options.cluster
 @options.backend
 @options.no_plan
-@click.option("--json", "as_json", is_flag=True, help="Print it as one JSON document.")
+@options.as_json
 def check(
     scenario: Path,
     out: Path | Storage,
@@ -75,13 +75,9 @@ def check(
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        for name, value in (
-            ("--out", out),
-            ("--scheduler", scheduler),
-            ("--cluster", cluster),
-            ("--backend", backend),
-        ):
-            words += [name, str(value)] if value and str(value) != "lidarpool-out" else []
+        given = {"out": out, "scheduler": scheduler, "cluster": cluster, "backend": backend}
+        for name, value in given.items():
+            words += [f"--{name}", str(value)] if value and str(value) != "lidarpool-out" else []
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
 
 
@@ -97,10 +93,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
         turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
     yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
     sides = list(zip("xyz", *found["bounds"], strict=True))
-    yield (
-        f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; "
-        + ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
-    )
+    spans = ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
+    yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
     drive = found["drive"]
     where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
     several = len(job.survey.carried) > 1
@@ -108,15 +102,13 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     yield f"survey      {counted(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
     if drive:
         yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
-        for sensor in drive["sensors"]:
-            told = f"{sensor['name'] or 'sensor':<11} {sensor['model']}, "
-            told += counted(sensor["firings"], "firing")
-            if sensor["turns"]:
-                told += (
-                    f", {sensor['turns']:,.2f} {sensor['cycle']}s; in one the carrier moves "
-                    f"{sensor['metres_a_turn']:,.3f} m"
-                )
-            yield told
+        for one in drive["sensors"]:
+            turns = ""
+            if one["turns"]:
+                turns = f", {one['turns']:,.2f} {one['cycle']}s; in one the carrier moves "
+                turns += f"{one['metres_a_turn']:,.3f} m"
+            firings = counted(one["firings"], "firing")
+            yield f"{one['name'] or 'sensor':<11} {one['model']}, {firings}{turns}"
     returns = job.survey.returns
     if drive or returns != type(returns)():
         rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
@@ -136,9 +128,7 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     there = found["memory"]["there"]
     limit = f" of {format_bytes(there)}" if there else ""
     yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"
-    yield (
-        f"disk        about {format_bytes(disk['parts'])} during the run and "
-        f"{format_bytes(disk['result'])} for the result; {format_bytes(disk['free'])} free"
-    )
+    parts, result, free = (format_bytes(disk[name]) for name in ("parts", "result", "free"))
+    yield f"disk        about {parts} during the run and {result} for the result; {free} free"
     for note in found["notes"]:
         yield f"note: {note}"

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from dataclasses import asdict
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -44,10 +45,8 @@ PROGRAM = "lidarpool"
 
 # What `demo` and `run` have in common; each is a field of RunOptions.
 _SHOWN = (
-    click.option("--tls", is_flag=True, help="Encrypt the traffic of the local cluster."),
-    click.option(
-        "--live", is_flag=True, help="Show the live page in the browser; it stays until Ctrl-C."
-    ),
+    options.flag("--tls", help="Encrypt the traffic of the local cluster."),
+    options.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
     click.option(
         "--no-stay",
         "stay",
@@ -60,17 +59,10 @@ _SHOWN = (
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no pictures and no page.",
     ),
-    click.option("--overwrite", is_flag=True, help="Replace the result of another survey."),
-    click.option("--quiet", "-q", is_flag=True, help="No progress, only the result."),
-    click.option(
-        "--verbose",
-        "-v",
-        is_flag=True,
-        help="Show what Dask and other libraries log, on stderr.",
-    ),
-    click.option(
-        "--json", "as_json", is_flag=True, help="Print the main figures as one JSON document."
-    ),
+    options.flag("--overwrite", help="Replace the result of another survey."),
+    options.flag("--quiet", "-q", help="No progress, only the result."),
+    options.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
+    options.as_json,
 )
 
 
@@ -82,16 +74,13 @@ def _seconds(_: click.Context, __: click.Parameter, text: str | None) -> float |
     try:
         return float(text[:-1]) * unit if unit else float(text)
     except ValueError as error:
-        raise click.BadParameter(
-            f"{text!r} is not a time: give a number with s, m or h."
-        ) from error
+        told = f"{text!r} is not a time: give a number with s, m or h."
+        raise click.BadParameter(told) from error
 
 
 def _shown(command: options.Command) -> options.Command:
     """Give a command the options of `_SHOWN`, in their order."""
-    for option in reversed(_SHOWN):
-        command = option(command)
-    return command
+    return reduce(lambda command, option: option(command), reversed(_SHOWN), command)
 
 
 @click.group(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
@@ -125,8 +114,8 @@ def demo(out: Path | Storage, **shown: Any) -> None:
 @options.cluster
 @options.backend
 @options.no_plan
-@click.option("--resume", is_flag=True, help="Resume an unfinished run, if there is one.")
-@click.option("--fresh", is_flag=True, help="Delete an unfinished run.")
+@options.flag("--resume", help="Resume an unfinished run, if there is one.")
+@options.flag("--fresh", help="Delete an unfinished run.")
 @click.option(
     "--parts",
     metavar="PLACE",
@@ -166,15 +155,10 @@ def run(scenario: Path, **given: Any) -> None:
     for name, default in (("wait_s", WAIT_S), ("patience_s", PATIENCE_S)):
         if given[name] is None:
             given[name] = QUEUE_S if queued else default
-    if given["tls"] and queued:
+    if given["tls"] and (queued or given["scheduler"] is not None):
         raise click.UsageError(
-            "--tls is for a cluster of this machine; that of --cluster is encrypted if its file "
-            "says so."
-        )
-    if given["tls"] and given["scheduler"] is not None:
-        raise click.UsageError(
-            "--tls is for the local cluster; the cluster of --scheduler is encrypted if its "
-            "address begins with tls://."
+            "--tls is for a cluster of this machine: that of --cluster is encrypted if its file "
+            "says so, that of --scheduler if its address begins with tls://."
         )
     if given["resume"] and given["fresh"]:
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
@@ -201,7 +185,7 @@ def _run(path: Path | None, **given: Any) -> None:
 
 @cli.command()
 @options.scheduler
-@click.option("--json", "as_json", is_flag=True, help="Print it as one JSON document.")
+@options.as_json
 def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     """Show versions, backends, GPUs and workers.
 
@@ -222,22 +206,21 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
         with connected(scheduler, files) as client:
             pool = Pool.from_client(client)
     workers = sorted(pool or (), key=lambda worker: (sorted(worker.resources), worker.name))
-    gpus = visible_gpus()
+    told: dict[str, Any] = {
+        "versions": versions(),
+        "gpus": list(visible_gpus()),
+        "backends": {name: reason or "ready" for name, reason in available_backends().items()},
+        "workers": [asdict(worker) for worker in workers],
+    }
     if as_json:
-        told = {
-            "versions": versions(),
-            "gpus": list(gpus),
-            "backends": {name: reason or "ready" for name, reason in available_backends().items()},
-            "workers": [asdict(worker) for worker in workers],
-        }
         click.echo(json.dumps(told, indent=1, default=str))
         return
-    for name, number in versions().items():
+    for name, number in told["versions"].items():
         click.echo(f"{name:<14} {number}")
-    click.echo(f"{'GPUs here':<14} {', '.join(gpus) or 'none'}")
+    click.echo(f"{'GPUs here':<14} {', '.join(told['gpus']) or 'none'}")
     click.echo("backends")
-    for name, reason in available_backends().items():
-        click.echo(f"  {name:<12} {reason or 'ready'}")
+    for name, state in told["backends"].items():
+        click.echo(f"  {name:<12} {state}")
     if pool is not None:
         _tell_workers(workers)
 
@@ -264,48 +247,45 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     try:
         cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
     except LidarpoolError as error:
-        _die(" ".join([str(error), *_notes(error)]), 2)
+        _die(str(error), error)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
     except click.MissingParameter as error:
         usage = error.ctx.get_usage() if error.ctx else ""
         told = " ".join(error.format_message().split())  # click gives each choice a line
-        _die(f"{told}\n{usage}", 2)
+        _die(f"{told}\n{usage}")
     except click.UsageError as error:
-        _die(error.format_message(), 2)
+        _die(error.format_message())
     except (KeyboardInterrupt, click.Abort) as error:
-        notes = _notes(error)
-        _die(" ".join([f"{STOPPED}.", *notes]) if notes else UNTOUCHED, INTERRUPTED)
+        _die(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
     except OSError as error:
         # The name is impossible for a file, or its folder may not be read; anything else is a
         # defect, and gets a traceback.
         if error.filename is None:
             raise
-        told = f"{error.filename}: {error.strerror}: give another name or folder."
-        _die(" ".join([told, *_notes(error)]), 2)
+        _die(f"{error.filename}: {error.strerror}: give another name or folder.", error)
     except MemoryError as error:
-        advice = "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
-        _die(" ".join([advice, *_notes(error)]), 2)
+        _die("not enough memory: take a smaller scene, fewer scans or a larger keep_every.", error)
     except RuntimeError as error:
         from poolpart import PoolError
 
         if not isinstance(error, PoolError):
             raise
-        _die(" ".join([str(error), *_notes(error)]), 2)
+        _die(str(error), error)
     sys.exit(0)
 
 
-def _notes(error: BaseException) -> list[str]:
+def _notes(error: BaseException | None) -> list[str]:
     """List the notes of an error or its cause: what was kept, and how to continue."""
-    link: BaseException | None = error
-    while link is not None:
-        if notes := getattr(link, "__notes__", []):
+    while error is not None:
+        if notes := getattr(error, "__notes__", []):
             return list(notes)
-        link = link.__cause__ or link.__context__
+        error = error.__cause__ or error.__context__
     return []
 
 
-def _die(message: str, code: int) -> NoReturn:
+def _die(message: str, error: BaseException | None = None, code: int = 2) -> NoReturn:
+    message = " ".join([message, *_notes(error)])
     # Names may come from files, and control characters would reach the terminal.
     message = "".join(c if c.isprintable() or c == "\n" else "\ufffd" for c in message)
     click.echo(f"lidarpool: {message}", err=True)

@@ -9,14 +9,14 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..export.table import EXPORTS, LAYOUTS
-from .options import Place
+from . import options
 
 if TYPE_CHECKING:
     from ..base.storage import Storage
 
 
 @click.command()
-@click.argument("result", metavar="FOLDER", type=Place())
+@options.result
 @click.option(
     "--format",
     "-f",
@@ -33,12 +33,8 @@ if TYPE_CHECKING:
     show_default=True,
     help="Layout of points in mcap and rosbag2.",
 )
-@click.option(
-    "--out",
-    type=Place(file_okay=False),
-    help="Folder for the files.  [default: FOLDER]",
-)
-@click.option("--overwrite", is_flag=True, help="Replace existing files.")
+@options.copies
+@options.overwrite
 def export(
     result: Path | Storage,
     formats: tuple[str, ...],

@@ -6,7 +6,6 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,7 @@ from .run_command import no_hits
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
 # caster is built (Embree 300, NumPy 350, CUDA 360).
-PROCESS_BYTES = 200 << 20
+PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles what calls Embree
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
 RAY_BYTES = 48  # of a turn, and of the pattern made of it
@@ -60,23 +59,6 @@ FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most
 SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
 
 
-@dataclass(frozen=True)
-class Sample:
-    """Estimate for a survey from some of its scans, cast here.
-
-    Parameters
-    ----------
-    rays
-        Rays that were cast.
-    hits, points
-        Of the whole survey, estimated; counted if all of its rays were cast.
-    """
-
-    rays: int
-    hits: int
-    points: int
-
-
 def forecast(
     job: Job,
     pool: PoolSection,
@@ -87,18 +69,8 @@ def forecast(
 ) -> dict[str, Any]:
     """Find out what a run would do and need, and whether it can run.
 
-    Parameters
-    ----------
-    job, out
-        What is to be run, and the place of the result; that is only looked at.
-    pool
-        Sizes of a cluster on this machine, which is not started.
-    client
-        Client of the cluster to run on instead.
-    formats
-        That the cloud is exported to.
-    file
-        Of a cluster to start for it, which is not started.
+    It runs on the cluster of `client`, on the one that `file` describes, or on one of this machine
+    with the sizes of `pool`. Neither of the latter is started, and `out` is only looked at.
 
     Returns
     -------
@@ -118,26 +90,39 @@ def forecast(
             one.check_installed()
     slots = _slots(job, pool, client, file)
     # The memory of machines that are not there yet is unknown.
-    casters, backend, memory = slots[GPU]["there"], None, 0 if client or file else MEMORY_LIMIT
+    memory = 0 if client or file else MEMORY_LIMIT
+    casters, backend = slots[GPU]["there"], None
     with mistakes.noted():
         if file is not None:
             file.require({name: one["needed"] for name, one in slots.items()})
         elif client is None:
-            backend = _backend_here(job.backend)
+            check_backend_here(job.backend)
+            usable = [name for name, reason in available_backends().items() if not reason]
+            backend = usable[0] if job.backend == "auto" else job.backend
         else:
-            casters, backend, memory, note = _casters(job, client)
-            notes += [note] if note else []
-    sample = None
+            try:
+                everybody, casting, backend, _ = find_workers(client, job, job.backend)
+            except PoolError as error:
+                raise LidarpoolError(str(error)) from error
+            casters = len(casting)
+            memory = min((worker.memory for worker in casting if worker.memory), default=0)
+            notes += filter(None, [gpu_note(everybody, casting, backend)])
+    estimate = None
     # Casting here needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) <= MEMORY_LIMIT:
-        sample = sample_survey(job.scene, job.survey)
-        if not sample.hits:
+        estimate = sample_survey(job.scene, job.survey)
+        if not estimate["hits"]:
             notes.append(no_hits(job))
-    # Without a sample every ray may hit.
-    points = sample.points if sample else job.survey.ray_count // job.survey.keep_every
+    # Without an estimate every ray may hit.
+    points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     disk = _disk(job, points, len(formats), out)
-    with mistakes.noted():
-        _check_disk(disk, isinstance(out, Storage))
+    stored = isinstance(out, Storage)
+    if disk["free"] < (least := disk["result"] + (0 if stored else disk["parts"])):
+        mistakes.lines.append(
+            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
+            f"needs about {format_bytes(least)}: make room, name another folder with "
+            f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
+        )
     needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)
     if memory and memory < needed:
         mistakes.lines.append(
@@ -156,7 +141,7 @@ def forecast(
         "drive": _drive(job.survey),
         "scans": job.survey.scan_count,
         "rays": job.survey.ray_count,
-        "estimate": asdict(sample) if sample else None,
+        "estimate": estimate,
         "trials": job.trials,
         "backend": backend,
         "casters": casters,
@@ -166,34 +151,19 @@ def forecast(
     }
 
 
-def _casters(job: Job, client: Client) -> tuple[int, str, int, str]:
-    """Workers of a cluster that would cast, their backend, the least memory of one, and a note."""
-    try:
-        planning = job.planning is not None
-        pool, casting, backend, _ = find_workers(client, job.collectors, planning, job.backend)
-    except PoolError as error:
-        raise LidarpoolError(str(error)) from error
-    memory = min((worker.memory for worker in casting if worker.memory), default=0)
-    return len(casting), backend, memory, gpu_note(pool, casting, backend)
-
-
 def _disk(job: Job, points: int, exports: int, out: Path | Storage) -> dict[str, Any]:
-    """Disk that is needed and free, and its folder."""
-    parts, result = _disk_bytes(job, points, exports)
+    """Disk that parts and database need during the run, that the result needs, and what is free."""
+    survey, faces, point = job.survey, len(job.scene.faces), _point_bytes(job)
+    parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
+    tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
+    run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
+    # A row of the PLY has doubles for coordinates at most; one piece exists twice.
+    cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
+    result = cloud + (point + FORMAT_BYTES) * points * exports + ROOM_BYTES + 36 * faces
     # What goes into storage is made in a folder for temporary files, but for the parts.
     folder = Path(tempfile.gettempdir()) if isinstance(out, Storage) else out
     free = shutil.disk_usage(_existing(folder)).free
-    return {"parts": parts, "result": result, "free": free, "folder": str(folder)}
-
-
-def _check_disk(disk: dict[str, Any], stored: bool) -> None:
-    needed = disk["result"] + (0 if stored else disk["parts"])
-    if disk["free"] < needed:
-        raise LidarpoolError(
-            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
-            f"needs about {format_bytes(needed)}: make room, name another folder with "
-            f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
-        )
+    return {"parts": run, "result": result, "free": free, "folder": str(folder)}
 
 
 def _drive(survey: Survey) -> dict[str, Any] | None:
@@ -205,26 +175,24 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
     metres = float(np.linalg.norm(np.diff(places, axis=0), axis=1).sum())
     sensors = []
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
-        firings = carried.sensor.firings(steps - 1)[1]
-        rate_hz = getattr(carried.sensor.head, "rate_hz", None)
-        on_ns = carried.sensor.begins_ns(np.array([firings])).item() - carried.sensor.start_ns
-        turns = rate_hz and on_ns / 1e9 * rate_hz
-        sensors.append(
-            {
-                "name": carried.name,
-                "model": carried.sensor.model,
-                "cycle": carried.sensor.cycle,
-                "scans": steps * survey.path.stations,
-                "firings": firings * survey.path.stations,
-                "turns": turns,
-                "metres_a_turn": rate_hz and metres / seconds / rate_hz,
-            }
-        )
+        sensor, name = carried.sensor, carried.name
+        firings = sensor.firings(steps - 1)[1]
+        rate_hz = getattr(sensor.head, "rate_hz", None)
+        on_ns = sensor.begins_ns(np.array([firings])).item() - sensor.start_ns
+        sensors.append({
+            "name": name, "model": sensor.model, "cycle": sensor.cycle,
+            "scans": steps * survey.path.stations, "firings": firings * survey.path.stations,
+            "turns": rate_hz and on_ns / 1e9 * rate_hz,
+            "metres_a_turn": rate_hz and metres / seconds / rate_hz,
+        })  # fmt: skip
     return {"seconds": seconds, "metres": metres, "sensors": sensors}
 
 
-def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample:
-    """Estimate hits and points of a survey by casting some of its scans, all if they are few."""
+def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
+    """Estimate hits and points of a survey by casting some of its scans, all if they are few.
+
+    Also returns how many rays were cast.
+    """
     rig = Rig(scene, survey, backend)
     all_rays = survey.ray_count * survey.returns.subrays
     count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, *SAMPLE_SCANS)
@@ -235,14 +203,14 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> Sample
             hits += int(found.found.hits.sum())
             points += len(found)
     share = survey.ray_count / rays
-    return Sample(rays, round(hits * share), round(points * share))
+    return {"rays": rays, "hits": round(hits * share), "points": round(points * share)}
 
 
 def _slots(
     job: Job, pool: PoolSection, client: Client | None, file: ClusterFile | None
 ) -> dict[str, dict[str, int]]:
     """Slots of each partition: those needed, and those that exist or would exist."""
-    needed = slots_needed(job.collectors, job.planning is not None)
+    needed = slots_needed(job)
     if file is not None:
         there = file.slots
     elif client is not None:
@@ -253,13 +221,6 @@ def _slots(
         there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
         there[LIDAR] = needed[LIDAR]  # one worker with as many threads
     return {name: {"needed": needed[name], "there": there.get(name, 0)} for name in needed}
-
-
-def _backend_here(wanted: str) -> str:
-    """Ray-casting backend that stage 2 would use on this machine."""
-    check_backend_here(wanted)
-    usable = (name for name, reason in available_backends().items() if not reason)
-    return next(usable) if wanted == "auto" else wanted
 
 
 def _existing(out: Path) -> Path:
@@ -302,18 +263,6 @@ def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> i
     if OTHER in slots:
         workers += other * slots[OTHER]["there"]
     return workers + driver + 2 * PROCESS_BYTES  # of LIDAR and the driver
-
-
-def _disk_bytes(job: Job, points: int, exports: int) -> tuple[int, int]:
-    """Disk that parts and database need during the run, and that the result needs."""
-    survey, faces, point = job.survey, len(job.scene.faces), _point_bytes(job)
-    parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
-    tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
-    run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
-    # A row of the PLY has doubles for coordinates at most; one piece exists twice.
-    cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
-    exported = (point + FORMAT_BYTES) * points * exports
-    return run, cloud + exported + ROOM_BYTES + 36 * faces
 
 
 def _point_bytes(job: Job) -> int:

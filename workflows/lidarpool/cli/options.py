@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import wraps
+from functools import partial, wraps
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ class Place(click.Path):
         return Storage.at(value)
 
 
+flag = partial(click.option, is_flag=True)
 out = click.option(
     "--out",
     type=Place(),
@@ -41,12 +42,20 @@ backend = click.option(
     type=click.Choice(BACKENDS),
     help="Ray caster of stage 2; by default the scenario's, else the fastest available.",
 )
-no_plan = click.option("--no-plan", is_flag=True, help="Leave out path planning.")
+no_plan = flag("--no-plan", help="Leave out path planning.")
 cluster = click.option(
     "--cluster",
     metavar="FILE",
     type=click.Path(path_type=Path),
     help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md.",
+)
+
+
+overwrite = flag("--overwrite", help="Replace existing files.")
+as_json = flag("--json", "as_json", help="Print the figures as one JSON document.")
+result = click.argument("result", metavar="FOLDER", type=Place())
+copies = click.option(
+    "--out", type=Place(file_okay=False), help="Folder for the files.  [default: FOLDER]"
 )
 
 

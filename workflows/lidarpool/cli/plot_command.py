@@ -10,7 +10,7 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import PICTURES
-from .options import Place
+from . import options
 
 if TYPE_CHECKING:
     from ..base.storage import Storage
@@ -26,7 +26,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
 
 
 @click.command()
-@click.argument("result", metavar="FOLDER", type=Place())
+@options.result
 @click.option(
     "--only",
     type=click.Choice(PICTURES),
@@ -41,11 +41,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
     show_default=True,
     help="Width and height in pixels.",
 )
-@click.option(
-    "--out",
-    type=Place(file_okay=False),
-    help="Folder for the pictures.  [default: FOLDER]",
-)
+@options.copies
 @click.option(
     "--colour",
     metavar="COLUMN",

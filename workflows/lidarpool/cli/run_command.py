@@ -25,13 +25,13 @@ from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import slots_needed
 from ..run.cluster_file import ClusterFile
-from ..run.conductor import NoPage, Page, conducted
+from ..run.conductor import Page, conducted
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
 from ..run.job import Job, make_job
 from ..run.result import RunResult
 from ..run.store import RUN_FOLDER, RunStore, remove_run
-from ..run.waiting import Waiting
+from ..run.watch import Waiting
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from ..simulator.world import check_backend_here
@@ -42,11 +42,9 @@ from .worker_logs import WorkerLogs
 
 @dataclass(frozen=True)
 class RunOptions:
-    """How a scenario is to be run; see the options of `lidarpool run`.
+    """How a scenario is to be run: the options of `lidarpool run`, where they are told of.
 
     `resumable`: keep the run in the output folder; otherwise `resume` and `fresh` have no effect.
-    `stay`: keep the live page open after the run. `only`: "cloud" for a cloud without pictures and
-    page. `overwrite`: replace the result of another survey. `parts`: where to keep the parts.
     """
 
     out: Path | Storage
@@ -79,27 +77,19 @@ class RunOptions:
 def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     """Run a scenario, write the result and print a summary.
 
-    Raises
-    ------
-    LidarpoolError
-        If the run fails; notes of the error say what was kept.
+    LidarpoolError if the run fails; notes of the error say what was kept.
     """
     set_logs(options.verbose)
     if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     with shown_status("reading the scene", options.quiet, logged=False):
-        job = make_job(
-            scenario,
-            options.backend,
-            options.no_plan,
-            wait_s=options.wait_s,
-            patience_s=options.patience_s,
-        )
+        times = {"wait_s": options.wait_s, "patience_s": options.patience_s}
+        job = make_job(scenario, options.backend, options.no_plan, **times)
     if options.cluster is not None:
-        options.cluster.require(slots_needed(job.collectors, job.planning is not None))
+        options.cluster.require(slots_needed(job))
     if not options.quiet:
         for note in scenario.advice(job.scene):
-            _note(note)
+            tell(f"note: {note}")
     with ExitStack() as whole, _page(job, options.live) as page:
         result, report = _run(scenario, job, options, page, whole)
         if options.as_json:
@@ -122,12 +112,11 @@ def _run(
     for one in formats:
         one.check_installed()
     load_open3d()  # what writes the cloud in the end
-    out, left = options.out, ""
+    out = options.out
 
     def in_place() -> None:
-        nonlocal left
         whole.enter_context(_noting_complete(out))
-        left = store.remove()
+        store.remove()
 
     with result_folder(out) as folder:
         goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
@@ -148,17 +137,8 @@ def _run(
             what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
             with shown_status(f"writing {what}", options.quiet):
                 report = write_result(
-                    folder,
-                    out,
-                    result,
-                    scenario,
-                    in_place,
-                    only_cloud=only_cloud,
-                    formats=formats,
-                    workers=workers,
+                    folder, out, result, scenario, in_place, only_cloud, formats, workers
                 )
-        if left:
-            report["notes"].append(left.rstrip("."))
     return result, report
 
 
@@ -187,7 +167,7 @@ def _noting_complete(out: Path | Storage) -> Iterator[None]:
 
 def _page(job: Job, live: bool) -> AbstractContextManager[Page]:
     if not live:
-        return nullcontext(NoPage())
+        return nullcontext(Page())
     from ..live.run_page import live_run
 
     return live_run(job)
@@ -221,13 +201,11 @@ def _cluster(
     if options.cluster is not None:
         started = started_client(options.cluster, _teller(options))
         return _with_status(started, f"starting {options.cluster}", options)
+    pool = scenario.pool
     local = local_client(
-        gpu_workers=scenario.pool.gpu,
-        collectors=scenario.pool.collectors,
-        other_workers=scenario.pool.other,
-        planning=job.planning is not None,
-        tls=options.tls,
-    )
+        gpu_workers=pool.gpu, collectors=pool.collectors, other_workers=pool.other,
+        planning=job.planning is not None, tls=options.tls,
+    )  # fmt: skip
     return _with_status(local, "starting the workers", options)
 
 
@@ -246,11 +224,7 @@ def _with_status(
 
 
 def _teller(options: RunOptions) -> Callable[[str], None]:
-    return (lambda words: None) if options.quiet else _note
-
-
-def _note(words: str) -> None:
-    tell(f"note: {words}")
+    return lambda words: None if options.quiet else tell(f"note: {words}")
 
 
 def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:
@@ -264,17 +238,12 @@ def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, An
         f"{counted(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
-    if result.plan is not None:
-        plan = result.plan
-        found = (
-            f"path of {plan.length:.2f} m, free of collisions"
-            if plan.collision_free
-            else "no path free of collisions was found"
-        )
-        possible = (
-            f"the shortest possible is {plan.shortest_possible:.2f} m"
-            if math.isfinite(plan.shortest_possible)
-            else "no path is possible, the obstacles leave no way"
-        )
+    if (plan := result.plan) is not None:
+        found = "no path free of collisions was found"
+        if plan.collision_free:
+            found = f"path of {plan.length:.2f} m, free of collisions"
+        possible = "no path is possible, the obstacles leave no way"
+        if math.isfinite(plan.shortest_possible):
+            possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
         click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
     click.echo(f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from .options import Command
+from .options import Command, overwrite
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -21,18 +22,13 @@ def scene() -> None:
 
 def _made(triangles: int) -> Callable[[Command], Command]:
     """Add the output file, the number of triangles, and a seed."""
-
-    def add(command: Command) -> Command:
-        for option in (
-            click.option("--seed", default=0, help="The same seed gives the same scene."),
-            click.option("--triangles", default=triangles, help="Approximate number."),
-            click.option("--overwrite", is_flag=True, help="Replace an existing file."),
-            click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj"),
-        ):
-            command = option(command)
-        return command
-
-    return add
+    added = (
+        click.option("--seed", default=0, help="The same seed gives the same scene."),
+        click.option("--triangles", default=triangles, help="Approximate number."),
+        overwrite,
+        click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj"),
+    )
+    return lambda command: reduce(lambda made, option: option(made), added, command)
 
 
 @scene.command(context_settings={"show_default": True})

@@ -30,8 +30,7 @@ def sensors(model: str | None, out: Path | None) -> None:
         rows = [heads, *map(_figures, model_names())]
         widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
         for row in rows:
-            cells = (cell.ljust(width) for cell, width in zip(row, widths, strict=True))
-            click.echo("  ".join(cells).rstrip())
+            click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
         return
     described = read_model(model)
     from ..render.beam_picture import draw_beams  # imports Matplotlib, which lists do not need

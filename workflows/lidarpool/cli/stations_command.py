@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
+from . import options
 
 if TYPE_CHECKING:
     from ..plan.stations import StationPlan
@@ -66,8 +67,8 @@ def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> flo
     metavar="FOLDER",
     help="Folder for stations.yaml and stations.png.  [default: named after the scene]",
 )
-@click.option("--overwrite", is_flag=True, help="Replace existing files.")
-@click.option("--json", "as_json", is_flag=True, help="Print the plan as one JSON document.")
+@options.overwrite
+@options.as_json
 def stations(
     scene: Path,
     model: str,
@@ -110,14 +111,9 @@ def stations(
         built = read.build_scene()
     with shown_status("looking from all places", as_json, logged=False):
         plan = plan_stations(
-            built,
-            sensor,
-            count=count,
-            coverage=coverage,
-            height_m=height,
-            spacing_m=spacing,
-            slant_deg=slant,
-        )
+            built, sensor, count=count, coverage=coverage,
+            height_m=height, spacing_m=spacing, slant_deg=slant,
+        )  # fmt: skip
     with shown_status("drawing the picture", as_json, logged=False):
         page = draw_stations(built, plan)
     folder.mkdir(parents=True, exist_ok=True)
@@ -214,14 +210,13 @@ def _told(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
     order = [k for k in (-left).argsort(kind="stable").tolist() if plan.visible_m2[k] > 0]
     shown = order[:_OBJECTS_TOLD]
     labels = without_common_prefix(names)
-    wide = max(6, *(len(labels[k]) for k in shown))
-    yield f"{'object':<{wide}}  can be seen   covered"
-    for k in shown:
-        visible, covered = float(plan.visible_m2[k]), float(plan.covered_m2[k])
-        yield f"{labels[k]:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
+    groups = [(labels[k], [k]) for k in shown]
     if others := order[_OBJECTS_TOLD:]:
-        visible, covered = plan.visible_m2[others].sum(), plan.covered_m2[others].sum()
-        label = f"{len(others):,} others"
+        groups.append((f"{len(others):,} others", others))
+    wide = max(6, *(len(label) for label, _ in groups))
+    yield f"{'object':<{wide}}  can be seen   covered"
+    for label, those in groups:
+        visible, covered = plan.visible_m2[those].sum(), plan.covered_m2[those].sum()
         yield f"{label:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
     blind = len(names) - len(order)
     if blind:

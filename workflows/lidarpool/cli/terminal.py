@@ -66,13 +66,7 @@ def _tell(stream: Any, line: str) -> None:
 
 
 class PlainLines:
-    """Progress as lines of text; call it with each `Progress`.
-
-    Parameters
-    ----------
-    stream
-        Where to write.
-    """
+    """Progress as lines of text in a stream; call it with each `Progress`."""
 
     def __init__(self, stream: Any) -> None:
         self.stream = stream
@@ -92,23 +86,19 @@ class PlainLines:
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)
-        scans, trials = progress.scans, progress.trials
         stages = ", ".join(
             f"{label} {getattr(progress, count):,}" for label, count, unit in STAGES[:-1]
         )
-        whole = f"{scans:,} scans, {progress.points:,} points in {now:.1f} s"
-        done = min(progress.collected, progress.framed)
-        self._line("survey", due, now, done, scans, f"scans ({stages})", whole)
-        if trials:
-            whole = f"{trials:,} trials in {now:.1f} s"
-            self._line("planning", due, now, progress.trials_done, trials, "trials", whole)
-
-    def _line(
-        self, what: str, due: bool, now: float, count: int, total: int, unit: str, whole: str
-    ) -> None:
-        pace = self._paces[what].told(now, count, total)
-        if count == total and what not in self._done:
-            self._done.add(what)
-            _tell(self.stream, f"{what}  done: {whole}")
-        elif due and count < total:
-            _tell(self.stream, f"{what}  {count:,} of {total:,} {unit}  {pace}".rstrip())
+        scans, done = progress.scans, min(progress.collected, progress.framed)
+        whole, trials = f"{scans:,} scans, {progress.points:,} points", progress.trials
+        for what, count, total, unit, all_ in (
+            ("survey", done, scans, f"scans ({stages})", whole),
+            ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
+        ):
+            pace = self._paces[what].told(now, count, total)
+            if total and count == total and what not in self._done:
+                self._done.add(what)
+                _tell(self.stream, f"{what}  done: {all_} in {now:.1f} s")
+            elif due and count < total:
+                line = f"{what}  {count:,} of {total:,} {unit}  {pace}"
+                _tell(self.stream, line.rstrip())

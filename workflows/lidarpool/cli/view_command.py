@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import click
 
-from .options import Place
+from .options import Place, flag
 
 if TYPE_CHECKING:
     from ..base.storage import Storage
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     show_default=True,
     help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
-@click.option("--no-browser", is_flag=True, help="Only print the address.")
+@flag("--no-browser", help="Only print the address.")
 def view(result: Path | Storage, port: int, no_browser: bool) -> None:
     """Show a result or a cloud in the browser.
 

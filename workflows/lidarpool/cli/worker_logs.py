@@ -13,11 +13,6 @@ class WorkerLogs(WorkerPlugin):
     """Shows or drops messages of workers that share the command's terminal.
 
     The driver reports a failed task once; Dask's worker would log it as well, with a traceback.
-
-    Parameters
-    ----------
-    shown
-        Whether they show what they log.
     """
 
     name = "lidarpool-logs"

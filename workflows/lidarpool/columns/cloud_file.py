@@ -19,18 +19,8 @@ from .table import TABLE, Column
 class CloudFile:
     """A cloud in PLY format, whose points stay on disk until they are selected.
 
-    Parameters
-    ----------
-    path
-        The file.
-    own
-        Descriptions of its columns that are not in the table of columns, if known: the file cannot
-        store units.
-
-    Raises
-    ------
-    LidarpoolError
-        If it cannot be read, or is not a point cloud of lidarpool.
+    The file cannot store units, so `own` describes columns that are not in the table of columns, if
+    that is known. LidarpoolError if it cannot be read, or is not a point cloud of lidarpool.
     """
 
     def __init__(self, path: Path, own: Sequence[Column] = ()) -> None:
@@ -40,7 +30,7 @@ class CloudFile:
         scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
         some = scans[one_of_each_part(len(scans), 100_000)]
         ordered = scans.dtype.kind in "iu" and bool((np.diff(some) >= 0).all())
-        # First and last scan; None if the points are not in scan order.
+        # First and last scan; (0, 0) if the points are not in scan order.
         self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
 
     def __len__(self) -> int:
@@ -56,14 +46,13 @@ class CloudFile:
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order, from row `first` on, at most so many at a time."""
         for start in range(first, len(self), points):
-            rows = self._rows[start : start + points]
-            positions = np.stack([rows[axis] for axis in AXES], axis=1)
-            columns = {column.name: rows[column.in_files] for column in self.table}
-            yield Cloud(positions, columns, self.table)
+            yield self._cloud(self._rows[start : start + points])
 
     def choose(self, most: int) -> Cloud:
         """Select at most so many evenly spaced points, and of these the finite ones, in order."""
-        return self._cloud(self._rows[one_of_each_part(len(self), most)])
+        rows = self._rows[one_of_each_part(len(self), most)]
+        known = np.isfinite(_positions(rows)).all(axis=1)
+        return self._cloud(rows if known.all() else rows[known], np.float64)
 
     def row_of(self, scan: int) -> int:
         """Row of the first point of a scan, if the points are in the order of scans."""
@@ -81,13 +70,13 @@ class CloudFile:
         files = {column.name: column.in_files for column in self.table}
         return np.asarray(self._rows[files.get(name, name)][rows])
 
-    def _cloud(self, rows: NDArray[np.void]) -> Cloud:
-        positions = np.stack([rows[axis] for axis in AXES], axis=1, dtype=np.float64)
-        known = np.isfinite(positions).all(axis=1)
-        if not known.all():
-            rows, positions = rows[known], positions[known]
+    def _cloud(self, rows: NDArray[np.void], dtype: Any = None) -> Cloud:
         columns = {column.name: rows[column.in_files] for column in self.table}
-        return Cloud(positions, columns, self.table)
+        return Cloud(_positions(rows, dtype), columns, self.table)
+
+
+def _positions(rows: NDArray[np.void], dtype: Any = None) -> NDArray[Any]:
+    return np.stack([rows[axis] for axis in AXES], axis=1, dtype=dtype)
 
 
 def _table(row: np.dtype[np.void], own: Sequence[Column]) -> tuple[Column, ...]:

@@ -14,7 +14,7 @@ import re
 import zipfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -59,21 +59,9 @@ def mark_name(mark: str) -> str:
 def own_files(storage: Storage, mark: str | None) -> list[str]:
     """Names of the files that a run may delete, those that killed writers left among them.
 
-    Parameters
-    ----------
-    storage
-        Folder of the parts. Behind a link, or without the mark in it, there are none.
-    mark
-        That of the run; None for each that the folder has.
-
-    Returns
-    -------
-    The names; marks come last, so that what an interrupted removal has left stays known.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be listed.
+    `mark` is that of the run; None for each that the folder has. Behind a link, or without the mark
+    in the folder, there are none. Marks come last, so that what an interrupted removal has left
+    stays known.
     """
     names = [] if storage.is_link else [*storage.sizes()]
     marks = {_mark_of(name) for name in names if name.endswith("-mark")} - {""}
@@ -90,25 +78,13 @@ def _mark_of(name: str) -> str:
 
 @dataclass(frozen=True)
 class PartColumns:
-    """Content of a part.
+    """Content of a part."""
 
-    Parameters
-    ----------
-    first
-        Its first scan.
-    counts
-        int64 (scans,): rows of each scan.
-    columns
-        {name: (rows,)}: the columns, positions as cells.
-    triangles, hits
-        int32 (k,), int64 (k,): triangles that were hit, and all their hits.
-    """
-
-    first: int
-    counts: NDArray[np.int64]
-    columns: Mapping[str, NDArray[Any]]
-    triangles: NDArray[np.int32]
-    hits: NDArray[np.int64]
+    first: int  # scan
+    counts: NDArray[np.int64]  # (scans,): rows of each scan
+    columns: Mapping[str, NDArray[Any]]  # {name: (rows,)}, positions as cells
+    triangles: NDArray[np.int32]  # (k,): those that were hit
+    hits: NDArray[np.int64]  # (k,): all their hits
 
     def __len__(self) -> int:
         return int(self.counts.sum())
@@ -139,20 +115,10 @@ class PartColumns:
         rows: NDArray[np.integer] | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
-        """Points of the part, or some of them.
+        """Points of the part, or some of its rows, with these columns beside the positions.
 
-        Parameters
-        ----------
-        table
-            Columns of the cloud beside the positions.
-        precision_m
-            Size of the cells that positions were rounded to.
-        origin
-            World position of the scene's local origin, (3,), metres.
-        rows
-            Of the part.
-        sweeps
-            As of `Cloud`.
+        Their cells are of `precision_m`, from the world position `origin`, (3,), metres; `sweeps`
+        as of `Cloud`.
         """
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
         columns = {
@@ -189,10 +155,7 @@ def pack(part: PartColumns) -> bytearray:
 def unpack(data: bytes) -> PartColumns:
     """Inverse of `pack`; every array's checksum is compared.
 
-    Raises
-    ------
-    LidarpoolError
-        If it is not a part, or damaged; the message is a clause.
+    LidarpoolError if it is not a part, or damaged; the message is a clause.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as archive:
@@ -203,11 +166,7 @@ def unpack(data: bytes) -> PartColumns:
             arrays = {name.removesuffix(".npy"): _read_array(archive, name) for name in names}
         first, stop = arrays.pop(".scans").tolist()
         part = PartColumns(
-            first,
-            arrays.pop(".counts"),
-            arrays,
-            arrays.pop(".triangles"),
-            arrays.pop(".hits"),
+            first, arrays.pop(".counts"), arrays, arrays.pop(".triangles"), arrays.pop(".hits")
         )
         if (
             part.stop != stop
@@ -239,13 +198,7 @@ def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
-    """Read a part.
-
-    Raises
-    ------
-    LidarpoolError
-        If it is missing, cannot be read or is damaged.
-    """
+    """Read a part; LidarpoolError if it is missing, cannot be read or is damaged."""
     try:
         return unpack(storage.read(name))
     except LidarpoolError as error:
@@ -259,13 +212,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
 
 
 def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
-    """Read the hits of each triangle of a part, and nothing else.
-
-    Raises
-    ------
-    LidarpoolError
-        As `read_part`.
-    """
+    """Read the hits of each triangle of a part, and nothing else; errors as of `read_part`."""
     if not storage.is_local:
         part = read_part(storage, name)
         return part.triangles, part.hits
@@ -278,50 +225,23 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
         ) from error
 
 
+@dataclass(eq=False, repr=False)
 class StoredCloud(Savable):
-    """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`.
+    """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`."""
 
-    Parameters
-    ----------
-    storage
-        Place of the parts.
-    names, firsts, rows
-        Names of the parts in scan order, their first scans, and their numbers of points.
-    columns
-        Columns of a part.
-    cells
-        Lowest and highest cell of all points, (2, 3); None without points.
-    precision_m
-        Size of the cells that positions were rounded to.
-    origin
-        World position of the scene's local origin, (3,), metres.
-    keeper
-        Object to keep alive while the parts can be read.
-    sweeps
-        Returns the sweeps of the survey for `save`.
-    """
-
-    def __init__(
-        self,
-        storage: Storage,
-        names: Sequence[str],
-        firsts: Sequence[int],
-        rows: Sequence[int],
-        columns: Sequence[Column],
-        cells: NDArray[np.int64] | None,
-        precision_m: float,
-        origin: NDArray[np.float64],
-        keeper: Any = None,
-        sweeps: Callable[[], Any] | None = None,
-    ) -> None:
-        self.storage, self.names = storage, tuple(names)
-        self.firsts, self.rows = tuple(firsts), tuple(rows)
-        self._columns = tuple(columns)
-        self._cells, self._precision_m, self._origin = cells, precision_m, origin
-        self._keeper, self.sweeps = keeper, sweeps
+    storage: Storage  # of the parts
+    names: Sequence[str]  # of the parts, in scan order
+    firsts: Sequence[int]  # their first scans
+    rows: Sequence[int]  # their numbers of points
+    columns: Sequence[Column]  # of a part
+    cells: NDArray[np.int64] | None  # lowest and highest, (2, 3); None without points
+    precision_m: float  # size of the cells that positions were rounded to
+    origin: NDArray[np.float64]  # world position of the scene's local origin, (3,), metres
+    keeper: Any = None  # kept alive while the parts can be read
+    sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save`
 
     def __getstate__(self) -> dict[str, Any]:
-        return self.__dict__ | {"_keeper": None, "sweeps": None}  # both hold the scene
+        return self.__dict__ | {"keeper": None, "sweeps": None}  # both hold the scene
 
     def __repr__(self) -> str:
         return described(self)
@@ -332,31 +252,24 @@ class StoredCloud(Savable):
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
-        if self._cells is None:
+        if self.cells is None:
             return np.zeros((2, 3))
-        return positions(self._cells, self._precision_m, self._origin)
+        return positions(self.cells, self.precision_m, self.origin)
 
     @property
     def table(self) -> tuple[Column, ...]:
         """The columns beside the positions, in the order of files."""
-        rest = [column for column in self._columns if column not in AXES]
+        rest = [column for column in self.columns if column not in AXES]
         return (SCAN, *rest)
-
-    def part(self, name: str) -> PartColumns:
-        """Read one part."""
-        return read_part(self.storage, name)
 
     def cloud_of(self, part: PartColumns, rows: NDArray[np.integer] | slice = slice(None)) -> Cloud:
         """Points of a part, or some of them."""
-        return part.cloud(self.table, self._precision_m, self._origin, rows, self.sweeps)
+        return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)
 
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Read the cloud in order, from row `first` on, so many points at a time.
 
-        Raises
-        ------
-        LidarpoolError
-            If a part cannot be read.
+        LidarpoolError if a part cannot be read.
         """
         held: list[Cloud] = []
         count = 0
@@ -364,7 +277,7 @@ class StoredCloud(Savable):
             if rows <= first:
                 first -= rows
                 continue
-            cloud, first = self.cloud_of(self.part(name), slice(first, None)), 0
+            cloud, first = self.cloud_of(read_part(self.storage, name), slice(first, None)), 0
             while count + len(cloud) >= points:
                 cut = points - count
                 yield Cloud.joined([*held, cloud.part(slice(0, cut))])
@@ -381,7 +294,9 @@ class StoredCloud(Savable):
         row = sum(self.rows[: max(0, at)])
         if at < 0 or scan == self.firsts[at]:
             return row
-        return row + int(self.part(self.names[at]).counts[: scan - self.firsts[at]].sum())
+        return row + int(
+            read_part(self.storage, self.names[at]).counts[: scan - self.firsts[at]].sum()
+        )
 
     def sample(self, most: int, parts: int) -> Cloud:
         """Read at most so many evenly spaced points, of at most so many parts."""
@@ -393,7 +308,7 @@ class StoredCloud(Savable):
         for i in opened:
             inside = picked[(picked >= before) & (picked < before + self.rows[i])] - before
             before += self.rows[i]
-            clouds.append(self.cloud_of(self.part(self.names[i]), inside))
+            clouds.append(self.cloud_of(read_part(self.storage, self.names[i]), inside))
         return Cloud.joined(clouds) if clouds else self.load()
 
     def to_dask(self) -> Any:
@@ -409,9 +324,8 @@ class StoredCloud(Savable):
         need_packages("pandas", "pyarrow")
         import dask.dataframe as dd
 
-        bare = StoredCloud(
-            self.storage, (), (), (), self._columns, None, self._precision_m, self._origin
-        )
+        # Without the scene, which would go to all workers.
+        bare = replace(self, names=(), firsts=(), rows=(), cells=None, keeper=None, sweeps=None)
         filled = [name for name, rows in zip(self.names, self.rows, strict=True) if rows]
         empty = bare.load().to_dataframe()
         if not filled:
@@ -420,7 +334,7 @@ class StoredCloud(Savable):
 
     def frame_of(self, name: str) -> Any:
         """Return a pandas DataFrame of a part."""
-        return self.cloud_of(self.part(name)).to_dataframe()
+        return self.cloud_of(read_part(self.storage, name)).to_dataframe()
 
     def load(self) -> Cloud:
         """Read the whole cloud into memory."""

@@ -37,13 +37,7 @@ def held_type(column: Column) -> np.dtype[Any]:
 
 
 def as_held(column: Column, values: NDArray[Any]) -> NDArray[Any]:
-    """Values of a column in its type in a file.
-
-    Raises
-    ------
-    LidarpoolError
-        If a value is too large to be exact.
-    """
+    """Values of a column in its type in a file; LidarpoolError if one would not be exact."""
     wanted = held_type(column)
     if wanted == np.float64 and values.dtype.kind in "iu" and len(values):
         largest = max(abs(int(values.min())), abs(int(values.max())))
@@ -100,10 +94,8 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
 def mapped_rows(path: Path) -> NDArray[np.void]:
     """Return the points of a PLY file, a row each, which stay on the disk until they are used.
 
-    Raises
-    ------
-    LidarpoolError
-        If the file cannot be read, or is not a complete binary PLY file with our properties.
+    LidarpoolError if the file cannot be read, or is not a complete binary PLY file with our
+    properties.
     """
     try:
         start, count, dtype = layout(path)

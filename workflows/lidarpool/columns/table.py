@@ -85,10 +85,8 @@ class Column:
     def make(self, returns: Any) -> NDArray[Any]:
         """Values of this column for the returns of a batch: (n,), of the column's type.
 
-        Raises
-        ------
-        LidarpoolError
-            If its source gives another number of values, or values that the type cannot hold.
+        LidarpoolError if its source gives another number of values, or values that the type cannot
+        hold.
         """
         source = self.source
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
@@ -158,12 +156,7 @@ OPTIONAL = (
         kind="label",
     ),
     Column(
-        "returns",
-        "uint8",
-        "",
-        "number of reported returns of its pulse",
-        "returns",
-        kind="label",
+        "returns", "uint8", "", "number of reported returns of its pulse", "returns", kind="label"
     ),
     Column(
         "class",
@@ -183,10 +176,8 @@ TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name:
 def chosen(columns: Iterable[str | Column]) -> tuple[Column, ...]:
     """Columns in addition to `ALWAYS`, each once, with names looked up in `TABLE`.
 
-    Raises
-    ------
-    LidarpoolError
-        If there is no column of a name, two have the same name, or a name cannot be written.
+    LidarpoolError if there is no column of a name, two have the same name, or a name cannot be
+    written.
     """
     kept: dict[str, Column] = {}
     names = {column.in_files: column for column in TABLE.values()} | TABLE

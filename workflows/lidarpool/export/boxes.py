@@ -19,23 +19,12 @@ class Boxes:
 
     An actor moves during a sweep. Its box is at its pose at the mean time of its points, by their
     scans, or at the start of the sweep if it has none.
-
-    Parameters
-    ----------
-    centres
-        float64 (a, 3): metres, world coordinates.
-    quaternions
-        float64 (a, 4): x, y, z, w of the rotation from the actor's axes to the world's.
-    sizes
-        float64 (a, 3): length, width and height, metres, along the actor's axes.
-    points
-        int64 (a,): how many points of the sweep are the actor's.
     """
 
-    centres: Floats
-    quaternions: Floats
-    sizes: Floats
-    points: NDArray[np.int64]
+    centres: Floats  # (a, 3): metres, world coordinates
+    quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to the world's
+    sizes: Floats  # (a, 3): length, width and height, metres, along the actor's axes
+    points: NDArray[np.int64]  # (a,): how many points of the sweep are the actor's
 
     @classmethod
     def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Boxes:

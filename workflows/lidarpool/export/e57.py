@@ -15,7 +15,7 @@ import pye57
 from pye57 import libe57
 
 from ..base.fingerprint import fingerprint
-from ..columns.cloud import CloudLike
+from ..columns.cloud import Cloud, CloudLike
 from .sweeps import Sweeps
 
 
@@ -24,30 +24,23 @@ def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
     with _named_by(content), pye57.E57(str(path), mode="w") as file:
         try:
-            _write(file, cloud, sweeps)
+            for sweep, points in enumerate(sweeps.points(cloud)):
+                if len(points):
+                    _write_scan(file, sweeps, sweep, points)
             file.close()
         except libe57.E57Exception as error:
             del file.image_file  # closing it would fail again
             raise OSError(f"{str(error).splitlines()[0]}; the disk may be full") from error
 
 
-def _write(file: Any, cloud: CloudLike, sweeps: Sweeps) -> None:
-    for sweep, points in enumerate(sweeps.points(cloud)):
-        if not len(points):
-            continue
-        inside = sweeps.in_sensor(sweep, points.positions)
-        data = {
-            f"cartesian{axis}": column for axis, column in zip("XYZ", inside.T.copy(), strict=True)
-        }
-        if "intensity" in points.columns:
-            data["intensity"] = points["intensity"]
-        x, y, z, w = sweeps.pose.quaternions[sweep]
-        file.write_scan_raw(
-            data,
-            name=f"sweep {sweep}",
-            rotation=np.array([w, x, y, z]),
-            translation=sweeps.pose.positions[sweep],
-        )
+def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
+    x, y, z = sweeps.in_sensor(sweep, points.positions).T.copy()
+    data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
+    if "intensity" in points.columns:
+        data["intensity"] = points["intensity"]
+    turn = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
+    place = sweeps.pose.positions[sweep]
+    file.write_scan_raw(data, name=f"sweep {sweep}", rotation=turn, translation=place)
 
 
 @contextmanager

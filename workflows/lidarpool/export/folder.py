@@ -78,10 +78,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
 def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
     """Yield the folder of a result: from storage, a temporary copy of some of its files.
 
-    Raises
-    ------
-    LidarpoolError
-        If the storage cannot be read, or has no complete result.
+    LidarpoolError if the storage cannot be read, or has no complete result.
     """
     with local_folder(place) as folder:
         if not isinstance(place, Storage):
@@ -102,23 +99,10 @@ def local_result(place: Path | Storage, names: Sequence[str]) -> Iterator[Path]:
 
 
 def send(path: Path, place: Path | Storage) -> str:
-    """Copy a file or folder of a place into its storage, if it has one.
+    """Copy a file or folder of `result_folder` into its storage, if the place is one.
 
-    Parameters
-    ----------
-    path
-        A file or folder in the folder that `result_folder` gave.
-    place
-        The place of that folder; what it has of that name is replaced.
-
-    Returns
-    -------
-    Its path or URL, for messages.
-
-    Raises
-    ------
-    LidarpoolError
-        If the storage cannot be written to.
+    What the storage has of that name is replaced. Returns the path or URL, for messages.
+    LidarpoolError if the storage cannot be written to.
     """
     if not isinstance(place, Storage):
         return str(path)

@@ -9,9 +9,11 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
+from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, flush
 from ..columns.cloud import Cloud, CloudLike
@@ -25,47 +27,26 @@ _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." 
 
 
 @dataclass(frozen=True)
+@checked_fields
 class Format:
-    """A format that a cloud is exported to.
+    """A format that a cloud is exported to; the layout is that of points in mcap and rosbag2."""
 
-    Parameters
-    ----------
-    name
-        One of `lidarpool.export.table.FORMATS`.
-    layout
-        Layout of points in mcap and rosbag2: velodyne, autoware or ouster.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is no such format or layout.
-    """
-
-    name: str
-    layout: str = "velodyne"
-
-    def __post_init__(self) -> None:
-        for what, given, known in (
-            ("format", self.name, FORMATS),
-            ("layout", self.layout, LAYOUTS),
-        ):
-            if given not in known:
-                raise LidarpoolError(f"There is no {what} {given!r}: use {', '.join(known)}.")
+    format: Literal[tuple(FORMATS)]  # type: ignore[valid-type]
+    layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
 
     @classmethod
     def of(cls, entry: str | Mapping[str, str]) -> Format:
         """Return what an entry of a scenario's `output.write` names."""
         try:
-            fields = {"format": entry} if isinstance(entry, str) else dict(entry)
-            return cls(fields.pop("format"), **fields)
-        except (KeyError, TypeError, ValueError) as error:
+            return cls(entry) if isinstance(entry, str) else cls(**entry)
+        except TypeError as error:
             raise LidarpoolError(
                 f"{entry!r} names no format: give a name, or {{'format': name, 'layout': name}}."
             ) from error
 
     @property
     def _row(self) -> FormatRow:
-        return FORMATS[self.name]
+        return FORMATS[self.format]
 
     @property
     def file(self) -> str:
@@ -84,23 +65,21 @@ class Format:
 
     def left_out(self, cloud: CloudLike) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
-        names = [column.name for column in cloud.table]
-        held = self._row.holds
-        if held is None:
-            return []
-        return [name for name in names if name not in held + self._row.layouts.get(self.layout, ())]
+        held, there = self._row.holds, (column.name for column in cloud.table)
+        laid_out = self._row.layouts.get(self.layout, ())
+        return [] if held is None else [name for name in there if name not in held + laid_out]
 
     def notes(self, cloud: CloudLike) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""
         left = ", ".join(self.left_out(cloud))
-        return [f"{self.name} does not hold {left}"] if left else []
+        return [f"{self.format} does not hold {left}"] if left else []
 
     def check_installed(self) -> None:
         """Check that it can be written here; LidarpoolError if a package is missing."""
         absent = [package for package in self._row.packages if find_spec(package) is None]
         if absent:
             raise LidarpoolError(
-                f"The format {self.name} needs {' and '.join(absent)}: "
+                f"The format {self.format} needs {' and '.join(absent)}: "
                 f'pip install "lidarpool[{self._row.module}]".'
             )
 
@@ -116,8 +95,8 @@ class Format:
             laid_out = f"with the layout {self.layout} " if self._row.layouts else ""
             lacks = ", ".join(missing)
             raise LidarpoolError(
-                f"The format {self.name} {laid_out}needs {lacks}, which the cloud lacks: run the "
-                f"survey again with {self.name} in output.write, or with {lacks} among "
+                f"The format {self.format} {laid_out}needs {lacks}, which the cloud lacks: run the "
+                f"survey again with {self.format} in output.write, or with {lacks} among "
                 "cloud.columns."
             )
 
@@ -130,20 +109,10 @@ class Format:
         overwrite: bool = False,
         workers: Workers | None = None,
     ) -> None:
-        """Write a cloud completely, or not at all.
+        """Write a cloud to a file or folder completely, or not at all.
 
-        Parameters
-        ----------
-        path
-            The file, or the folder of a format that has many.
-        cloud
-            Its points, read in order a piece at a time.
-        sweeps
-            When and where its sweeps began.
-        overwrite
-            Whether existing files may be replaced.
-        workers
-            Write a format of many files, as far as they see its folder.
+        Points are read in order a piece at a time. Workers write a format of many files, as far as
+        they see its folder.
 
         Raises
         ------
@@ -161,7 +130,7 @@ class Format:
                     RangeWriter(module, cloud, sweeps, place).write(workers)
                 else:
                     writers = import_module(f".{module}", __package__)
-                    getattr(writers, f"write_{self.name}")(staged, cloud, sweeps, **more)
+                    getattr(writers, f"write_{self.format}")(staged, cloud, sweeps, **more)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
                     remove(path)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import shutil
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,27 +25,28 @@ _ROUNDING_SHARE = 0.05
 def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     """Write a cloud, in memory or on disk, to a binary PLY file through Open3D.
 
-    About a million points are in memory at a time: Open3D writes each such piece to a separate
-    file, which is appended to the others below one header. The bytes are the same as if Open3D
-    wrote all points at once. float64 positions are stored in single precision if the error is
-    below a twentieth of the precision of the sweeps, else in double.
+    About a million points are in memory at a time: Open3D writes the first of these to a file of
+    their own, whose rows and header show its layout, and the others follow as such rows. The
+    bytes are the same as if Open3D wrote all points at once, which would need memory for all.
+    float64 positions are stored in single precision if the error is below a twentieth of the
+    precision of the sweeps, else in double.
     """
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
-    piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
     row = row_type(real, cloud.table)
-    # Open3D would print a line for each buffer that it cannot write.
     _check_room(path, header(row, len(cloud)), len(cloud), row.itemsize)
     with path.open("xb") as file:
         for chunk in cloud.chunks():
-            _write_open3d(piece, _as_held(chunk, real))
-            start = _start_of_rows(piece, path, len(chunk))
-            with piece.open("rb") as written:
-                head = written.read(start)
-                if not file.tell():
-                    own = b"element vertex %d\n" % len(chunk)
-                    file.write(head.replace(own, b"element vertex %d\n" % len(cloud)))
-                shutil.copyfileobj(written, file, 1 << 24)
+            if file.tell():
+                file.write(_rows(chunk, row).data)
+                continue
+            piece = path.with_name(f".{path.name}.ply")  # by its ending Open3D chooses the format
+            _write_open3d(piece, chunk, real)
+            start, row = _layout(piece, path, len(chunk))
+            written = piece.read_bytes()
+            own = b"element vertex %d\n" % len(chunk)
+            file.write(written[:start].replace(own, b"element vertex %d\n" % len(cloud)))
+            file.write(memoryview(written)[start:])
             piece.unlink()
         if not file.tell():  # which Open3D refuses to write
             file.write(header(row, 0))
@@ -94,25 +94,14 @@ def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
         )
 
 
-class _Held(NamedTuple):
-    """Points with the names and types of files."""
-
-    positions: NDArray[np.floating]
-    columns: dict[str, NDArray[Any]]
-
-
-def _as_held(cloud: Cloud, real: np.dtype[np.floating]) -> _Held:
-    columns = {column.in_files: as_held(column, cloud[column.name]) for column in cloud.table}
-    return _Held(cloud.positions.astype(real, copy=False), columns)
-
-
-def _write_open3d(path: Path, cloud: _Held) -> None:
-    """Write `cloud` to `path`; reading back shows whether it worked."""
+def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
+    """Write `cloud`, its positions of type `real`; reading back shows whether it worked."""
     o3d = load_open3d()  # here, because read_cloud does not need it
     points = o3d.t.geometry.PointCloud()
-    points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions))
-    for name, values in cloud.columns.items():
-        points.point[name] = o3d.core.Tensor(np.ascontiguousarray(values)[:, None])
+    points.point.positions = o3d.core.Tensor(np.ascontiguousarray(cloud.positions, real))
+    for column in cloud.table:
+        values = np.ascontiguousarray(as_held(column, cloud[column.name]))
+        points.point[column.in_files] = o3d.core.Tensor(values[:, None])
     quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
     try:
         with quiet:
@@ -123,10 +112,20 @@ def _write_open3d(path: Path, cloud: _Held) -> None:
         raise LidarpoolError(f"Open3D cannot write to {path.parent}: check folder and disk.")
 
 
-def _start_of_rows(piece: Path, path: Path, count: int) -> int:
-    """Start of the rows of a piece; checks them, because Open3D ignores a full disk."""
+def _rows(cloud: Cloud, row: np.dtype[np.void]) -> NDArray[np.void]:
+    """Rows of a file, of the types and in the order of `row`."""
+    rows = np.empty(len(cloud), row)
+    for axis, values in zip(AXES, cloud.positions.T, strict=True):
+        rows[axis] = values
+    for column in cloud.table:
+        rows[column.in_files] = as_held(column, cloud[column.name])
+    return rows
+
+
+def _layout(piece: Path, path: Path, count: int) -> tuple[int, np.dtype[np.void]]:
+    """Start and type of the rows of a piece; checks them, because Open3D ignores a full disk."""
     try:
-        start, found, _ = layout(piece)
+        start, found, row = layout(piece)
         if found != count:
             raise ValueError(f"{found:,} of {count:,} points")
     except ValueError as error:
@@ -135,4 +134,4 @@ def _start_of_rows(piece: Path, path: Path, count: int) -> int:
             f"{path} could not be written ({error}); the disk has {free:,} bytes free. "
             "Make room, or write to another folder."
         ) from error
-    return start
+    return start, row

@@ -33,25 +33,19 @@ _LATCHED = Qos(
     QosTime(0, 0), QosTime(0, 0), QosLiveliness.AUTOMATIC, QosTime(0, 0), False,
 )  # fmt: skip
 _KINDS = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
-# Fields of a point: name, type, offset, and the column that it is made of.
-_LAYOUTS: dict[str, tuple[int, tuple[tuple[str, str, int], ...]]] = {
-    "velodyne": (
-        22,
-        (("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "f4", 12),
-         ("ring", "u2", 16), ("time", "f4", 18)),
-    ),
-    "autoware": (
-        32,
-        (("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "u1", 12),
-         ("return_type", "u1", 13), ("channel", "u2", 14), ("azimuth", "f4", 16),
-         ("elevation", "f4", 20), ("distance", "f4", 24), ("time_stamp", "u4", 28)),
-    ),
-    "ouster": (
-        48,
-        (("x", "f4", 0), ("y", "f4", 4), ("z", "f4", 8), ("intensity", "f4", 16), ("t", "u4", 20),
-         ("reflectivity", "u2", 24), ("ring", "u2", 26), ("ambient", "u2", 28),
-         ("range", "u4", 32)),
-    ),
+_XYZ = [("x", "<f4"), ("y", "<f4"), ("z", "<f4")]
+_LAYOUTS = {
+    "velodyne": np.dtype([*_XYZ, ("intensity", "<f4"), ("ring", "<u2"), ("time", "<f4")]),
+    "autoware": np.dtype([
+        *_XYZ, ("intensity", "u1"), ("return_type", "u1"), ("channel", "<u2"), ("azimuth", "<f4"),
+        ("elevation", "<f4"), ("distance", "<f4"), ("time_stamp", "<u4"),
+    ]),
+    "ouster": np.dtype({
+        "names": ["x", "y", "z", "intensity", "t", "reflectivity", "ring", "ambient", "range"],
+        "formats": ["<f4", "<f4", "<f4", "<f4", "<u4", "<u2", "<u2", "<u2", "<u4"],
+        "offsets": [0, 4, 8, 16, 20, 24, 26, 28, 32],
+        "itemsize": 48,
+    }),
 }  # fmt: skip
 
 
@@ -98,14 +92,11 @@ def _messages(
     cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any
 ) -> Iterator[tuple[str, Any, int]]:
     """Topics, messages and times in nanoseconds, sweep by sweep."""
-    step, described = _LAYOUTS[layout]
-    offset_of = {name: offset for name, _, offset in described}
-    row = np.dtype({
-        "names": list(offset_of), "formats": [f"<{kind}" for _, kind, _ in described],
-        "offsets": list(offset_of.values()), "itemsize": step,
-    })  # fmt: skip
-    field = types["sensor_msgs/msg/PointField"]
-    fields = [field(name, offset, _KINDS[kind], 1) for name, kind, offset in described]
+    row, field = _LAYOUTS[layout], types["sensor_msgs/msg/PointField"]
+    fields = [
+        field(name, offset, _KINDS[kind.str[1:]], 1)
+        for name, (kind, offset, *_) in (row.fields or {}).items()
+    ]
     make = _Messages(types)
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
     _, _, *frames = plain_names((WORLD, CARRIER, *named))
@@ -121,13 +112,13 @@ def _messages(
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
         frame = frames[sweeps.sensor[sweep]]
         topic = f"/{frame}/points" if sweeps.sensors[sweeps.sensor[sweep]] else "/points"
-        rows = _rows(row, points, sweeps, sweep)
+        rows = _rows(layout, points, sweeps, sweep)
         in_world = [(WORLD, name, placed, sweep) for name, placed in moving]
         yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
         yield "/tf", make.transforms(in_world, time_ns), time_ns
         message = types["sensor_msgs/msg/PointCloud2"](
-            make.header(frame, time_ns), 1, len(rows), fields, False, step,
-            step * len(rows), rows.view(np.uint8).ravel(), True,
+            make.header(frame, time_ns), 1, len(rows), fields, False, row.itemsize,
+            rows.nbytes, rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
         if actors:
@@ -135,14 +126,14 @@ def _messages(
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
 
 
-def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:
+def _rows(layout: str, points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:
     """Points of a sweep in a layout."""
-    rows = np.zeros(len(points), row)
     there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
     light = np.clip(there["intensity"], 0, 1)
-    inside = sweeps.in_sensor(sweep, points.positions)
-    values = {"x": inside[:, 0], "y": inside[:, 1], "z": inside[:, 2], "ring": there["channel"]}
-    if "time_stamp" in (row.names or ()):
+    values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
+    if layout == "velodyne":
+        values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
+    elif layout == "autoware":
         values |= {
             "intensity": np.round(light * 255),
             "return_type": np.ones(len(points)),
@@ -152,17 +143,17 @@ def _rows(row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int) -> 
             "distance": there["range"],
             "time_stamp": np.clip(since, 0, None),
         }
-    elif "t" in (row.names or ()):
+    else:
         values |= {
             "intensity": there["intensity"],
             "t": np.clip(since, 0, None),
             "reflectivity": np.round(np.clip(there["reflectivity"], 0, 1) * 65_535),
+            "ring": there["channel"],
             "range": np.round(there["range"] * 1000),
         }
-    else:
-        values |= {"intensity": there["intensity"], "time": since / 1e9}
-    for name in set(values) & set(row.names or ()):
-        rows[name] = values[name]
+    rows = np.zeros(len(points), _LAYOUTS[layout])
+    for name, column in values.items():
+        rows[name] = column
     return rows
 
 

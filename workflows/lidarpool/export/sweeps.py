@@ -31,22 +31,17 @@ MIXED_UP = (
 )
 _PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
 _FORMAT = 2
+# Fields of `Sweeps` that a file holds under their names: as an array each, and as JSON.
+_ARRAYS = ("scans", "begins_ns", "sensor", "actor_bounds")
+_WORDS = ("sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns")
 
 
 @dataclass(frozen=True, eq=False)
 class Placed:
-    """Poses of something at the start of each sweep.
+    """Poses of something at the start of each sweep."""
 
-    Parameters
-    ----------
-    positions
-        float64 (n, 3): metres, world coordinates.
-    quaternions
-        float64 (n, 4): x, y, z, w of the rotation from its own axes to the world's.
-    """
-
-    positions: Floats
-    quaternions: Floats
+    positions: Floats  # (n, 3): metres, world coordinates
+    quaternions: Floats  # (n, 4): x, y, z, w of the rotation from its own axes to the world's
 
     def inward(self, sweep: int, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to its axes at the start of a sweep."""
@@ -57,50 +52,22 @@ class Placed:
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
-    """All sweeps of a survey. A sweep is the scans of one turn, or of one frame, of a sensor.
+    """All sweeps of a survey. A sweep is the scans of one turn, or of one frame, of a sensor."""
 
-    Parameters
-    ----------
-    scans
-        int64 (n + 1,): the first scan of each, and one past the last of all.
-    begins_ns
-        float64 (n,): start of each, nanoseconds since the survey's start.
-    sensor
-        uint8 (n,): number of its sensor.
-    pose
-        Poses of the sensors.
-    mounts
-        Pose of each sensor in the carrier's axes.
-    sensors, objects, actors
-        Names; those of actors follow those of objects in the column `object`.
-    actor_poses
-        Poses of each actor.
-    actor_bounds
-        float64 (a, 2, 3): corners of each actor's box in its own axes, metres.
-    coordinates
-        Of the cloud's points, "world" or "sensor".
-    precision_m
-        Step to which positions were rounded, metres.
-    epsg
-        Code of the coordinate system of the world; None if unknown.
-    start_ns
-        Nanoseconds from 1970-01-01 UTC to the survey's start; None if unknown.
-    """
-
-    scans: NDArray[np.int64]
-    begins_ns: Floats
-    sensor: NDArray[np.uint8]
-    pose: Placed
-    mounts: Placed
-    sensors: tuple[str, ...]
+    scans: NDArray[np.int64]  # (n + 1,): the first of each sweep, and one past the last of all
+    begins_ns: Floats  # (n,): nanoseconds since the survey's start
+    sensor: NDArray[np.uint8]  # (n,): its number
+    pose: Placed  # of the sensors
+    mounts: Placed  # of each sensor in the carrier's axes
+    sensors: tuple[str, ...]  # names
     objects: tuple[str, ...]
-    actors: tuple[str, ...]
-    actor_poses: tuple[Placed, ...]
-    actor_bounds: Floats
-    coordinates: str
-    precision_m: float
-    epsg: int | None = None
-    start_ns: int | None = None
+    actors: tuple[str, ...]  # they follow the objects in the column `object`
+    actor_poses: tuple[Placed, ...]  # of each actor
+    actor_bounds: Floats  # (a, 2, 3): corners of each actor's box in its own axes, metres
+    coordinates: str  # of the cloud's points, "world" or "sensor"
+    precision_m: float  # step to which positions were rounded
+    epsg: int | None = None  # code of the coordinate system of the world
+    start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -145,7 +112,8 @@ class Sweeps:
             turned = np.eye(3) if mount.rotation is None else mount.rotation
             mounts.append((mount.position, turned))
             for station in range(path.stations):
-                positions, rotations = _poses(survey, station, since)
+                positions, found = path.poses(station, since)
+                rotations = _full(found, len(since))
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
                 begins.append(station * survey.station_ns + since)
@@ -208,49 +176,17 @@ class Sweeps:
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; OSError if it cannot be written."""
-        words = {
-            "format": _FORMAT,
-            "sensors": self.sensors,
-            "objects": self.objects,
-            "actors": self.actors,
-            "coordinates": self.coordinates,
-            "precision_m": self.precision_m,
-            "epsg": self.epsg,
-            "start_ns": self.start_ns,
-        }
-        arrays: dict[str, Any] = {
-            "words": np.frombuffer(json.dumps(words).encode(), np.uint8),
-            "scans": self.scans,
-            "begins_ns": self.begins_ns,
-            "sensor": self.sensor,
-            "positions": self.pose.positions,
-            "quaternions": self.pose.quaternions,
-            "mount_positions": self.mounts.positions,
-            "mount_quaternions": self.mounts.quaternions,
-            "actor_bounds": self.actor_bounds,
-        }
-        for number, placed in enumerate(self.actor_poses):
-            arrays[f"actor{number}_positions"] = placed.positions
-            arrays[f"actor{number}_quaternions"] = placed.quaternions
+        words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
+        arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
+        arrays |= {name: getattr(self, name) for name in _ARRAYS}
+        placed = {"": self.pose, "mount_": self.mounts}
+        placed |= {f"actor{number}_": poses for number, poses in enumerate(self.actor_poses)}
+        for prefix, poses in placed.items():
+            arrays[f"{prefix}positions"] = poses.positions
+            arrays[f"{prefix}quaternions"] = poses.quaternions
         memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
         np.savez_compressed(memory, **arrays)
         path.write_bytes(memory.getbuffer())
-
-    def _check(self) -> None:
-        """ValueError if arrays of a file do not fit together."""
-        count = len(self)
-        shapes = {
-            (self.begins_ns.shape, (count,)),
-            (self.scans.shape, (count + 1,)),
-            (self.sensor.shape, (count,)),
-            (self.actor_bounds.shape, (len(self.actors), 2, 3)),
-        }
-        each = [(placed, count) for placed in (self.pose, *self.actor_poses)]
-        for placed, many in (*each, (self.mounts, len(self.sensors))):
-            shapes |= {(placed.positions.shape, (many, 3)), (placed.quaternions.shape, (many, 4))}
-        wrong = [f"{one} for {other}" for one, other in shapes if one != other]
-        if wrong or (count and self.sensor.max() >= len(self.sensors)):
-            raise ValueError(f"its arrays do not fit together {'; '.join(wrong[:1])}".strip())
 
     @classmethod
     def load(cls, path: Path) -> Sweeps:
@@ -265,28 +201,18 @@ class Sweeps:
             words = json.loads(arrays["words"].tobytes())
             if words["format"] != _FORMAT:
                 raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")
-            poses = [
-                Placed(arrays[f"actor{k}_positions"], arrays[f"actor{k}_quaternions"])
-                for k in range(len(words["actors"]))
-            ]
-            found = cls(
-                arrays["scans"],
-                arrays["begins_ns"],
-                arrays["sensor"],
-                Placed(arrays["positions"], arrays["quaternions"]),
-                Placed(arrays["mount_positions"], arrays["mount_quaternions"]),
-                tuple(words["sensors"]),
-                tuple(words["objects"]),
-                tuple(words["actors"]),
-                tuple(poses),
-                arrays["actor_bounds"],
-                words["coordinates"],
-                words["precision_m"],
-                words["epsg"],
-                words["start_ns"],
+            words |= {name: tuple(words[name]) for name in ("sensors", "objects", "actors")}
+            pose, mounts, *actors = (
+                Placed(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])
+                for prefix in ("", "mount_", *(f"actor{k}_" for k in range(len(words["actors"]))))
             )
-            found._check()
-            return found
+            return cls(
+                pose=pose,
+                mounts=mounts,
+                actor_poses=tuple(actors),
+                **{name: arrays[name] for name in _ARRAYS},
+                **{name: words[name] for name in _WORDS},
+            )
 
 
 def plain_names(names: Iterable[str]) -> list[str]:
@@ -313,16 +239,6 @@ def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:
     firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
     begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in firsts.tolist()]))
     return firsts, begins + sensor.lead_ns
-
-
-def _poses(survey: Survey, station: int, since: Floats) -> tuple[Floats, Floats]:
-    if survey.path.moves:
-        positions, rotations = survey.path.poses(station, since)
-        return positions, _full(rotations, len(since))
-    pose = survey.path.pose(station)
-    positions = np.broadcast_to(np.array(pose.position), (len(since), 3))
-    rotation = None if pose.rotation is None else np.broadcast_to(pose.rotation, (len(since), 3, 3))
-    return positions, _full(rotation, len(since))
 
 
 def _full(rotations: Floats | None, count: int) -> Floats:

@@ -11,32 +11,17 @@ from dataclasses import dataclass, field
 
 @dataclass(frozen=True)
 class FormatRow:
-    """What a format is.
+    """What a format is."""
 
-    Parameters
-    ----------
-    file
-        Its file, or its folder, in the folder of a result. An ending chooses the format.
-    module
-        Module of this room that writes it: by `write_NAME(path, cloud, sweeps)`, or by `Pieces`.
-    in_pieces
-        Whether it has many files, which workers can write: `Pieces` says which.
-    packages
-        What writes it; the extra of lidarpool that installs them has the name of the module.
-    needs
-        Columns that a cloud must have. Formats that need `scan` store single sweeps.
-    holds
-        Columns that it can hold; None for all.
-    layouts
-        {layout: the columns that it needs and holds beside those}, where there are layouts.
-    """
-
-    file: str
+    file: str  # or folder, in the folder of a result; an ending chooses the format
+    # Of this room: writes it by `write_NAME(path, cloud, sweeps)`, or by `Pieces`.
     module: str
-    in_pieces: bool = False
+    in_pieces: bool = False  # it has many files, which workers can write: `Pieces` says which
+    # What writes it; the extra of lidarpool that installs them has the name of the module.
     packages: tuple[str, ...] = ()
-    needs: tuple[str, ...] = ()
-    holds: tuple[str, ...] | None = None
+    needs: tuple[str, ...] = ()  # columns; formats that need `scan` store single sweeps
+    holds: tuple[str, ...] | None = None  # columns; None for all
+    # {layout: columns that it needs and holds beside those}, where there are layouts
     layouts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def needed(self, layout: str) -> tuple[str, ...]:

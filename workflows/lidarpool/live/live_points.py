@@ -65,19 +65,16 @@ class LivePoints:
             while len(cloud) > self._most:
                 self._share /= 2
                 cloud = cloud.part(np.flatnonzero(self._random.random(len(cloud)) < 0.5))
-            self.show(cloud)
-
-    def show(self, cloud: Cloud) -> None:
-        """Show these points instead."""
-        self.cloud = cloud
-        self.version += 1
+            self.cloud = cloud
+            self.version += 1
 
     def finish(self, result: RunResult) -> None:
         """Take a sample of all points, and all hits; the parts may then be removed."""
         with self._lock:
             self._waiting = []
             self._counts, self.hits = result.hit_counts, result.hits
-            self.show(result.points.sample(self._most, PARTS_NOTED))
+            self.cloud = result.points.sample(self._most, PARTS_NOTED)
+            self.version += 1
 
     def hit_counts(self) -> NDArray[np.float64]:
         """Hits of each triangle, (f,), scaled up to all hits if some parts were not read."""

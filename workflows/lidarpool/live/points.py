@@ -17,7 +17,6 @@ from ..columns.table import Column
 
 Floats = NDArray[np.floating]
 Rows = NDArray[np.int64]
-Limits = tuple[float, float] | None  # lowest and highest, both included; None for all
 Scans = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK = 1 << 15  # rows that are read at a time
@@ -63,11 +62,10 @@ class HeldPoints:
         return 0, len(self)
 
 
-def within(values: Any, limits: Limits) -> Any:
-    """Whether values (n,) are within limits; NaN is not."""
-    if limits is None:
-        return np.ones(np.shape(values), np.bool_)
-    return (values >= limits[0]) & (values <= limits[1])
+def no_points(table: Sequence[Column]) -> HeldPoints:
+    """Stand for the points before there are any."""
+    columns = {column.name: np.empty(0, column.dtype) for column in table}
+    return HeldPoints(Cloud(np.empty((0, 3)), columns, own=tuple(table)))
 
 
 @dataclass(frozen=True)
@@ -97,7 +95,8 @@ class Filter:
         x, y, z = (points.values(axis, rows) for axis in AXES)
         kept = np.asarray(np.isfinite(x + y + z))
         for name, low, high in self.limits:
-            kept &= within(points.values(name, rows), (low, high))
+            values = points.values(name, rows)
+            kept &= (values >= low) & (values <= high)  # NaN is not
         return kept
 
 
@@ -185,16 +184,8 @@ class PointFinder:
     ) -> tuple[Rows, int]:
         """Find at most `most` points that pass a filter, in order.
 
-        Parameters
-        ----------
-        most
-            Points at most. They are evenly spaced in the file, or with an eye over its picture.
-        wanted, scans
-            The filter, and the ranges of scans; None for all.
-        eye
-            Camera: only points in its picture.
-        abandoned
-            Asked now and then; once it returns True, nobody waits for the answer.
+        They are evenly spaced in the file, or with an eye over its picture, where all are then.
+        `abandoned` is asked now and then; once it returns True, nobody waits for the answer.
 
         Returns
         -------

@@ -36,7 +36,7 @@ def result_view(
     """
     if sweeps is not None and sweeps.coordinates != "world":
         pictured, note = None, note or IN_SENSOR_AXES
-    view = View(title, file, file.table, pictured, sweeps, note=note)
+    view = View(title, file, pictured, sweeps, note=note)
     if pictured is not None:
         faces = len(pictured.scene.faces)
         view.hits = lambda: pictured.hit_counts[:faces]
@@ -47,8 +47,8 @@ def result_view(
 @contextmanager
 def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
     """Serve the page of a result while the body runs; see `announced`."""
-    count = counted(0 if view.points is None else len(view.points), "point")
-    with page_server(view, port) as page:
+    count = counted(len(view.points), "point")
+    with page_server(view.answer, port) as page:
         ends = "" if cell_display() else "; Ctrl-C ends it"
         with announced(page, f"{page.url} shows {count}{ends}", browser):
             yield page
@@ -73,12 +73,7 @@ def view_result(path: Path, *, port: int, browser: bool = True) -> None:
 def open_result(path: Path) -> View:
     """Open a cloud or the folder of a result; with its scene and sweeps if there are any.
 
-    That these cannot be read is only noted, because the cloud is complete.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is no cloud, or it is damaged.
+    That these cannot be read is only noted. LidarpoolError if there is no cloud, or a damaged one.
     """
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():

@@ -1,12 +1,11 @@
 """The page of a run: during the run, and until it is closed.
 
 The run calls it in its own thread, and never waits for a browser: news are recorded, and parts
-are read in another thread from time to time, within a small share of a core.
+are read when a page asks for news, within a small share of a core.
 """
 
 from __future__ import annotations
 
-import logging
 import threading
 import time
 from collections import deque
@@ -27,28 +26,25 @@ from ..columns.table import SCAN, TABLE
 from ..export.sweeps import Sweeps
 from ..pipeline import Frame
 from ..plan import best
+from ..run.bars import Pace, standing_still
+from ..run.conductor import Page
 from ..run.job import Job
 from ..run.picture_file import Pictured, sensor_ways
-from ..run.progress import STAGES, Progress, Show, in_words, is_sure, time_in_words
+from ..run.progress import STAGES, Progress, Show
 from ..run.result import RunResult
 from ..run.store import RunStore
 from ..sensor.materials import MaterialTable
 from .live_points import LivePoints
-from .points import HeldPoints
+from .points import HeldPoints, no_points
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 from .view import IN_SENSOR_AXES, View
 
-READ_EVERY_S, READING_SHARE = 0.2, 0.06  # of a core, to read parts while the run goes on
-ASKED_WITHIN_S = 10.0  # a page that asked no longer ago is open
+READING_SHARE = 0.06  # of a core, to read parts while the run goes on
 ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
-_LAST_S = 30.0  # to wait for what is read last
-_NO_RAYS = np.zeros((0, 2, 3), np.float32)
-
-_LOGGER = logging.getLogger(__name__)
 
 
-class LiveRun:
+class LiveRun(Page):
     """Connects a run and its page, in both directions."""
 
     page: PageServer
@@ -57,25 +53,24 @@ class LiveRun:
         self._job = job
         self.stopped = threading.Event()  # by a user of the page; --resume continues
         survey, scene = job.survey, job.scene
-        table, nothing = MaterialTable.of(survey.materials, scene.all_names), np.zeros(0, np.int64)
         pictured = Pictured(
-            scene, sensor_ways(survey), nothing, _NO_RAYS, job.planning, None, (),
-            survey.duration_ns, (), table.reflectance,
+            scene, sensor_ways(survey), np.zeros(0, np.int64), np.zeros((0, 2, 3), np.float32),
+            job.planning, None, (), survey.duration_ns, (),
+            MaterialTable.of(survey.materials, scene.all_names).reflectance,
         )  # fmt: skip
-        self._view = View("lidarpool", None, (SCAN, *survey.stored_columns), pictured)
+        self._view = View("lidarpool", no_points((SCAN, *survey.stored_columns)), pictured)
         if survey.coordinates != "world":
             self._view.note = IN_SENSOR_AXES
         self._view.hits = self._hits
-        self._starting = "starting"  # the state before there is any progress
+        self._state = "starting"
         self._store: RunStore | None = None
         self._points: LivePoints | None = None
         self._progress: Progress | None = None
-        self._first: Progress | None = None  # that rates are taken from
+        self._pace, self._rate = Pace(), ""
         self._frames: deque[Frame] = deque(maxlen=FRAMES_SHOWN)
         self._partitions: Mapping[str, Partition] = {}
         self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
-        self._ask_at = 0.0
-        self._asked_at = 0.0  # when a page last asked for news
+        self._ask_at = self._read_at = 0.0  # from when on the cluster is asked, and parts are read
         self._over = False
         self._ends = 0  # how often something came at the run's end that the page must ask for
 
@@ -89,7 +84,7 @@ class LiveRun:
             self._progress = store.progress()
         store.on_parts = points.add
         self._store, self._points = store, points
-        self._starting = "starting: workers, each with its own Python"
+        self._state = "starting: workers, each with its own Python"
 
     def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
         """Return a function to call with the progress: it calls `show` and updates the page.
@@ -98,7 +93,7 @@ class LiveRun:
         busy slots of `partitions`.
         """
         self._partitions = partitions
-        self._starting = "starting: workers read the scene and make their trees"
+        self._state = "starting: workers read the scene and make their trees"
 
         def tell(progress: Progress) -> None:
             show(progress)
@@ -106,15 +101,17 @@ class LiveRun:
 
         return tell
 
-    def on_frame(self, frame: Frame, take: Callable[[Frame], None] | None = None) -> None:
+    def on_frame(self, frame: Frame, take: Callable[[Frame], None] = lambda frame: None) -> None:
         """Record a frame, which is displayed unless many others come at once, and call `take`."""
         self._frames.append(frame)
-        if take is not None:
-            take(frame)
+        take(frame)
 
     def on_progress(self, progress: Progress) -> None:
         """Record the progress; raises KeyboardInterrupt if the run was stopped."""
-        self._first, self._progress = self._first or progress, progress
+        self._progress = progress
+        if progress.cast:
+            self._state = "running"
+        self._rate = self._pace.told(progress.seconds, progress.collected, progress.scans)
         now = time.monotonic()
         if now >= self._ask_at:
             self._ask_at = now + ASK_EVERY_S
@@ -128,7 +125,8 @@ class LiveRun:
         """Show the whole result at the end of the run; its parts may then be removed."""
         if self._points is not None:
             self._points.finish(result)
-            self._view.show(HeldPoints(self._points.cloud) if self._points.cloud else None)
+            if self._points.cloud is not None:
+                self._view.show(HeldPoints(self._points.cloud))
         self._view.rays = result.sample_rays
         self._view.path = None if result.plan is None else result.plan.path
         if self._progress is not None:
@@ -152,20 +150,10 @@ class LiveRun:
 
     # -- the page's side -----------------------------------------------------------------
 
-    def read_parts(self) -> None:
-        """Read some of the parts that were committed, if a page is open."""
-        points = self._points
-        if points is None or self._over or time.monotonic() > self._asked_at + ASKED_WITHIN_S:
-            return
-        before = points.version
-        points.gather()
-        if points.version != before and points.cloud is not None and not self._over:
-            self._view.show(HeldPoints(points.cloud))
-
     def answer(self, what: str, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Answer a question of the page."""
         if what == "news":
-            self._asked_at = time.monotonic()
+            self._read_parts()
             return self._news()
         header, arrays = self._view.answer(what, asked, abandoned)
         if what == "state":
@@ -173,11 +161,17 @@ class LiveRun:
             header |= {"live": True, "sampled": some, "points": self._count}
         return header, arrays
 
-    def order(self, what: str) -> None:
-        """Stop the run, or end the page that stays."""
-        if what != "stop":
-            raise KeyError(what)
-        self.stopped.set()
+    def _read_parts(self) -> None:
+        """Read some of the parts that were committed."""
+        points = self._points
+        if points is None or self._over or time.monotonic() < self._read_at:
+            return
+        before, started = points.version, time.thread_time()
+        points.gather()
+        # Processor time: waiting does not count.
+        self._read_at = time.monotonic() + (time.thread_time() - started) / READING_SHARE
+        if points.version != before and points.cloud is not None and not self._over:
+            self._view.show(HeldPoints(points.cloud))
 
     def _news(self) -> Answer:
         view, frames = self._view, list(self._frames)
@@ -220,10 +214,12 @@ class LiveRun:
         """Write the progress of the run, as HTML."""
         progress = self._progress
         if progress is None:
-            return f"<b>{self._starting}</b>"
-        lines = [f"<b>{self._words(progress)}</b>, {progress.seconds:,.0f} s{self._pace(progress)}"]
+            return f"<b>{self._state}</b>"
+        lines = [f"<b>{self._words(progress)}</b>, {progress.seconds:,.0f} s"]
         if self._over:
             return lines[0]
+        if self._rate:
+            lines[0] += f", {self._rate}"
         lines += [
             _bar(label, getattr(progress, count), getattr(progress, total))
             for label, count, total in STAGES
@@ -237,20 +233,7 @@ class LiveRun:
             return "done"
         if self.stopped.is_set():
             return "stopping"
-        if progress.waits_for:
-            return f"waiting for slots of {escape(progress.waits_for)}"
-        return "running" if self._first is not None and progress.cast else self._starting
-
-    def _pace(self, progress: Progress) -> str:
-        """Return scans a second, and the time left."""
-        first, left = self._first, progress.scans - progress.collected
-        if first is None or progress.collected <= first.collected or not left:
-            return ""
-        rate = (progress.collected - first.collected) / (progress.seconds - first.seconds)
-        words = f", {in_words(rate)} scans/s"
-        if is_sure(progress.collected, progress.scans, progress.seconds):
-            words += f", {time_in_words(left / rate)} left"
-        return words
+        return escape(standing_still(progress)) or self._state
 
 
 def _rays_of(frames: list[Frame]) -> NDArray[np.float32]:
@@ -272,34 +255,8 @@ def _bar(label: str, done: int, whole: int) -> str:
 def live_run(job: Job, *, port: int = PORT, browser: bool = True) -> Iterator[LiveRun]:
     """Serve the page of a run while the body runs; see `announced`."""
     live = LiveRun(job)
-    with page_server(live, port) as page:
-        live.page = page
-        with announced(page, f"live page: {page.url}", browser), _repeated(live.read_parts):
-            yield live
-
-
-@contextmanager
-def _repeated(read: Callable[[], None]) -> Iterator[None]:
-    """Call a function repeatedly in a thread while the body runs, within a share of a core.
-
-    An error is logged, and ends the reading but not the body.
-    """
-    ended = threading.Event()
-
-    def run() -> None:
-        try:
-            while not ended.is_set():
-                started = time.thread_time()
-                read()
-                took = time.thread_time() - started  # processor time: waiting does not count
-                ended.wait(max(READ_EVERY_S, took / READING_SHARE - took))
-        except Exception:
-            _LOGGER.exception("the page shows no new points any more")
-
-    thread = threading.Thread(target=run, name="lidarpool-live", daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        ended.set()
-        thread.join(_LAST_S)
+    with (
+        page_server(live.answer, port, live.stopped.set) as live.page,
+        announced(live.page, f"live page: {live.page.url}", browser),
+    ):
+        yield live

@@ -15,19 +15,20 @@ import sys
 import threading
 import webbrowser
 from collections.abc import Callable, Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import partial
 from html import escape
 from importlib.resources import files
 from importlib.util import find_spec
-from typing import Any, Protocol
+from typing import Any
 
 import click
 from numpy.typing import NDArray
 from tornado.httpserver import HTTPServer
 from tornado.iostream import StreamClosedError
-from tornado.web import Application, HTTPError, RequestHandler
+from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
 from ..base.notebook import cell_display
 from .points import Abandoned
@@ -41,15 +42,6 @@ _PORTS_TRIED = 100
 OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
 
-# What the page consists of, with its types.
-_FILES = {
-    "": ("index.html", "text/html"),
-    "page.css": ("page.css", "text/css"),
-    "page.js": ("page.js", "text/javascript"),
-    "picture.js": ("picture.js", "text/javascript"),
-    "controls.js": ("controls.js", "text/javascript"),
-    "three.min.js": ("three.min.js", "text/javascript"),
-}
 _ALIGNED = 8  # bytes, that arrays begin at multiples of
 _PIECE = 1 << 20  # bytes that are written at a time
 
@@ -59,22 +51,9 @@ Arguments = Mapping[str, str]
 Answer = tuple[dict[str, Any], dict[str, NDArray[Any]]]  # what is written as JSON, and arrays
 
 
-class Source(Protocol):
-    """What the page shows."""
-
-    def answer(self, what: str, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Answer a question of the page.
-
-        Raises
-        ------
-        KeyError, ValueError
-            If there is no such question, or an argument is missing or wrong.
-        Abandoned
-            If nobody waits for the answer any more, as `abandoned` tells.
-        """
-
-    def order(self, what: str) -> None:
-        """Do what a user of the page has ordered; KeyError if there is no such order."""
+# Answers a question with its arguments: KeyError or ValueError if there is no such question or an
+# argument is wrong; Abandoned if the function it is given says that nobody waits any more.
+Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
 
 
 def bundle(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[bytes]:
@@ -97,11 +76,8 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[b
     return [len(text).to_bytes(4, "little"), text, *pieces]
 
 
-class _Handler(RequestHandler):
-    """Answers one request. `source` may take long: it is asked in a thread of its own."""
-
-    def initialize(self, source: Source, threads: ThreadPoolExecutor) -> None:
-        self._source, self._threads, self._gone = source, threads, threading.Event()
+class _Guarded(RequestHandler):
+    """Answers pages of this machine."""
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
@@ -122,14 +98,28 @@ class _Handler(RequestHandler):
             _LOGGER.warning("a page of %r asked %r: refused", origin, host)
             raise HTTPError(403)
 
+    def log_exception(self, *error: Any) -> None:
+        """Log what is our fault only."""
+        if not isinstance(error[1], HTTPError):
+            _LOGGER.error("the page's question was not answered", exc_info=error)
+
+
+class _File(_Guarded, StaticFileHandler):
+    """Sends a file that the page consists of."""
+
+
+class _Question(_Guarded):
+    """Answers one question. `source` may take long: it is asked in a thread of its own."""
+
+    def initialize(
+        self, source: Source, stop: Callable[[], None] | None, threads: ThreadPoolExecutor
+    ) -> None:
+        self._source, self._stop, self._threads = source, stop, threads
+        self._gone = threading.Event()
+
     async def get(self, what: str) -> None:
-        if what in _FILES:
-            name, kind = _FILES[what]
-            self.set_header("Content-Type", f"{kind}; charset=utf-8")
-            self.finish(files(__package__).joinpath("page", name).read_bytes())
-            return
         asked = {name: self.get_query_argument(name) for name in self.request.query_arguments}
-        ask = partial(self._source.answer, what, asked, self._gone.is_set)
+        ask = partial(self._source, what, asked, self._gone.is_set)
         try:
             answer = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
         except (KeyError, ValueError) as error:
@@ -149,18 +139,12 @@ class _Handler(RequestHandler):
         # A page from elsewhere cannot set this header (Fetch standard, 2.2.2).
         if "X-Lidarpool" not in self.request.headers:
             raise HTTPError(403)
-        try:
-            self._source.order(what)
-        except KeyError as error:
-            raise HTTPError(404) from error
+        if what != "stop" or self._stop is None:
+            raise HTTPError(404)
+        self._stop()
 
     def on_connection_close(self) -> None:
         self._gone.set()
-
-    def log_exception(self, *error: Any) -> None:
-        """Log what is our fault only."""
-        if not isinstance(error[1], HTTPError):
-            _LOGGER.error("the page's question was not answered", exc_info=error)
 
 
 def may_ask(host: str, origin: str | None) -> bool:
@@ -179,81 +163,61 @@ def may_ask(host: str, origin: str | None) -> bool:
     return origin is None or origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
 
 
+@dataclass(frozen=True)
 class PageServer:
-    """Serves a page on 127.0.0.1, in a thread of its own, on a port or the next that is free.
+    """A page that is served on 127.0.0.1, and its port."""
 
-    Parameters
-    ----------
-    source
-        What the page shows.
-    port
-        0 for any.
-    """
-
-    def __init__(self, source: Source, port: int = PORT) -> None:
-        self._source, self._threads = source, ThreadPoolExecutor(2, "lidarpool-page")
-        self._loop: asyncio.AbstractEventLoop | None = None
-        self._socket = _bound(port)
-        self.port: int = self._socket.getsockname()[1]
-        started = threading.Event()
-        self._thread = threading.Thread(
-            target=self._serve, args=(started,), name="lidarpool-page", daemon=True
-        )
-        self._thread.start()
-        started.wait()
-
-    def _serve(self, started: threading.Event) -> None:
-        async def serve() -> None:
-            self._loop, self._ended = asyncio.get_running_loop(), asyncio.Event()
-            options = {"source": self._source, "threads": self._threads}
-            server = HTTPServer(Application([("/(.*)", _Handler, options)], log_function=_quiet))
-            server.add_socket(self._socket)
-            started.set()
-            await self._ended.wait()
-            server.stop()
-            await server.close_all_connections()
-
-        asyncio.run(serve())
+    port: int
 
     @property
     def url(self) -> str:
         """Its address."""
         return f"http://{HOST}:{self.port}"
 
-    def close(self) -> None:
-        """Serve no more; returns once the thread has ended."""
-        if self._loop is not None and self._thread.is_alive():
-            self._loop.call_soon_threadsafe(self._ended.set)
-            self._thread.join()
-        self._threads.shutdown(cancel_futures=True)
 
+@contextmanager
+def page_server(
+    source: Source, port: int = PORT, stop: Callable[[], None] | None = None
+) -> Iterator[PageServer]:
+    """Serve a page while the body runs, in a thread of its own, on a port or the next free one.
 
-def _quiet(handler: RequestHandler) -> None:
-    """Do not log requests."""
+    A `port` of 0 is for any; `stop` is called when a user of the page orders to stop.
+    """
+    bound, threads = _bound(port), ThreadPoolExecutor(2, "lidarpool-page")
+    page = {"path": str(files(__package__) / "page"), "default_filename": "index.html"}
+    asked = {"source": source, "stop": stop, "threads": threads}
+    bound.setblocking(False)
+    running: Future[asyncio.AbstractEventLoop] = Future()
+    ended = asyncio.Event()
+
+    async def serve() -> None:
+        handlers: list[Any] = [
+            (r"/(|\w[\w.]*\.(?:css|js))", _File, page),
+            (r"/(.*)", _Question, asked),
+        ]
+        server = HTTPServer(Application(handlers, log_function=lambda _: None))
+        server.add_socket(bound)
+        running.set_result(asyncio.get_running_loop())
+        await ended.wait()
+        server.stop()
+        await server.close_all_connections()
+
+    thread = threading.Thread(target=lambda: asyncio.run(serve()), name="page", daemon=True)
+    thread.start()
+    loop = running.result()
+    try:
+        yield PageServer(bound.getsockname()[1])
+    finally:
+        loop.call_soon_threadsafe(ended.set)
+        thread.join()
+        threads.shutdown(cancel_futures=True)
 
 
 def _bound(port: int) -> socket.socket:
-    last = min(port + _PORTS_TRIED, 65_536)
-    for tried in (*range(port, last), 0) if port else (0,):
-        try:
-            bound = socket.create_server((HOST, tried), backlog=128)
-        except OSError:
-            if not tried:
-                raise
-            continue
-        bound.setblocking(False)
-        return bound
-    raise AssertionError  # the last one tried is any
-
-
-@contextmanager
-def page_server(source: Source, port: int = PORT) -> Iterator[PageServer]:
-    """Serve a page while the body runs; see `PageServer`."""
-    server = PageServer(source, port)
-    try:
-        yield server
-    finally:
-        server.close()
+    for tried in range(port, min(port + _PORTS_TRIED, 65_536)) if port else ():
+        with suppress(OSError):
+            return socket.create_server((HOST, tried), backlog=128)
+    return socket.create_server((HOST, 0), backlog=128)
 
 
 @contextmanager
@@ -290,12 +254,9 @@ def announced(page: PageServer, words: str, browser: bool) -> Iterator[None]:
         shown.update(display.HTML(""))
 
 
-def open_browser(url: str) -> bool:
-    """Open a page if there is a desktop to open it on; returns whether there is."""
-    if sys.platform.startswith("linux") and not (
-        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY")
-    ):
-        return False  # else a browser in the terminal would take it over
-    if "SSH_CONNECTION" in os.environ:
-        return False
-    return webbrowser.open(url)
+def open_browser(url: str) -> None:
+    """Open a page if there is a desktop to open it on."""
+    desktop = "DISPLAY" in os.environ or "WAYLAND_DISPLAY" in os.environ
+    if "SSH_CONNECTION" in os.environ or (sys.platform.startswith("linux") and not desktop):
+        return  # else a browser in the terminal would take it over
+    webbrowser.open(url)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from ..columns.table import OBJECT
 from ..render.colouring import colours_of
 from ..render.hits import hit_colours
-from ..render.surface import apart
+from ..render.surface import apart, triangle_areas
 from ..render.theme import mapped
 from ..scene.scene import Scene
 from .legend import Legend, as_bytes, legend_of, scale_legend
@@ -60,7 +60,7 @@ class Surface:
         legend = None
         if by == "object":
             colouring = colours_of(self._objects, OBJECT, self._scene.names)
-            colours, legend = colouring.colours, legend_of(colouring)
+            colours, legend = colouring.paint(self._objects), legend_of(colouring)
         elif by == "reflectance" and self._reflectance is not None:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
             greys = mapped("gray", np.linspace(0.1, 1.0, 9))
@@ -99,8 +99,7 @@ def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
 
     That is -1 where nothing is left of a small object.
     """
-    a, b, c = scene.vertices[scene.faces].transpose(1, 0, 2)
-    area = float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()) / 2
+    area = float(triangle_areas(scene.vertices[scene.faces]).sum())
     cell, low = (2 * area / most) ** 0.5, scene.vertices.min(axis=0)
     while True:
         at = np.floor((scene.vertices - low) / cell).astype(np.int64)

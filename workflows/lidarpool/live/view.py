@@ -13,18 +13,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from raybeam import RayCaster
+
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import Column, X, Y, Z
 from ..export.sweeps import Sweeps
-from ..render.closeup import CUT, around_ways, floor_and_roof
+from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import Pictured, SensorWay, ways_of
 from ..scene.actors import Actor
 from ..sensor.trajectory import quaternions_of
 from .legend import Legend, as_bytes, legend_of
-from .points import Eye, Filter, PointFinder, Points, Scans, positions, within
+from .points import Eye, Filter, PointFinder, Points, Scans, positions
 from .server import Answer, Arguments
 from .surface import Surface, colours_for
 
@@ -49,52 +51,32 @@ IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does n
 
 @dataclass(eq=False)
 class View:
-    """A survey on a page, or a cloud alone.
-
-    Parameters
-    ----------
-    title
-        Of the page.
-    points
-        The points, or None before there are any.
-    table
-        Columns beside the positions.
-    pictured, sweeps
-        What else is known of the survey.
-    hits
-        Returns the hits of each triangle, (f,).
-    rays
-        float32 (n, 2, 3): ends of some rays, metres, local.
-    note
-        A remark on what is shown.
-    """
+    """A survey on a page, or a cloud alone."""
 
     title: str
-    points: Points | None
-    table: Sequence[Column]
+    points: Points
     pictured: Pictured | None = None
     sweeps: Sweeps | None = None
-    hits: Callable[[], NDArray[Any]] | None = None
+    hits: Callable[[], NDArray[Any]] | None = None  # returns those of each triangle, (f,)
     rays: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), np.float32))
-    note: str = ""
+    note: str = ""  # a remark on what is shown
 
     def __post_init__(self) -> None:
         self.version = 0  # of the points
-        self.path = None if self.pictured is None or self.pictured.plan is None else (
-            self.pictured.plan.path
-        )  # fmt: skip
+        plan = None if self.pictured is None else self.pictured.plan
+        self.path = None if plan is None else plan.path
         self.origin, self._bounds = self._around()
-        rest = {column.name: column for column in self.table if column not in POSITION}
+        rest = {column.name: column for column in self.points.table if column not in POSITION}
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
         self._lock = threading.Lock()
         self._surface: Surface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
         self.show(self.points)
 
-    def show(self, points: Points | None) -> None:
+    def show(self, points: Points) -> None:
         """Show other points."""
         self.points = points
-        self._finder = None if points is None else PointFinder(points, self.origin)
+        self._finder = PointFinder(points, self.origin)
         self._colourings: dict[tuple[str, Filter], Colouring] = {}
         self.version += 1
 
@@ -144,14 +126,17 @@ class View:
         """Local origin and the box of all that is shown."""
         if self.pictured is None:
             return _of_points(self.points)
-        scene, planning = self.pictured.scene, self.pictured.planning
-        places = np.concatenate([scene.bounds, *(way.positions for way in self.pictured.sensors)])
+        scene, ways = self.pictured.scene, self.pictured.sensors
+        places = np.concatenate([scene.bounds, *(way.positions for way in ways)])
         low, high = places.min(axis=0), places.max(axis=0)
-        if planning is not None:
-            ends = np.array([planning.start, planning.target])
-            low[:2] = np.minimum(low[:2], ends.min(axis=0))
-            high[:2] = np.maximum(high[:2], ends.max(axis=0))
-        return scene.origin, np.stack([low, high])
+        places = np.concatenate([[low, high], self._ends(low[2])])
+        return scene.origin, np.stack([places.min(axis=0), places.max(axis=0)])
+
+    def _ends(self, level: float) -> Floats:
+        """Start and target of the planning (2, 3), if there is any, at a height."""
+        planning = None if self.pictured is None else self.pictured.planning
+        ends = [] if planning is None else [planning.start, planning.target]
+        return np.array([[*end, level] for end in ends]).reshape(-1, 3)
 
     # -- answers -------------------------------------------------------------------------
 
@@ -167,10 +152,6 @@ class View:
         }
         return answers[what](asked, abandoned)
 
-    def order(self, what: str) -> None:
-        """There is nothing to order."""
-        raise KeyError(what)
-
     def _state(self) -> Answer:
         """Tell all but points and surfaces."""
         near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
@@ -185,14 +166,11 @@ class View:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = self.sweeps.sensor
-        scene, pictured = None, self.pictured
-        if pictured is not None:
-            scene = list(colours_for(pictured.scene, pictured.reflectance))
-        objects = len(self._names("object"))
+        pictured, objects = self.pictured, len(self._names("object"))
         header = {
             "title": self.title,
             "version": self.version,
-            "points": 0 if self.points is None else len(self.points),
+            "points": len(self.points),
             "columns": [
                 {"name": name, "unit": "s" if column.unit == "ns" else column.unit,
                  "meaning": column.meaning} for name, column in self.columns.items()
@@ -201,7 +179,7 @@ class View:
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
             "cut": None if near is None else float(near[1, 2]),
-            "scene": scene,
+            "scene": pictured and colours_for(pictured.scene, pictured.reflectance),
             "sensors": [
                 {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
             ],
@@ -227,10 +205,7 @@ class View:
             return _corners_of(self._bounds if near is None else near)
         corners = [_corners_of(pictured.scene.bounds)]
         corners += [way.positions[:: len(way.positions) // _PLACES + 1] for way in self.sensors]
-        if (planning := pictured.planning) is not None:
-            ends = np.array([planning.start, planning.target])
-            corners.append(np.column_stack([ends, np.full(2, self._bounds[0, 2])]))
-        return np.concatenate(corners)
+        return np.concatenate([*corners, self._ends(self._bounds[0, 2])])
 
     @property
     def rays_shown(self) -> NDArray[np.float32]:
@@ -243,10 +218,8 @@ class View:
         if self.path is None or self.pictured is None:
             return None
         planning = self.pictured.planning
-        discs: list[Any] = []
-        if planning is not None:
-            discs = np.column_stack([planning.centres, planning.radii]).tolist()
-        return {"corners": self.path.tolist(), "discs": discs}
+        discs = [] if planning is None else [*np.column_stack([planning.centres, planning.radii])]
+        return {"corners": self.path.tolist(), "discs": [disc.tolist() for disc in discs]}
 
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
@@ -254,8 +227,6 @@ class View:
         wanted = Filter.read(asked.get("filter", ""), list(self.columns))
         name = asked["colour"]
         column = self.columns[name]
-        if finder is None:
-            return {"version": version, "count": 0, "legend": None}, _nothing()
         eye = Eye.read(asked["eye"]) if "eye" in asked else None
         scans = _scans(asked["scans"]) if "scans" in asked else None
         most = max(1, min(int(asked["most"]), MOST_POINTS))
@@ -270,7 +241,8 @@ class View:
             "colours": colours,
             "rows": rows.astype(np.uint32),
         }
-        return {"version": version, "count": count, "legend": legend}, arrays
+        shown = legend if len(finder.points) else None
+        return {"version": version, "count": count, "legend": shown}, arrays
 
     def _colouring(
         self, finder: PointFinder, name: str, wanted: Filter, abandoned: Callable[[], bool]
@@ -285,8 +257,6 @@ class View:
 
     def _sample(self, name: str) -> NDArray[Any]:
         """Finite values of a column in an evenly spaced sample of the points."""
-        if self._finder is None:
-            return np.empty(0)
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         return values[np.isfinite(values)]
 
@@ -310,7 +280,7 @@ class View:
     def _point(self, row: int) -> Answer:
         """Tell the position of a point, world coordinates, and all its columns in words."""
         points = self.points
-        if points is None or not 0 <= row < len(points):
+        if not 0 <= row < len(points):
             raise KeyError(row)
         one = np.array([row])
         shown = [
@@ -352,21 +322,17 @@ class View:
         poses = [way.positions for way in self.sensors if len(way.positions)]
         if surface is None or pictured is None or not poses:
             return {"floor": None, "roof_cut": None}
-        places = np.concatenate(poses)
-        floor, roof = floor_and_roof(surface.coarse, places)
-        if roof is not None:
-            top = float(places[:, 2].max())
-            roof = top + CUT * (roof - top)
-        return {"floor": floor, "roof_cut": roof}
+        scene = surface.coarse
+        caster = RayCaster(scene.vertices, scene.faces)
+        floor, cut = floor_and_cut(scene, caster, np.concatenate(poses))
+        return {"floor": floor, "roof_cut": cut}
 
     def _on_statics(self) -> NDArray[np.float32]:
         """Positions (n, 3) of some points on static objects, local."""
-        if self._finder is None or self.pictured is None:
-            return np.zeros((0, 3), np.float32)
         rows, _ = self._finder.find(_HITS_SAMPLE)
-        if "object" in self.columns:
+        if self.pictured is not None and "object" in self.columns:
             owners = self._finder.points.values("object", rows)
-            rows = rows[within(owners, (0, len(self.pictured.scene.names) - 1))]
+            rows = rows[owners < len(self.pictured.scene.names)]
         return (positions(self._finder.points, rows) - self.origin).astype(np.float32)
 
     def _range(self, sweep: int) -> Answer:
@@ -375,12 +341,9 @@ class View:
         if sweeps is None or not 0 <= sweep < len(sweeps):
             raise KeyError(sweep)
         first, last = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
-        rows = np.empty(0, np.int64)
-        if finder is not None:
-            rows, _ = finder.find(MOST_POINTS, scans=((first, last - 1),))
-        image = np.zeros((1, 1, 4), np.uint8)
-        limits = (0.0, 1.0)
-        if len(rows) and finder is not None:
+        rows, _ = finder.find(MOST_POINTS, scans=((first, last - 1),))
+        image, limits = np.zeros((1, 1, 4), np.uint8), (0.0, 1.0)
+        if len(rows):
             places = sweeps.in_sensor(sweep, positions(finder.points, rows))
             channels = None
             if "channel" in self.columns:
@@ -397,10 +360,7 @@ class View:
 
 
 def range_image(
-    places: Floats,
-    ranges: Floats,
-    channels: NDArray[np.int64] | None,
-    limits: tuple[float, float],
+    places: Floats, ranges: Floats, channels: NDArray[np.int64] | None, limits: tuple[float, float]
 ) -> NDArray[np.uint8]:
     """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
 
@@ -436,12 +396,9 @@ def range_image(
     return image
 
 
-def _of_points(points: Points | None) -> Bounds:
+def _of_points(points: Points) -> Bounds:
     """Origin in whole metres near the points, and their box without a few outliers."""
-    places = np.empty((0, 3))
-    if points is not None:
-        rows, _ = PointFinder(points, np.zeros(3)).find(_SAMPLE)
-        places = positions(points, rows)
+    places = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(places):
         return np.zeros(3), np.array([[-1.0, -1.0, 0.0], [1.0, 1.0, 1.0]])
     box = np.percentile(places, [0.5, 99.5], axis=0)
@@ -470,11 +427,3 @@ def _scans(text: str) -> Scans:
     """Read ranges of scans, ``first-last,first-last``."""
     pairs = (entry.split("-") for entry in text.split(",") if entry)
     return tuple((int(first), int(last)) for first, last in pairs)
-
-
-def _nothing() -> dict[str, NDArray[Any]]:
-    return {
-        "positions": np.zeros((0, 3), np.float32),
-        "colours": np.zeros((0, 4), np.uint8),
-        "rows": np.zeros(0, np.uint32),
-    }

@@ -21,19 +21,11 @@ class Place(Enum):
 
 @dataclass(eq=False)
 class Batch:
-    """Consecutive scans on their way to a part.
-
-    Parameters
-    ----------
-    first, stop
-        Its scans.
-    number
-        Number of earlier batches: limits how far the last is ahead of the first.
-    """
+    """Consecutive scans on their way to a part."""
 
     first: int
     stop: int
-    number: int
+    number: int  # of earlier batches: limits how far the last is ahead of the first
     place: Place = Place.WAITING
     since: float = 0.0  # since when it is in its state
     offers: int = 0  # how often it was offered to a GPU worker; receipts of all offers count

@@ -20,34 +20,17 @@ from .rigs import rig_of
 
 @dataclass(frozen=True)
 class CastBatch:
-    """Result of stage 2 for a batch.
-
-    Parameters
-    ----------
-    part
-        Its columns.
-    summaries
-        Of its scans, (scans,) of `messages.summary_type`.
-    record
-        The task.
-    """
+    """Result of stage 2 for a batch."""
 
     part: PartColumns
-    summaries: NDArray[np.void]
+    summaries: NDArray[np.void]  # (scans,) of `messages.summary_type`
     record: TaskRecord
 
 
-def intersect(handle: str, first: int, stop: int, run: str = "") -> CastBatch:
+def intersect(handle: str, first: int, stop: int) -> CastBatch:
     """Cast the rays of scans `first` to `stop` and make their columns; runs on a GPU worker.
 
-    Parameters
-    ----------
-    handle
-        Of the worker's rig.
-    first, stop
-        The scans.
-    run
-        Id of the survey, for traces.
+    `handle` is that of the worker's rig, which is the id of the run.
 
     Raises
     ------
@@ -59,14 +42,14 @@ def intersect(handle: str, first: int, stop: int, run: str = "") -> CastBatch:
     rig = rig_of(handle)
     recorder = Recorder(INTERSECT, GPU)
     scans = list(range(first, stop))
-    trace("intersect.start", run=run, stage=INTERSECT, scans=scans)
+    trace("intersect.start", run=handle, stage=INTERSECT, scans=scans)
     with naming_scans(first, stop - 1):
         found = list(rig.cast(first, stop))
-        trace("intersect.cast", run=run, stage=INTERSECT, scans=scans)
+        trace("intersect.cast", run=handle, stage=INTERSECT, scans=scans)
         part = columns_of(found)
         summaries = np.concatenate([_summaries(returns) for returns in found])
     batch = CastBatch(part, summaries, recorder.done(stop - first))
-    trace("intersect.end", run=run, stage=INTERSECT, scans=scans)
+    trace("intersect.end", run=handle, stage=INTERSECT, scans=scans)
     return batch
 
 

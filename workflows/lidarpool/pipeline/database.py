@@ -42,22 +42,15 @@ CREATE TABLE trials (trial INTEGER PRIMARY KEY, data TEXT NOT NULL);
 class RunDatabase:
     """Committed parts and trials of one run.
 
-    Parameters
-    ----------
-    path
-        The file; made if it does not exist.
-    scan_count
-        Scans of the survey.
-    durable
-        Whether commits must survive a power failure.
+    A file that does not exist is made, and begins with the values `new`. Commits survive a power
+    failure if they are `durable`. All methods that write raise LidarpoolError if the disk is full
+    or fails.
 
-    Raises
-    ------
-    LidarpoolError
-        If it is damaged, of another version, in use by another run, or cannot be written.
+    LidarpoolError if it is damaged, of another version, in use by another run, or cannot be
+    written.
     """
 
-    def __init__(self, path: Path, scan_count: int, *, durable: bool = True) -> None:
+    def __init__(self, path: Path, scan_count: int, *, durable: bool = True, **new: str) -> None:
         self.path, self.scan_count, self._durable = path, scan_count, durable
         self.meta: dict[str, str] = {}
         self.parts: dict[int, Receipt] = {}  # {first scan: its part}
@@ -73,12 +66,12 @@ class RunDatabase:
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
             )
             try:
-                self._open()
+                self._open({"format": str(FORMAT), "mark": secrets.token_hex(8)} | new)
             except BaseException:
                 self._sql.close()
                 raise
 
-    def _open(self) -> None:
+    def _open(self, new: Mapping[str, str]) -> None:
         # The lock is held while the database is open, so that no second run writes to it.
         self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")
         self._sql.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'OFF'}")
@@ -86,8 +79,8 @@ class RunDatabase:
         if not self._sql.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             for statement in _TABLES.split(";"):
                 self._sql.execute(statement)
-            self._set("format", str(FORMAT))
-            self._set("mark", secrets.token_hex(8))
+            for name, value in new.items():
+                self._set(name, value)
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (made := self.meta.get("format")) != str(FORMAT):
@@ -165,13 +158,7 @@ class RunDatabase:
     # -- writing -------------------------------------------------------------------------
 
     def set(self, **values: str) -> None:
-        """Store some values.
-
-        Raises
-        ------
-        LidarpoolError
-            If the disk is full or fails, as in all methods that write.
-        """
+        """Store some values."""
         with self._transaction():
             for name, value in values.items():
                 self._set(name, value)
@@ -237,12 +224,6 @@ class RunDatabase:
         """Content of the file after the last transaction."""
         with self._explained():
             return self._sql.serialize()
-
-    def unlock(self) -> None:
-        """Release the lock of the file; it can still be read."""
-        with self._explained():
-            self._sql.execute("PRAGMA locking_mode = NORMAL")
-            self._sql.execute("SELECT count(*) FROM meta").fetchone()  # the lock goes with a read
 
     def close(self) -> None:
         """Close the file."""
@@ -322,14 +303,8 @@ def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:
 def read_place(path: Path) -> tuple[str, str] | None:
     """Mark of a run, and the place of its parts or "", from its database.
 
-    Returns
-    -------
-    None if there is no database, or a damaged one.
-
-    Raises
-    ------
-    LidarpoolError
-        If a run is using it, or if it is another program's.
+    None if there is no database, or a damaged one; LidarpoolError if a run is using it, or if it is
+    another program's.
     """
     if not path.exists():
         return None

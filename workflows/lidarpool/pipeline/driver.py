@@ -13,8 +13,8 @@ from __future__ import annotations
 import secrets
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from itertools import chain
 
 import numpy as np
@@ -23,7 +23,6 @@ from poolpart import TaskRecord, Whereabouts
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
-from ..base.task_book import TaskBook
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..columns.parts import part_name, probe_name
@@ -31,6 +30,7 @@ from ..sensor import Survey
 from . import policies
 from .batches import Batch, Batches, Place
 from .database import RunDatabase
+from .failures import storing
 from .long_stages import LongStages
 from .messages import (
     CollectOrder,
@@ -38,14 +38,13 @@ from .messages import (
     Frame,
     Receipt,
     ScanRange,
-    StorageFailed,
-    StorageHidden,
     Summaries,
     samples_of_scan,
     summary_type,
 )
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
 from .policies import Loss, Verdict
+from .task_book import TaskBook
 from .workers import CastingWorkers, Outcome
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
@@ -55,22 +54,10 @@ CLOSING_S = 0.001  # longest wait while the stages end
 class SurveyDriver:
     """Runs one survey on the partitions of a cluster.
 
-    Parameters
-    ----------
-    workers, stages
-        Stage 2 and the others: all that it asks of Dask, so that tests can play the cluster.
-    survey
-        What is scanned.
-    db
-        Committed parts; their scans are not cast again.
-    storage
-        Where parts go.
-    read
-        Reads the points of a committed scan.
-    on_frame
-        Called with each frame, in scan order, in the driver's thread.
-    on_parts
-        Called with parts that were committed.
+    `workers` are stage 2 and `stages` the others: all that it asks of Dask, so that tests can play
+    the cluster. Scans in `db` are not cast again, and `storage` is where parts go. `read` reads the
+    points of a committed scan. `on_frame` is called with each frame, in scan order, in the driver's
+    thread, and `on_parts` with parts that were committed.
     """
 
     def __init__(
@@ -98,7 +85,7 @@ class SurveyDriver:
         self.offered_again = 0
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
-        self._hidden: set[str] = set()  # names of LIDAR workers that do not see the storage
+        self._hidden: set[str] = set()  # addresses of LIDAR workers that do not see the storage
         self._sorted_at = time.monotonic()  # when the last frames came
         self._closed = False  # all is committed, and the stages are ending
 
@@ -106,7 +93,7 @@ class SurveyDriver:
 
     def start(self) -> None:
         """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
-        with self._storing():
+        with storing(self._storage):
             self._storage.prepare()
             self._storage.write(*self._probe)
         self._stages.open(self._probe)
@@ -139,10 +126,7 @@ class SurveyDriver:
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
 
-        Raises
-        ------
-        LidarpoolError
-            If a task of the survey has failed, naming stage and scans.
+        LidarpoolError if a task of the survey has failed, naming stage and scans.
         """
         moved = self._receive()
         if self._closed:  # only receive last messages
@@ -183,10 +167,6 @@ class SurveyDriver:
                     for batch in self.batches.at(Place.COLLECTING):
                         if batch.key == message.key:
                             self._again(batch, "its columns could not be fetched")
-                case StorageHidden():
-                    self._hidden.add(message.worker)
-                case StorageFailed():
-                    raise self._unwritable(message.reason)
         return bool(messages)
 
     @property
@@ -298,28 +278,16 @@ class SurveyDriver:
         """Whether a part is in storage; one that its worker holds is written now."""
         if not receipt.held_at:
             return True
+        self._hidden.add(receipt.held_at)
         data = self._stages.take_held(receipt)
         if data is None:
             for batch in self.batches.within(receipt.first, receipt.stop):
                 if batch.place is Place.COLLECTING:
                     self._again(batch, "its part was lost")
             return False
-        with self._storing():
+        with storing(self._storage):
             self._storage.write(receipt.name, data)
         return True
-
-    @contextmanager
-    def _storing(self) -> Iterator[None]:
-        try:
-            yield
-        except OSError as error:
-            raise self._unwritable(error.strerror or str(error)) from error
-
-    def _unwritable(self, reason: str) -> LidarpoolError:
-        return LidarpoolError(
-            f"The points cannot be kept in {self._storage.url} ({reason}): make room there, or "
-            "give another place with --parts."
-        )
 
     def _commit(self, receipts: list[Receipt]) -> None:
         new = self._db.commit(receipts)

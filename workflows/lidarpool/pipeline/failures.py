@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 
 from distributed import Client, Future, KilledWorker
 
 from poolpart import WorkerLeft
 
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
+from ..base.storage import Storage
 from .rigs import RigMissing
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
@@ -19,12 +20,8 @@ ASK_S = 10.0  # for an error's text, which the scheduler has
 def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     """Prefix the message of any error with the current scans.
 
-    Raises
-    ------
-    RuntimeError
-        Instead of any error of the body, because it can always be sent through Dask.
-    WorkerLeft
-        If the body raised it: the scans are not the cause.
+    It becomes a RuntimeError, because that can always be sent through Dask; but a WorkerLeft
+    passes, since the scans are not its cause.
     """
     try:
         yield
@@ -33,6 +30,12 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     except Exception as error:
         span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
         raise RuntimeError(f"{span}: {type(error).__name__}: {error}") from error
+
+
+def storing(storage: Storage) -> AbstractContextManager[None]:
+    """Turn an OSError of the body into a LidarpoolError that says what to do."""
+    advice = "make room there, or give another place with --parts"
+    return explained(f"The points cannot be kept in {storage.url}", advice)
 
 
 def was_killed(future: Future) -> bool:

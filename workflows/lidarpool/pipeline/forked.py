@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from contextlib import suppress
 
 import distributed.nanny  # noqa: F401
@@ -12,5 +13,7 @@ from . import stages  # noqa: F401
 
 keep_freed_memory()
 with suppress(ImportError):  # if it cannot be loaded, a check says why
-    import embreex.mesh_construction
-    import embreex.rtcore_scene  # noqa: F401
+    from raybeam import embree_kernels
+
+    if embree_kernels.COMPILED:
+        print("note: compiled the ray caster for this processor, once", file=sys.stderr)  # noqa: T201

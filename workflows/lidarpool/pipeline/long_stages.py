@@ -28,13 +28,7 @@ from ..base.software import call_alike
 from ..base.storage import Storage
 from ..sensor import Survey
 from .failures import raise_if_failed, was_killed, words_on_memory
-from .messages import (
-    CollectOrder,
-    Message,
-    Receipt,
-    StageStart,
-    Summaries,
-)
+from .messages import CollectOrder, Message, Receipt, StageStart, Summaries
 from .names import COLLECT, GENERATE, SORT
 from .stages import collect, generate, sort_frames
 
@@ -74,22 +68,8 @@ class LongStages:
     lock of the cluster, when there are slots for all: two runs with some of the slots each would
     wait for each other for ever.
 
-    Parameters
-    ----------
-    client, partition
-        Where the stages run.
-    run
-        Id of the run, part of the names of tasks and pipes.
-    sources
-        ``lidarpool`` of the run's `software`.
-    survey, storage
-        What is scanned, and where parts go.
-    queue_capacity
-        Items that stage 1 may be ahead.
-    collectors
-        Number of tasks of stage 4.
-    patience_s
-        How long to wait for slots, seconds.
+    `run` is the run's id, part of the names of tasks and pipes; `sources` is ``lidarpool`` of its
+    `software`. Stage 1 may be `queue_capacity` items ahead, and slots are waited for `patience_s`.
     """
 
     def __init__(
@@ -223,11 +203,14 @@ class LongStages:
             self._waited_from = self._waited_from or now
             self._enough_at = now
         elif now - self._enough_at > self._patience_s:
-            raise LidarpoolError(
-                f"Partition {self.partition.name!r} has had {seen.slots} of the {needed} slots "
-                f"needed for {self._patience_s:.0f} s: start another worker with "
-                f'--resources "{self.partition.name}=1" and run it again.'
-            )
+            what = f"has had {seen.slots} of the {needed} slots needed for {self._patience_s:.0f} s"
+            raise self._too_few(f"Partition {self.partition.name!r} {what}")
+
+    def _too_few(self, what: str) -> LidarpoolError:
+        return LidarpoolError(
+            f'{what}: start another worker with --resources "{self.partition.name}=1" and run it '
+            "again."
+        )
 
     def _look(self) -> Whereabouts:
         keys = [task.future.key for task in self._tasks.values()]
@@ -241,11 +224,8 @@ class LongStages:
         `progress` is any number that grows when something is committed; so many scans were
         `generated`, taken from stage 1, and `framed`, handed out as frames.
 
-        Raises
-        ------
-        LidarpoolError
-            If a stage has failed, or keeps dying with nothing committed in between, or the
-            partition has too few slots for too long.
+        LidarpoolError if a stage has failed, or keeps dying with nothing committed in between, or
+        the partition has too few slots for too long.
         """
         now = time.monotonic()
         if now - self._looked_at < LOOK_EVERY_S:
@@ -303,11 +283,8 @@ class LongStages:
             for other, task in self._tasks.items()
         )
         if seconds > self._patience_s and not spare:
-            raise LidarpoolError(
-                f"Stage {name} has had no free slot in partition {self.partition.name!r} for "
-                f"{self._patience_s:.0f} s since its worker died: start another worker with "
-                f'--resources "{self.partition.name}=1" and run it again.'
-            )
+            what = f"no free slot in partition {self.partition.name!r} for {self._patience_s:.0f} s"
+            raise self._too_few(f"Stage {name} has had {what} since its worker died")
 
     def _count_death(self, name: str, worker: str) -> None:
         """LidarpoolError when a stage keeps dying."""
@@ -385,9 +362,7 @@ class LongStages:
     def finish(self, others: Sequence[Future]) -> list[TaskRecord]:
         """Wait a moment for the stages to end, and clean up the scheduler; cancel others as well.
 
-        Returns
-        -------
-        The stages' records, without those of unreachable workers.
+        Returns the records of the stages whose workers can be reached.
         """
         futures = [task.future for task in self._tasks.values()]
         try:

@@ -88,58 +88,23 @@ class ColumnsLost:
 
 
 @dataclass(frozen=True, slots=True)
-class StorageHidden:
-    """From stage 4: the worker of this name does not see the storage, and holds its parts."""
-
-    worker: str
-
-
-@dataclass(frozen=True, slots=True)
-class StorageFailed:
-    """From stage 4: a part could not be written."""
-
-    reason: str
-
-
-@dataclass(frozen=True, slots=True)
 class Receipt:
-    """From stage 4: a part is whole in storage.
+    """From stage 4: a part is whole in storage."""
 
-    Parameters
-    ----------
-    first, stop
-        Its scans.
-    name
-        Of the part.
-    rows, size
-        Its points and its bytes.
-    hits
-        Hits of its scans, before thinning out.
-    cells
-        Lowest and highest cell as six numbers; empty where there are no points.
-    summaries
-        Of its scans, as bytes of `summary_type`.
-    record
-        The casting task; None for a receipt from the database.
-    held_at
-        Address of the worker that holds the part in memory because it does not see the storage;
-        "" if the part is in storage.
-    """
-
-    first: int
+    first: int  # of its scans
     stop: int
-    name: str
-    rows: int
-    size: int
-    hits: int
-    cells: tuple[int, ...]
-    summaries: bytes
-    record: TaskRecord | None = None
-    held_at: str = ""
+    name: str  # of the part
+    rows: int  # points
+    size: int  # bytes
+    hits: int  # of its scans, before thinning out
+    cells: tuple[int, ...]  # lowest and highest as six numbers; empty where there are no points
+    summaries: bytes  # of its scans, of `summary_type`
+    record: TaskRecord | None = None  # the casting task; None for a receipt from the database
+    held_at: str = ""  # worker that holds the part because it does not see the storage; else ""
 
 
 # To the driver.
-Message = ScanRange | Summaries | ColumnsLost | StorageHidden | StorageFailed | Receipt
+Message = ScanRange | Summaries | ColumnsLost | Receipt
 
 
 @dataclass(frozen=True)

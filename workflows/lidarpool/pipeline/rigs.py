@@ -27,15 +27,7 @@ UNUSED_S = 600.0  # a rig unused for so long is dropped when another is made
 
 @dataclass(frozen=True, eq=False)
 class RigPlan:
-    """Description of a rig.
-
-    Parameters
-    ----------
-    scene, survey
-        What is scanned, and how.
-    backend
-        Name of the ray-casting backend, the same on all workers.
-    """
+    """Description of a rig; its backend is the same on all workers."""
 
     scene: Scene
     survey: Survey
@@ -72,13 +64,7 @@ def set_up(handle: str, packed: bytes) -> None:
 
 
 def rig_of(handle: str) -> Rig:
-    """Return a rig of this process.
-
-    Raises
-    ------
-    RigMissing
-        If there is none.
-    """
+    """Return a rig of this process; RigMissing if there is none."""
     rig = _rigs.get(handle)
     if rig is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")

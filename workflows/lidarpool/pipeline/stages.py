@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from itertools import chain
 
-from distributed import get_worker, secede
+from distributed import secede
 
 from poolpart import (
     Pipe,
@@ -26,17 +26,8 @@ from ..base.storage import Storage
 from ..columns.parts import pack
 from ..sensor import Survey
 from .cast import CastBatch
-from .failures import naming_scans
-from .messages import (
-    CollectOrder,
-    ColumnsLost,
-    Receipt,
-    ScanRange,
-    StageStart,
-    StorageFailed,
-    StorageHidden,
-    Summaries,
-)
+from .failures import naming_scans, storing
+from .messages import CollectOrder, ColumnsLost, Receipt, ScanRange, StageStart, Summaries
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
@@ -73,14 +64,8 @@ def generate(me: StageStart, survey: Survey, outlet: Pipe, first: int) -> TaskRe
 def sort_frames(me: StageStart, following: int, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put the summaries of scans into scan order.
 
-    Parameters
-    ----------
-    me
-        This start of the task.
-    following
-        The next scan; all before it have been handed out.
-    inlet, outlet
-        From the driver lists of `Summaries`, and to it each of them once those before it were.
+    All before the scan `following` have been handed out. From the driver come lists of `Summaries`,
+    and to it goes each of them once those before it went.
     """
     secede()
     recorder = Recorder(SORT, LIDAR)
@@ -108,25 +93,13 @@ def sort_frames(me: StageStart, following: int, inlet: Pipe, outlet: Pipe) -> Ta
 
 @telling_departure()
 def collect(
-    me: StageStart,
-    storage: Storage,
-    probe: tuple[str, bytes],
-    inlet: Pipe,
-    outlet: Pipe,
+    me: StageStart, storage: Storage, probe: tuple[str, bytes], inlet: Pipe, outlet: Pipe
 ) -> TaskRecord:
     """Stage 4: fetch batches from the workers that cast them, and write each as a part.
 
-    Parameters
-    ----------
-    me
-        This start of the task.
-    storage, probe
-        Place of the parts, and a file there with its content. A worker that does not see that file
-        holds its parts in memory, and the driver fetches them.
-    inlet
-        From the driver: lists of `CollectOrder`.
-    outlet
-        To the driver: `Receipt`, `ColumnsLost`, `StorageFailed`, `StorageHidden`.
+    `probe` is a file in the storage, name and content: a worker that does not see it holds its
+    parts in memory, and the driver fetches them. From the driver come lists of `CollectOrder`, to
+    it go `Receipt` and `ColumnsLost`.
     """
     secede()
     recorder = Recorder(COLLECT, LIDAR)
@@ -134,8 +107,6 @@ def collect(
     try:
         me.trace("start")
         seen = storage.sees(*probe)
-        if not seen:
-            outlet.put(StorageHidden(str(get_worker().name)), unbounded=True)
         while True:
             for order in chain.from_iterable(inlet.get_all()):
                 answer = _collected(me, storage if seen else None, order)
@@ -150,7 +121,7 @@ def collect(
 
 def _collected(
     me: StageStart, storage: Storage | None, order: CollectOrder
-) -> Receipt | ColumnsLost | StorageFailed:
+) -> Receipt | ColumnsLost:
     """Make a part of one batch; returns the message to the driver."""
     scans = range(order.first, order.stop)
     found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
@@ -166,10 +137,8 @@ def _collected(
     if storage is None:
         held_at = hold_for_driver(order.name, data)
     else:
-        try:
+        with storing(storage):
             storage.write(order.name, data)
-        except OSError as error:
-            return StorageFailed(f"{error.strerror or error}")
         me.trace("stored", scans)
     return Receipt(
         first=order.first,

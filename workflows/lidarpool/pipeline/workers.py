@@ -42,16 +42,8 @@ class CastingWorkers:
     A worker's software is checked before it unpickles anything: a worker with other sources of
     lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts nothing.
 
-    Parameters
-    ----------
-    client, partition
-        Where they are.
-    handle
-        Name of their rigs.
-    plan
-        What rigs are made of.
-    software
-        That of the workers that may cast, see `base.software`.
+    Rigs have the name `handle` and are made of `plan`; `software` is that of the workers that may
+    cast, see `base.software`.
     """
 
     def __init__(
@@ -101,7 +93,7 @@ class CastingWorkers:
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
         key = f"{INTERSECT}-{self.handle}-{first}-{stop}.{offer}"
         self._casts[key] = self._partition.submit(
-            intersect, self.handle, first, stop, self.handle, key=key, workers=worker
+            intersect, self.handle, first, stop, key=key, workers=worker
         )
         return key
 
@@ -131,14 +123,8 @@ class CastingWorkers:
     def look(self) -> Whereabouts | None:
         """From time to time, handle workers that have joined or left, or take no tasks.
 
-        Returns
-        -------
-        Where workers and casting tasks are; None if it is not time to look.
-
-        Raises
-        ------
-        LidarpoolError
-            If preparing the scene fails, or kills several workers in a row.
+        Returns where workers and casting tasks are, None if it is not time to look. LidarpoolError
+        if preparing the scene fails, or kills several workers in a row.
         """
         if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
             self._check()
@@ -177,9 +163,8 @@ class CastingWorkers:
         addresses = [a for a in self.slots if a in self.seen.members]
         self.slots.clear()
         if addresses and self._client.status == "running":
-            with suppress(
-                TimeoutError
-            ):  # Dask tries for half a minute to reach a worker that is ending
+            # Dask tries for half a minute to reach a worker that is ending.
+            with suppress(TimeoutError):
                 self._client.run(
                     drop_rig,
                     self.handle,
@@ -190,12 +175,8 @@ class CastingWorkers:
 
     def _prepare(self, address: str) -> None:
         if self._plan is None:
-            with warnings.catch_warnings():
-                # A large scene makes a large graph, which is the only way to have it recomputed.
-                warnings.filterwarnings("ignore", message="Sending large graph")
-                self._plan = self._partition.submit(
-                    _same, self._packed, key=f"scene-{self.handle}-{self._count}"
-                )
+            key = f"scene-{self.handle}-{self._count}"
+            self._plan = share(self._partition, self._packed, key=key)
         self._count += 1
         self._setups[address] = self._partition.submit(
             _preparation(self._backend, self._software),
@@ -244,8 +225,16 @@ class CastingWorkers:
             )
 
 
-def _same(packed: bytes) -> bytes:
-    return packed
+def share(partition: Partition, thing: Any, **options: Any) -> Future:
+    """Have a thing on a worker, for tasks to fetch; Dask makes it again if that worker dies."""
+    with warnings.catch_warnings():
+        # A large one makes a large graph, which is the only way to have it recomputed.
+        warnings.filterwarnings("ignore", message="Sending large graph")
+        return partition.submit(_same, thing, **options)
+
+
+def _same(thing: Any) -> Any:
+    return thing
 
 
 def _preparation(backend: str, wanted: dict[str, str]) -> Callable[[str, bytes], dict[str, Any]]:

@@ -1,15 +1,7 @@
 """Path planning: particle swarms search for a short path around discs in the plane."""
 
-from .plan import Plan, best
 from .planning import Planning
 from .tangents import shortest_path_length
-from .trial import Trial, run_trial
+from .trial import Plan, Trial, best, run_trial
 
-__all__ = [
-    "Plan",
-    "Planning",
-    "Trial",
-    "best",
-    "run_trial",
-    "shortest_path_length",
-]
+__all__ = ["Plan", "Planning", "Trial", "best", "run_trial", "shortest_path_length"]

@@ -34,29 +34,16 @@ class PathCost:
 
     A path that enters no disc costs its length. A path that does also costs more than the longest
     detour around all discs, and `_SLOPE` to twice that for each unit of depth in each disc: it
-    never beats a free path, and its cost falls on the way out.
-
-    Parameters
-    ----------
-    centres, radii
-        The discs, on `PathAxes`: (m, 2) and (m,).
-    waypoints
-        Corners of each path between the two ends.
-    particles
-        Number of paths.
-
-    Attributes
-    ----------
-    waypoints : float32 (waypoints, 2, particles)
-        The paths, contiguous. Write to it, then call `evaluate`.
-    entry_price : float
-        The fixed part of the penalty for entering discs.
+    never beats a free path, and its cost falls on the way out. The discs, (m, 2) and (m,), are on
+    `PathAxes`; each of the `particles` paths has `waypoints` corners between the two ends.
     """
 
     def __init__(self, centres: Floats, radii: Floats, waypoints: int, particles: int) -> None:
         self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
         self._points[0, 0], self._points[-1, 0] = -0.5, 0.5
+        # (waypoints, 2, particles), contiguous. Write to it, then call `evaluate`.
         self.waypoints: Singles = self._points[1:-1]
+        # The fixed part of the penalty for entering discs.
         # The boundaries of all discs together are at least as long as any path around them.
         self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
         self._cost = np.empty(particles, np.float32)

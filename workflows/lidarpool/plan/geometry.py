@@ -1,6 +1,8 @@
-"""Segments against discs in the plane, exactly: closest points, no sampling."""
+"""Segments against discs in the plane, exactly, and normalised coordinates for planning."""
 
 from __future__ import annotations
+
+import math
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,16 +13,8 @@ Floats = NDArray[np.float64]
 def segment_distances(first: Floats, last: Floats, centres: Floats) -> Floats:
     """Distance of every segment to every centre.
 
-    Parameters
-    ----------
-    first, last
-        Ends of the segments: (s, 2). A segment may be a single point.
-    centres
-        Points to measure to: (m, 2).
-
-    Returns
-    -------
-    Distance from each centre to the closest point of each segment: (s, m).
+    Segments (s, 2) and (s, 2), which may be single points, and centres (m, 2): returns the distance
+    from each centre to the closest point of each segment, (s, m).
     """
     along = last - first
     squared = along[:, 0] ** 2 + along[:, 1] ** 2
@@ -41,18 +35,36 @@ def path_length(points: Floats) -> float:
 
 
 def clearance(points: Floats, centres: Floats, radii: Floats) -> float:
-    """Least distance from the path through `points` to the edge of a disc.
+    """Least distance from the path through `points`, (p, 2), to the edge of a disc.
 
     Negative if the path enters a disc, by its greatest depth; 0 if it touches one; inf without
-    discs.
-
-    Parameters
-    ----------
-    points
-        Corners of the path: (p, 2), at least 2.
-    centres, radii
-        The discs: (m, 2) and (m,).
+    discs, (m, 2) and (m,).
     """
     if not len(radii):
         return float("inf")
     return float((segment_distances(points[:-1], points[1:], centres) - radii).min())
+
+
+class PathAxes:
+    """Axes in which the path starts at (-½, 0) and ends at (½, 0), two different points.
+
+    The swarm computes in single precision and with fixed distances; in these axes neither
+    georeferenced coordinates nor the size of the scene matter. Only + - x / and square roots are
+    used, whose rounding IEEE 754 defines: the same numbers on every machine.
+    """
+
+    def __init__(self, start: tuple[float, float], target: tuple[float, float]) -> None:
+        run, rise = target[0] - start[0], target[1] - start[1]
+        self.unit_m = math.sqrt(run * run + rise * rise)  # metres in one unit of these axes
+        self._axis = run / self.unit_m, rise / self.unit_m  # x, in the plane
+        self._middle = (np.array(start) + np.array(target)) / 2
+
+    def to_local(self, points: Floats) -> Floats:
+        """Convert points of the plane, (p, 2), to these axes."""
+        (cos, sin), (x, y) = self._axis, (points - self._middle).T / self.unit_m
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=1)
+
+    def to_plane(self, points: Floats) -> Floats:
+        """Convert points on these axes, (p, 2), to the plane."""
+        (cos, sin), (x, y) = self._axis, points.T * self.unit_m
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=1) + self._middle

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from raybeam import RayCaster
 
@@ -36,19 +38,8 @@ _SECTORS = 36  # in all of which a sensor that turns has rays
 class Sight:
     """What a sensor sees from a station: surfaces in its range and field of view, not hidden.
 
-    Parameters
-    ----------
-    scene
-        The scene, without its actors.
-    sensor
-        It has to look all around; its lowest and highest rays limit the field of view.
-    slant_deg
-        Largest angle of incidence, from the normal of a surface, in degrees.
-
-    Raises
-    ------
-    LidarpoolError
-        If the sensor does not look all around.
+    Its lowest and highest rays limit the field of view, `slant_deg` the angle of incidence, from
+    the normal of a surface. Actors are left out. LidarpoolError if it does not look all around.
     """
 
     def __init__(self, scene: Scene, sensor: Sensor, slant_deg: float) -> None:
@@ -71,19 +62,10 @@ class Sight:
         self._lowest, self._highest = float(z.min()) - 1e-9, float(z.max()) + 1e-9
 
     def sides(self, station: Floats, points: Floats, normals: Floats) -> NDArray[np.int8]:
-        """Return which side of surfaces a station sees at points.
+        """Return which side of surfaces a station (3,) sees at points (n, 3): int8 (n,).
 
-        Parameters
-        ----------
-        station
-            (3,) local metres.
-        points, normals
-            (n, 3) local metres, on triangles of the scene; unit normals there.
-
-        Returns
-        -------
-        int8 (n,): 1 for the side that the normal points to, -1 for the other, 0 if the point is
-        not seen.
+        In local metres. The points are on triangles of the scene, with unit normals (n, 3). 1 is
+        the side that the normal points to, -1 the other, 0 a point that is not seen.
         """
         ways = points - station
         far = np.sqrt(np.einsum("ij,ij->i", ways, ways))
@@ -123,11 +105,11 @@ def plan_stations(
     scene: Scene,
     sensor: Sensor,
     *,
-    count: int | None = None,
-    coverage: float | None = None,
-    height_m: float = 1.7,
-    spacing_m: float | None = None,
-    slant_deg: float = 80.0,
+    count: Annotated[int | None, Field(ge=1, le=STATIONS_MOST)] = None,
+    coverage: Annotated[float | None, Field(gt=0, le=1)] = None,
+    height_m: Annotated[float, Field(gt=0, le=1e6)] = 1.7,
+    spacing_m: Annotated[float | None, Field(gt=0, le=1e6)] = None,
+    slant_deg: Annotated[float, Field(gt=0, le=90)] = 80.0,
 ) -> StationPlan:
     """Choose stations for a terrestrial scan.
 
@@ -169,15 +151,6 @@ def plan_stations(
     """
     if count is not None and coverage is not None:
         raise LidarpoolError("count and coverage both say when to stop: give one of them.")
-    for name, value, good, allowed in (
-        ("count", count, count is None or 1 <= count <= STATIONS_MOST, f"1 to {STATIONS_MOST}"),
-        ("coverage", coverage, coverage is None or 0 < coverage <= 1, "above 0, at most 1 (100 %)"),
-        ("height_m", height_m, 0 < height_m < math.inf, "above 0 and finite"),
-        ("spacing_m", spacing_m, spacing_m is None or 0 < spacing_m < math.inf, "above 0"),
-        ("slant_deg", slant_deg, 0 < slant_deg <= 90, "above 0, at most 90"),
-    ):
-        if not good:
-            raise LidarpoolError(f"{name} is {value}; it must be {allowed}.")
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _spacing(scene)
@@ -352,14 +325,8 @@ def _clear(scene: Scene, caster: RayCaster, places: Floats) -> Ints:
 def _samples(scene: Scene) -> tuple[Floats, Floats, Ints, Floats]:
     """Points on the surfaces, evenly spread by area within each object, always the same.
 
-    Returns
-    -------
-    points, normals
-        (n, 3) local metres, and unit normals.
-    owner
-        (n,) number of the object.
-    area
-        (n,) m² that a point stands for.
+    Returns points (n, 3) in local metres, unit normals there (n, 3), the number of the object (n,),
+    and the m² that a point stands for (n,).
     """
     order = np.argsort(scene.face_object, kind="stable")
     corners = scene.vertices[scene.faces[order]]

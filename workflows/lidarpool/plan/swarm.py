@@ -1,19 +1,60 @@
-"""A particle swarm: moves particles, and records the best."""
+"""A particle swarm: moves particles, and records the best; its random numbers."""
 
 from __future__ import annotations
+
+import itertools
+import math
 
 import numpy as np
 from numpy.typing import NDArray
 
 from .cost import PathCost, Singles
 from .geometry import Floats
-from .randoms import Randoms, Windows
 
 _GROUPS = 5
 _LEAST_GROUP = 20  # particles
 _NARROWEST = 0.05  # spread of the first group; the unit is the distance from start to target
 _LEAST_WIDEST = 0.2  # spread of the last group, at least
-_TABLE_WINDOWS = 2  # length of the table of random numbers, in windows
+# New random numbers for each move would cost as much as all other arithmetic. So they are drawn
+# once, into a table of so many moves, and each move takes a part of it from a random start. Parts
+# overlap, but a number serves another particle and coordinate in each.
+_TABLE_MOVES = 2
+_STARTS = 1021  # before they repeat
+
+
+class Randoms:
+    """Single-precision random numbers from a seed.
+
+    NumPy guarantees the raw output of its bit generators, but not that of its `Generator`
+    (NEP 19), so the last step is done here. The seed is below 2**64.
+    """
+
+    def __init__(self, seed: int) -> None:
+        self._bits = np.random.SFC64(seed)
+
+    def uniform(self, count: int) -> NDArray[np.float32]:
+        """Numbers uniform in [0, 1), multiples of 2**-24: (count,)."""
+        high = self._bits.random_raw(count) >> np.uint64(40)
+        return high.astype(np.float32) * np.float32(2**-24)
+
+    def normal(self, count: int) -> NDArray[np.float32]:
+        """Numbers of mean 0 and variance 1, nearly normal: (count,).
+
+        Each is the sum of four uniform ones (Irwin-Hall), the four quarters of a raw number,
+        so none is beyond 3.5. The exact distribution would need logarithms, which are not the
+        same on every machine.
+        """
+        raw = self._bits.random_raw(count)
+        total = np.zeros(count, np.uint64)
+        for quarter in range(4):
+            total += (raw >> np.uint64(16 * quarter)) & np.uint64(0xFFFF)
+        # Four whole numbers below 2**16 have mean 2 (2**16 - 1) and variance near 2**32 / 3.
+        centred = total.astype(np.float32) - np.float32(2 * (2**16 - 1))
+        return centred * np.float32(math.sqrt(3) / 2**16)
+
+    def below(self, end: int, count: int) -> list[int]:
+        """Draw whole numbers from 0 to end - 1, for an `end` far below 2**64."""
+        return (self._bits.random_raw(count) % np.uint64(end)).tolist()
 
 
 class Swarm:
@@ -26,23 +67,9 @@ class Swarm:
     scenes of 6 to 25 discs, with two thirds of the arithmetic.
 
     Discs can be passed on either side, and a swarm with one common best settles early on one
-    choice of sides. Groups with different initial spreads settle on several.
-
-    Parameters
-    ----------
-    paths
-        Its `waypoints` are the positions of the particles.
-    widest
-        Initial spread of the last group about the straight line, in units of its length.
-    randoms
-        Source of random numbers.
-
-    Attributes
-    ----------
-    paths : PathCost
-        As given.
-    groups : int
-        The most, up to 5, that divide the particles evenly into 20 or more.
+    choice of sides. Groups with different initial spreads settle on several: up to `widest` about
+    the straight line, in units of its length. The `waypoints` of `paths` are the positions of the
+    particles.
     """
 
     def __init__(self, paths: PathCost, widest: float, randoms: Randoms) -> None:
@@ -62,8 +89,10 @@ class Swarm:
         self._leader_numbers = np.empty(self.groups, np.intp)
         self._group_starts = np.arange(self.groups) * (particles // self.groups)
         # Position of a jump between the particle's best, 0, and its leader's, 1.
-        table = randoms.normal(_TABLE_WINDOWS * rows * particles) + np.float32(0.5)
-        self._shares = Windows(table, rows * particles, randoms)
+        size = rows * particles
+        self._shares = randoms.normal(_TABLE_MOVES * size) + np.float32(0.5)
+        starts = randoms.below(len(self._shares) - size + 1, _STARTS)
+        self._parts = itertools.cycle([slice(start, start + size) for start in starts])
         # Other views of the same memory: one long axis is fastest.
         self._flat_at, self._flat_best = self._at.reshape(-1), self._best.reshape(-1)
         self._flat_jump = self._jump.reshape(-1)
@@ -94,7 +123,7 @@ class Swarm:
 
     def _move(self) -> None:
         np.subtract(self._leaders[..., None], self._best_by_group, out=self._jump_by_group)
-        np.multiply(self._flat_jump, self._shares.draw(), out=self._flat_jump)
+        np.multiply(self._flat_jump, self._shares[next(self._parts)], out=self._flat_jump)
         np.add(self._flat_best, self._flat_jump, out=self._flat_at)
 
 

@@ -40,16 +40,8 @@ def shortest_path_length(
 
     Discs may overlap, touch and contain one another; a path may touch a disc's edge.
 
-    Parameters
-    ----------
-    start, target
-        x and y of either end.
-    centres, radii
-        The discs: (m, 2) and (m,), with radii above 0. m may be 0.
-
-    Returns
-    -------
-    The length; inf if discs separate target and start, or contain one of them.
+    Centres are (m, 2), and radii above 0 (m,); m may be 0. The length is inf if discs separate
+    target and start, or contain one of them.
 
     Notes
     -----

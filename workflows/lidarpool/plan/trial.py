@@ -1,18 +1,19 @@
-"""One trial: a swarm run to its end, on whatever worker."""
+"""One trial: a swarm run to its end, on whatever worker; and the plan, the best of the trials."""
 
 from __future__ import annotations
 
 import time
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from .axes import PathAxes
+from ..base.errors import LidarpoolError
 from .cost import PathCost
-from .geometry import Floats, clearance, path_length, segment_distances
+from .geometry import Floats, PathAxes, clearance, path_length, segment_distances
 from .planning import Planning
-from .randoms import Randoms
-from .swarm import Swarm
+from .swarm import Randoms, Swarm
+from .tangents import shortest_path_length
 
 
 @dataclass(frozen=True, eq=False)
@@ -20,52 +21,26 @@ class Trial:
     """What one swarm found.
 
     The same `Planning` and number give the same trial, to the bit, except for `seconds`.
-
-    Parameters
-    ----------
-    trial
-        Number of the trial, from 0.
-    seed
-        Seed of its random numbers.
-    length
-        Length of the path in metres.
-    waypoints
-        Corners of the path between its two ends, in metres: (k, 2).
-    collision_free
-        Whether the path enters no disc, by the exact check.
-    seconds
-        Time that the trial took.
     """
 
-    trial: int
-    seed: int
-    length: float
-    waypoints: Floats
-    collision_free: bool
-    seconds: float = field(compare=False)
-
-
-def trial_seed(planning: Planning, trial: int) -> int:
-    """Seed of trial number `trial`, independent of all others' (`numpy.random.SeedSequence`)."""
-    sequence = np.random.SeedSequence(entropy=planning.seed, spawn_key=(trial,))
-    return int(sequence.generate_state(1, np.uint64)[0])
+    trial: int  # its number, from 0
+    seed: int  # of its random numbers
+    length: float  # of the path, metres
+    waypoints: Floats  # (k, 2): corners of the path between its two ends, metres
+    collision_free: bool  # whether the path enters no disc, by the exact check
+    seconds: float = field(compare=False)  # that the trial took
 
 
 def run_trial(planning: Planning, trial: int) -> Trial:
     """Search for a path with one particle swarm.
 
-    A pure function on one thread: the result depends on `planning` and `trial` alone, not on
-    where or beside what it runs.
-
-    Parameters
-    ----------
-    planning
-        The problem.
-    trial
-        Number of the trial, from 0.
+    A pure function on one thread: the result depends on `planning` and the number of the trial
+    alone, not on where or beside what it runs.
     """
     begun = time.perf_counter()
-    seed = trial_seed(planning, trial)
+    # Independent of the seeds of all others.
+    sequence = np.random.SeedSequence(entropy=planning.seed, spawn_key=(trial,))
+    seed = int(sequence.generate_state(1, np.uint64)[0])
     axes = PathAxes(planning.start, planning.target)
     swarm = prepare_swarm(planning, axes, seed)
     for _ in range(planning.iterations):
@@ -96,3 +71,75 @@ def prepare_swarm(planning: Planning, axes: PathAxes, seed: int) -> Swarm:
     # No path worth having leaves the line by more than half its length.
     widest = min(float(edges.max(initial=0.0)), cost.entry_price / 2)
     return Swarm(cost, widest, Randoms(seed))
+
+
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """The best path found.
+
+    Parameters
+    ----------
+    path
+        Corners of the path from start to target, both included, in metres: (k + 2, 2).
+    length
+        Its length in metres.
+    shortest_possible
+        Length in metres of the shortest path, computed from the discs' tangents; inf if discs cut
+        off the target.
+    clearance
+        Least distance in metres from the path to a disc; negative if it enters one, inf without
+        discs.
+    trial
+        Number of the trial that found the path.
+    trials
+        Number of trials.
+    """
+
+    path: Floats
+    length: float
+    shortest_possible: float
+    clearance: float
+    trial: int
+    trials: int
+
+    @property
+    def collision_free(self) -> bool:
+        """Whether the path enters no disc."""
+        return self.clearance >= 0
+
+    @property
+    def excess(self) -> float:
+        """Share by which the path is longer than the shortest possible: 0.01 is 1%."""
+        return self.length / self.shortest_possible - 1
+
+
+def best(trials: Iterable[Trial], planning: Planning) -> Plan:
+    """Choose the best path of `trials`: the shortest of those that enter no disc.
+
+    Each path is checked again, segment by segment against each disc. If none is free of
+    collisions, the one that enters discs least is chosen, with `collision_free` False. The order
+    of `trials` does not matter; of equal ones the lowest number wins.
+
+    Raises
+    ------
+    LidarpoolError
+        If there are no trials.
+    """
+    candidates = []
+    for trial in trials:
+        path = with_ends(planning, trial.waypoints)
+        room = clearance(path, planning.centres, planning.radii)
+        candidates.append((max(0.0, -room), path_length(path), trial.trial, room, path))
+    if not candidates:
+        raise LidarpoolError("No planning trial was finished, so there is no best path.")
+    _, length, number, room, path = min(candidates, key=lambda candidate: candidate[:3])
+    return Plan(
+        path=path,
+        length=length,
+        shortest_possible=shortest_path_length(
+            planning.start, planning.target, planning.centres, planning.radii
+        ),
+        clearance=room,
+        trial=number,
+        trials=len(candidates),
+    )

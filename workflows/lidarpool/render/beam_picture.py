@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 
 from ..sensor import LineSensor, Sensor
-from . import theme
-from .page import FONT, Page
+from .page import Page
 from .shot import SIZE
 from .theme import mapped
 
@@ -22,11 +21,7 @@ def draw_beams(path: Path, sensor: Sensor) -> None:
 
     These are the rays of some firings; if a firing is one ray, those of a frame, or of two cycles
     of a mirror. For a sensor that looks down, whose rays lie in a plane, the angle over time.
-
-    Raises
-    ------
-    LidarpoolError
-        If the file, a .png, cannot be written.
+    LidarpoolError if the file, a .png, cannot be written.
     """
     page = Page(SIZE)
     turn = round(getattr(sensor.head, "firings_per_turn", 1000))
@@ -44,15 +39,8 @@ def draw_beams(path: Path, sensor: Sensor) -> None:
         azimuth = np.degrees(np.arctan2(y, x))
         across, up = (azimuth - middle + 180) % 360 - 180 + middle, np.degrees(np.arcsin(z))
         labels = "azimuth, degrees", "elevation, degrees"
-    axes = page.figure.add_axes((0.075, 0.12, 0.75, 0.73))
-    axes.set(facecolor=theme.GROUND, axisbelow=True, aspect="auto" if many or down else "equal")
-    axes.grid(color=theme.LINE, lw=0.5 * page.unit)
-    axes.spines[:].set(color=theme.LINE, linewidth=0.6 * page.unit)
-    for side, label in zip((axes.xaxis, axes.yaxis), labels, strict=True):
-        side.set_label_text(label, fontsize=7.6 * page.unit, color=theme.INK, family=FONT)
-    axes.tick_params(
-        labelsize=6.8 * page.unit, labelcolor=theme.MUTED, color=theme.LINE, labelfontfamily=FONT
-    )
+    shape = "auto" if many or down else "equal"
+    axes = page.chart((0.075, 0.12, 0.75, 0.73), aspect=shape, xlabel=labels[0], ylabel=labels[1])
     norm = Normalize(0, max(float(times.max()), 1e-3))
     size = (10 if many else 2) * page.unit**2
     axes.scatter(across, up, s=size, c=mapped(COLOURS, norm(times)), linewidths=0)

@@ -61,41 +61,23 @@ def fit_camera(
     azimuth_deg: float,
     elevation_deg: float,
 ) -> Camera:
-    """Place a camera so that points fill a frame within its image.
+    """Place a camera so that points (n, 3), not all in one place, fill a frame within its image.
 
-    The eye stands on the given side of the points, at 7 times their radius, which keeps
-    uprights upright; focal length and image centre are then chosen so that the
-    projected points touch the frame.
-
-    Parameters
-    ----------
-    points
-        (n, 3), not all in one place.
-    size
-        Width and height of the image in pixels.
-    frame
-        Left, top, right and bottom of the frame, as fractions of the image.
-    azimuth_deg, elevation_deg
-        Where the eye is, seen from the points.
+    Seen from the points, the eye is in the given direction, at 7 times their radius, which keeps
+    uprights upright; focal length and image centre are then chosen so that the projected points
+    touch the frame: left, top, right and bottom as fractions of the image.
     """
     corners = np.asarray(points, dtype=np.float64)
     low, high = corners.min(axis=0), corners.max(axis=0)
     azimuth, elevation = np.radians([azimuth_deg, elevation_deg])
-    back = np.array(
-        [
-            np.cos(azimuth) * np.cos(elevation),
-            np.sin(azimuth) * np.cos(elevation),
-            np.sin(elevation),
-        ]
-    )
-    right = np.array([-np.sin(azimuth), np.cos(azimuth), 0.0])
+    ahead = np.array([np.cos(azimuth), np.sin(azimuth), 0.0])
+    back = ahead * np.cos(elevation) + np.array([0.0, 0.0, np.sin(elevation)])
+    right = np.array([-ahead[1], ahead[0], 0.0])
     axes = np.stack([right, np.cross(back, right), -back])
     eye = (low + high) / 2 + back * 7.0 * np.linalg.norm(high - low) / 2
     flat, _ = Camera(eye, axes, 1.0, np.zeros(2), size).project(corners)
     least, most = flat.min(axis=0), flat.max(axis=0)
-    inner = np.array(
-        [(frame[2] - frame[0]) * size[0], (frame[3] - frame[1]) * size[1]], dtype=np.float64
-    )
-    middle = np.array([(frame[0] + frame[2]) * size[0], (frame[1] + frame[3]) * size[1]]) / 2
-    focal = float((inner / (most - least)).min())
+    start, end = np.array(frame).reshape(2, 2)
+    middle = (start + end) * size / 2
+    focal = float(((end - start) * size / (most - least)).min())
     return Camera(eye, axes, focal, middle - focal * (least + most) / 2, size)

@@ -1,9 +1,9 @@
-"""The part of a scene around a trajectory, which would be too small in a picture of a city."""
+"""What part of a scene to show: around a trajectory, and under a roof."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from raybeam import RayCaster
 
 from ..scene.scene import Scene
+from .surface import spiral, triangle_areas
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -20,7 +21,6 @@ Ints = NDArray[np.int64]
 _SHARE, _HEIGHTS, _LEAST_M = 0.35, 2.0, 25.0
 _MOST = 0.5  # share of the scene's ground from which all of it is shown
 
-CUT = 0.5  # cut under a roof, as a share of the height up to it
 _ROOFED = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
 _STEEP_DEG, _RAYS = 60.0, 64
 _TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
@@ -28,14 +28,9 @@ _PLACES = 8  # that are asked
 
 
 def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
-    """Box (2, 3) around trajectories, down to the ground; None if it is most of the scene.
+    """Box (2, 3) around trajectories (k, 3), down to the ground; None if it is most of the scene.
 
-    Parameters
-    ----------
-    bounds
-        Box (2, 3) of the scene, metres.
-    ways
-        (k, 3) each, metres.
+    `bounds` (2, 3) are those of the scene; all in metres.
     """
     if not ways:
         return None
@@ -49,66 +44,68 @@ def around_ways(bounds: Floats, ways: Sequence[Floats]) -> Floats | None:
     return box if ground < _MOST * whole else None
 
 
-def floor_and_roof(scene: Scene, places: Floats) -> tuple[float | None, float | None]:
-    """Heights of the floor under places (p, 3) and of the roof over them, metres.
+def floor_and_cut(
+    scene: Scene, caster: RayCaster, places: Floats
+) -> tuple[float | None, float | None]:
+    """Height of the floor under places (p, 3); and where to cut the scene open, metres.
 
-    None if there is none: under the sky, or over an abyss.
+    That is halfway up to the roof, None under the sky. There is no floor over an abyss.
     """
     some = places[np.linspace(0, len(places) - 1, min(len(places), _PLACES)).astype(int)]
-    caster = RayCaster(scene.vertices, scene.faces)
     floor = some[:, 2] - caster.cast(some, np.tile([0.0, 0.0, -1.0], (len(some), 1))).distance
-    up = np.sin(np.radians(np.linspace(_STEEP_DEG, 90, _RAYS)))
-    turn = np.pi * (3 - 5**0.5) * np.arange(_RAYS)  # the golden angle
-    level = np.sqrt(1 - up * up)
-    rays = np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
+    rays = spiral(_RAYS, np.sin(np.radians(_STEEP_DEG)))
     near = _TOUCHES * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     found = caster.cast(np.repeat(some, _RAYS, axis=0), np.tile(rays, (len(some), 1)), t_min=near)
-    heights = (some[:, 2, None] + found.distance.reshape(-1, _RAYS) * up).ravel()
+    heights = (some[:, 2, None] + found.distance.reshape(-1, _RAYS) * rays[:, 2]).ravel()
     met = np.isfinite(heights)
-    roof = float(np.median(heights[met])) if met.mean() >= _ROOFED else None
-    return (float(floor.min()) if np.isfinite(floor).all() else None), roof
+    cut = None
+    if met.mean() >= _ROOFED:
+        cut = float(places[:, 2].max() + np.median(heights[met])) / 2
+    return (float(floor.min()) if np.isfinite(floor).all() else None), cut
 
 
-def cut_out(scene: Scene, box: Floats) -> tuple[Scene, Ints, Floats]:
-    """Cut a box (2, 3) out of a scene.
+@dataclass(frozen=True, eq=False)
+class Part:
+    """A part of a scene."""
 
-    Objects narrower than the box are included if their middle is inside; wider ones, such as the
-    ground, are cut at its sides. All are cut at its top, because towers would hide the trajectory.
-    Objects keep their numbers, also if nothing of them is left.
+    scene: Scene
+    parents: Ints  # (f,) the whole scene's triangle of each triangle
+    shares: Floats  # (f,) its share of that triangle's area
 
-    Returns
-    -------
-    scene
-        The part; the scene itself if there is nothing in the box.
-    parents
-        (f,): the scene's triangle of each triangle.
-    shares
-        (f,): its share of that triangle's area.
-    """
-    boxes = scene.object_bounds[:, :, :2]
-    middle = boxes.mean(axis=1)
-    narrow = ((boxes[:, 1] - boxes[:, 0]) <= (box[1] - box[0])[:2]).all(axis=1)
-    inside = ((middle >= box[0, :2]) & (middle <= box[1, :2])).all(axis=1)
-    whole = np.flatnonzero((narrow & inside)[scene.face_object])
-    vertices, parents = scene.vertices, np.flatnonzero(~narrow[scene.face_object])
-    faces = scene.faces[parents].astype(np.int64)
-    for axis in (0, 1):
-        for sign, limit in ((1.0, box[1, axis]), (-1.0, box[0, axis])):
-            vertices, faces, parents = _clipped(vertices, faces, parents, axis, sign, limit)
-    faces, parents = np.concatenate([scene.faces[whole], faces]), np.append(whole, parents)
-    vertices, faces, parents = _clipped(vertices, faces, parents, 2, 1.0, box[1, 2])
-    if not len(faces):
-        return scene, np.arange(len(scene.faces)), np.ones(len(scene.faces))
-    part = replace(
-        scene,
-        vertices=vertices,
-        faces=faces.astype(np.int32),
-        face_object=scene.face_object[parents],
-        actors=(),
-    )
-    was = _areas(scene.vertices, scene.faces[parents])
-    shares = np.divide(_areas(vertices, faces), was, out=np.ones(len(was)), where=was > 0)
-    return part, parents, shares
+    @classmethod
+    def whole(cls, scene: Scene) -> Part:
+        """All of a scene."""
+        return cls(scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)))
+
+    def cut(self, box: Floats) -> Part:
+        """Cut a box (2, 3) out; all if there is nothing in it.
+
+        Objects narrower than the box are included if their middle is inside; wider ones, such as
+        the ground, are cut at its sides. All are cut at its top, because towers would hide the
+        trajectory. Objects keep their numbers, also if nothing of them is left.
+        """
+        scene = self.scene
+        boxes = scene.object_bounds[:, :, :2]
+        middle = boxes.mean(axis=1)
+        narrow = ((boxes[:, 1] - boxes[:, 0]) <= (box[1] - box[0])[:2]).all(axis=1)
+        inside = ((middle >= box[0, :2]) & (middle <= box[1, :2])).all(axis=1)
+        whole = np.flatnonzero((narrow & inside)[scene.face_object])
+        vertices, own = scene.vertices, np.flatnonzero(~narrow[scene.face_object])
+        faces = scene.faces[own].astype(np.int64)
+        for axis in (0, 1):
+            for sign, limit in ((1.0, box[1, axis]), (-1.0, box[0, axis])):
+                vertices, faces, own = _clipped(vertices, faces, own, axis, sign, limit)
+        faces, own = np.concatenate([scene.faces[whole], faces]), np.append(whole, own)
+        vertices, faces, own = _clipped(vertices, faces, own, 2, 1.0, box[1, 2])
+        if not len(faces):
+            return self
+        owners = scene.face_object[own]
+        part = Scene(vertices, faces.astype(np.int32), owners, scene.names, scene.origin)
+        was = triangle_areas(scene.vertices[scene.faces[own]])
+        shares = np.divide(
+            triangle_areas(vertices[faces]), was, out=np.ones(len(was)), where=was > 0
+        )
+        return Part(part, self.parents[own], self.shares[own] * shares)
 
 
 def _clipped(
@@ -139,8 +136,3 @@ def _clipped(
         kept += [np.stack(piece, axis=1) for piece in pieces]
         origins += [parents[rows]] * len(pieces)
     return vertices, np.concatenate(kept), np.concatenate(origins)
-
-
-def _areas(vertices: Floats, faces: NDArray[np.integer]) -> Floats:
-    a, b, c = (vertices[faces[:, k]] for k in range(3))
-    return np.asarray(np.linalg.norm(np.cross(b - a, c - a), axis=1))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -24,50 +24,26 @@ _TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 @dataclass(frozen=True, eq=False)
 class Colouring:
-    """Colours of points, and a legend: a scale between two limits, or labels.
+    """How points are coloured, and a legend: a scale between two limits, or labels."""
 
-    Parameters
-    ----------
-    colours
-        float64 (n, 3) in 0 to 1.
-    name, unit, meaning
-        Of the column; the unit is that of `limits`.
-    limits
-        Lowest and highest value on the scale, whose colours are `TURBO`; None for labels.
-    logarithmic
-        Whether the scale is.
-    labels
-        (name, colour): existing labels, those with most points first if there are many.
-    values
-        Values of the column that the labels stand for.
-    paint
-        Returns colours (m, 3) of other values (m,) of the column on the same scale.
-    """
-
-    colours: NDArray[np.float64]
-    name: str
-    unit: str
+    # Returns colours (n, 3) in 0 to 1 of values (n,).
+    paint: Callable[[NDArray[Any]], NDArray[np.float64]]
+    name: str  # of the column
+    unit: str  # of the limits
     meaning: str
-    limits: tuple[float, float] | None = None
+    limits: tuple[float, float] | None = None  # ends of the scale of `TURBO`; None for labels
     logarithmic: bool = False
+    # Name and colour of existing labels, those with most points first if there are many.
     labels: tuple[tuple[str, NDArray[np.float64]], ...] = ()
-    values: tuple[int, ...] = ()
-    paint: Callable[[NDArray[Any]], NDArray[np.float64]] = field(
-        default=lambda values: np.full((len(values), 3), _GREY), repr=False
-    )
+    values: tuple[int, ...] = ()  # of the column, that the labels stand for
 
 
 def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
-    """Colour points by the values (n,) of a column.
+    """Choose colours for the values (n,) of a column; `names` are those of its values 0, 1, 2, ….
 
     Labels have a colour each; labels without names and with too many values for a legend are on a
     scale like numbers. Numbers that are mostly small with a few large ones, such as intensities,
     have a logarithmic scale. NaN is grey.
-
-    Parameters
-    ----------
-    names
-        Names of the values 0, 1, 2, … of a label.
     """
     spread = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
@@ -87,10 +63,8 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
             def label(values: NDArray[Any]) -> NDArray[np.float64]:
                 return np.asarray(palette[values.astype(np.int64) % len(palette)])
 
-            return Colouring(
-                label(values), column.name, "", column.meaning, labels=labels,
-                values=tuple(found.tolist()), paint=label,
-            )  # fmt: skip
+            kept = tuple(found.tolist())
+            return Colouring(label, column.name, "", column.meaning, labels=labels, values=kept)
         spread = (0, 100)
     known, unit, size = np.isfinite(values), column.unit, 1.0
     middle, low, high = 0.5, 0.0, 1.0
@@ -114,6 +88,4 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
         return colours
 
     limits = float(low), float(high)
-    return Colouring(
-        shade(values), column.name, unit, column.meaning, limits, logarithmic, paint=shade
-    )
+    return Colouring(shade, column.name, unit, column.meaning, limits, logarithmic)

@@ -11,9 +11,11 @@ from numpy.typing import NDArray
 
 from ..scene.scene import Scene
 from .colouring import TURBO
+from .surface import triangle_areas
 from .theme import UNSEEN, rgb
 
 Floats = NDArray[np.float64]
+Reals = NDArray[np.float32]
 
 _LEVELS = 24  # of a grid whose cells are half as wide each time
 _ENOUGH = 12  # hits from which a density is estimated; points in a cell of the grid
@@ -22,12 +24,8 @@ _WIDEST_RANGE = 300.0  # densest to sparsest colour
 
 
 def hit_colours(
-    scene: Scene,
-    corners: NDArray[np.float32],
-    hits: Floats,
-    points: NDArray[np.float32],
-    most: int,
-) -> tuple[NDArray[np.float32], NDArray[np.int64], Floats, tuple[float, float]]:
+    scene: Scene, corners: Reals, hits: Floats, points: Reals, most: int
+) -> tuple[Reals, NDArray[np.int64], Floats, tuple[float, float]]:
     """Colour triangles by hits per square metre, large ones with many hits in pieces.
 
     Large triangles have the density of a grid of points, the finest with enough of them around;
@@ -35,12 +33,8 @@ def hit_colours(
 
     Parameters
     ----------
-    scene
-        Scene of the triangles.
-    corners
-        (f, 3, 3): the drawn triangles, metres.
-    hits
-        (f,): hits of each.
+    corners, hits
+        (f, 3, 3), metres, and (f,): the drawn triangles of the scene, and the hits of each.
     points
         (n, 3): an evenly spaced sample of hit points; it may lack those of some places.
     most
@@ -73,25 +67,19 @@ def hit_colours(
         means = np.bincount(corner, room * density[read].ravel()) / np.bincount(corner, room)
         density[read] = means[corner].reshape(-1, 3)
     # Where points were counted, none are grey; elsewhere the hits are known.
-    colours = _density_colours(density, (~read & (hits[owner] > 0))[:, None], limits, TURBO)
+    colours = _density_colours(density, (~read & (hits[owner] > 0))[:, None], limits)
     return pieces, owner, colours, limits
 
 
 def hit_density(scene: Scene, hit_counts: NDArray[Any]) -> Floats:
-    """Hits per square metre at each triangle, (f,).
+    """Hits per square metre at each triangle, (f,), from the hits of each, (f,).
 
     If triangles are so small that most have one hit or none, hits are shared with neighbours:
     each triangle gives a third to each of its corners, each corner returns them by area, until a
     density is estimated from a dozen hits. The total stays the same.
-
-    Parameters
-    ----------
-    hit_counts
-        (f,) hits of each triangle.
     """
     hits = hit_counts.astype(np.float64)
-    a, b, c = (scene.vertices[scene.faces[:, k]] for k in range(3))
-    area = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 2
+    area = triangle_areas(scene.vertices[scene.faces])
     for _ in range(_rounds(hits)):
         hits = _share(scene.faces, hits, area, len(scene.vertices))
     return np.divide(hits, area, out=np.zeros_like(hits), where=area > 0)
@@ -136,35 +124,27 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
 
 
 def _density_colours(
-    density: Floats, hit: NDArray[np.bool_], limits: tuple[float, float], table: Floats
+    density: Floats, hit: NDArray[np.bool_], limits: tuple[float, float]
 ) -> Floats:
     """Colours (..., 3) by density and whether there were hits, both (...,).
 
     Shared hits fade out to grey; triangles that were hit themselves are never grey.
-
-    Parameters
-    ----------
-    limits, table
-        Ends of the logarithmic scale, and its colours (256, 3).
     """
     low, high = limits
     share = np.log(np.maximum(density, low) / low) / np.log(high / low)
-    colours = table[np.clip(share * 255, 0, 255).astype(np.int64)]
+    colours = TURBO[np.clip(share * 255, 0, 255).astype(np.int64)]
     seen = np.where(hit, 1.0, np.clip(density / low / 0.6 - 0.3, 0, 1))[..., None]
     return np.asarray(rgb(UNSEEN) * (1 - seen) + colours * seen)
 
 
 def _divided(
-    pieces: NDArray[np.float32],
-    hit: NDArray[np.bool_],
-    points: NDArray[np.float32],
-    most: int,
-) -> tuple[NDArray[np.float32], NDArray[np.int64], Floats, Floats]:
+    pieces: Reals, hit: NDArray[np.bool_], points: Reals, most: int
+) -> tuple[Reals, NDArray[np.int64], Floats, Floats]:
     """Divide triangles that were hit (f,), for as long as there are points enough around.
 
     Returns pieces, owners and areas, and points per square metre, NaN for whole triangles.
     """
-    owner, areas = np.arange(len(pieces)), _areas(pieces)
+    owner, areas = np.arange(len(pieces)), triangle_areas(pieces)
     found, busy = np.full(len(pieces), np.nan), hit & bool(len(points))
     if not busy.any():
         return pieces, owner, areas, found
@@ -201,13 +181,7 @@ def _divided(
 class _Grid:
     """Sums of weights (n,) of places (n, 3) in the cells of a grid."""
 
-    def __init__(
-        self,
-        places: NDArray[np.float32],
-        weights: Floats,
-        width: float,
-        low: NDArray[np.float32],
-    ) -> None:
+    def __init__(self, places: Reals, weights: Floats, width: float, low: Reals) -> None:
         self._width, self._low = width, low
         cells = np.floor((places - low) / width).astype(np.int64)
         self._keys, cells = np.unique(_keys(cells), return_inverse=True)
@@ -243,8 +217,3 @@ def _halved(pieces: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[n
     a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))
     middle = (a + b) / 2
     return np.stack([a, middle, c], axis=1), np.stack([middle, b, c], axis=1)
-
-
-def _areas(pieces: NDArray[np.float32]) -> Floats:
-    sides = pieces[:, 1:] - pieces[:, :1]
-    return np.asarray(np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1) / 2, np.float64)

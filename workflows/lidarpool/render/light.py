@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from .camera import Camera
 from .cutaway import Cutaway, blocked
-from .surface import Surface, dot
+from .surface import Surface, dot, spiral
 
 Floats = NDArray[np.float64]
 Reals = NDArray[np.float32]
@@ -39,14 +39,8 @@ class LightMap:
     ) -> Reals:
         """Brightness (n,) of points: Lambert's law for the sun, and the open part of the sky.
 
-        Parameters
-        ----------
-        pixels
-            (n, 2) where the points are in the picture.
-        position, normal
-            (n, 3).
-        ground
-            bool (n,): whether they are on the ground, whose open parts keep their colour.
+        `pixels` (n, 2) are where points (n, 3) are in the picture, and `ground` (n,) whether they
+        are on the ground, whose open parts keep their colour.
         """
         openness = self._openness_at(pixels, position, normal)
         facing = np.clip(normal @ self.sun.astype(np.float32), 0, None)
@@ -111,16 +105,8 @@ def make_light_map(
     """Cast rays from a grid of surface points to lights all over the sky, many of them the sun.
 
     The same lights for all points: steps in brightness are invisible, while random directions
-    would need smoothing.
-
-    Parameters
-    ----------
-    cutaway
-        Removed surfaces, which cast no shadow.
-    position, normal
-        (rows, columns, 3); NaN where there is no surface.
-    reach
-        Surfaces farther than this, in metres, cast no shadow.
+    would need smoothing. Positions and normals are (rows, columns, 3), NaN without a surface.
+    Surfaces that the cutaway removes cast no shadow, nor do those farther than `reach`, metres.
     """
     sun = _sun_direction(camera)
     there = np.isfinite(position[..., 0])
@@ -149,10 +135,6 @@ def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
 
     The strengths (k,) of sky and sun together are 1 on level ground; turns (k,) in radians.
     """
-    n = np.arange(SKY_LIGHTS)
-    turn, up = 2 * np.pi * 0.6180339887 * n, (n + 0.5) / SKY_LIGHTS
-    level = np.sqrt(1 - up * up)
-    sky = np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
     n = np.arange(SUN_LIGHTS)
     turn, radius = 2 * np.pi * 0.6180339887 * n, SUN_RADIUS * np.sqrt((n + 0.5) / SUN_LIGHTS)
     side = np.cross(sun, [0.0, 0.0, 1.0])
@@ -162,4 +144,8 @@ def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
     strengths = np.repeat(
         [2 * (1 - SUN_SHARE) / SKY_LIGHTS, SUN_SHARE / sun[2] / SUN_LIGHTS], counts
     )
-    return np.concatenate([sky, sun + radius[:, None] * disc]), strengths, np.repeat(TURNS, counts)
+    return (
+        np.concatenate([spiral(SKY_LIGHTS), sun + radius[:, None] * disc]),
+        strengths,
+        np.repeat(TURNS, counts),
+    )

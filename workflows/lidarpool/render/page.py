@@ -102,15 +102,14 @@ class Page:
             widest = max((len(text) for text in axis.labels), default=0)
             away = (clear + TITLE + LETTER * widest * abs(outward[0])) * self.unit
             place = ends.mean(axis=0) + away * outward
-            self._text(axes, place, axis.title, 7.2, theme.INK, 90.0 if k == 2 else angle)
+            self._text(axes, place, axis.title, 7.2, theme.INK, rotation=90.0 if k == 2 else angle)
 
     def _text(
-        self, axes: Axes, place: Floats, text: str, size: float, colour: Any, angle: float = 0.0
+        self, on: Axes | Figure, place: Any, text: str, size: float, colour: str, **more: Any
     ) -> None:
-        axes.text(
-            float(place[0]), float(place[1]), text, rotation=angle, ha="center", va="center",
-            fontsize=size * self.unit, color=colour, family=FONT,
-        )  # fmt: skip
+        style = {"ha": "center", "va": "center", "color": colour, "family": FONT} | more
+        made = on.text(float(place[0]), float(place[1]), text, fontsize=size * self.unit, **style)
+        made.set_parse_math(False)  # names come from files
 
     def _sensors(self, axes: Axes, shot: Shot) -> None:
         """Mark the sensors, hollow if hidden, each on a stem."""
@@ -122,17 +121,16 @@ class Page:
                 solid_capstyle="round",
             )  # fmt: skip
             self.lines(axes, shot, np.stack([some[:-1], some[1:]], axis=1), 1.8, 0.9)
-        poses = shot.sensors
-        many = len(poses) > MANY_POSES
+        poses, many = shot.sensors, len(shot.sensors) > MANY_POSES
         pixels, seen = shot.visible(poses)
         if not many:
             feet = np.column_stack([poses[:, :2], np.full(len(poses), shot.stage.level)])
             self.lines(axes, shot, np.stack([poses, feet], axis=1), 0.8, 0.7)
+        size, edge_width = (5, 0.2) if many else (20, 0.7)
         for which, face, edge in ((seen, theme.SENSOR, theme.PAGE), (~seen, "none", theme.SENSOR)):
             axes.scatter(
-                pixels[which, 0], pixels[which, 1], s=(5 if many else 20) * self.unit**2,
-                facecolors=face, edgecolors=edge, linewidths=(0.2 if many else 0.7) * self.unit,
-                zorder=5,
+                pixels[which, 0], pixels[which, 1], s=size * self.unit**2, facecolors=face,
+                edgecolors=edge, linewidths=edge_width * self.unit, zorder=5,
             )  # fmt: skip
 
     def _actors(self, axes: Axes, shot: Shot) -> None:
@@ -156,12 +154,9 @@ class Page:
                 *np.stack([pixel, place]).T, color=colour, lw=0.7 * self.unit, zorder=6,
                 path_effects=halo,
             )  # fmt: skip
-            text = axes.text(
-                float(place[0]), float(place[1]), shortened(name), ha="center", va="bottom",
-                color=theme.INK if seen[k] else theme.MUTED, family=FONT,
-                fontsize=6.6 * self.unit, path_effects=halo, zorder=7,
-            )  # fmt: skip
-            text.set_parse_math(False)  # names come from files
+            ink = theme.INK if seen[k] else theme.MUTED
+            style = {"va": "bottom", "path_effects": halo, "zorder": 7}
+            self._text(axes, place, shortened(name), 6.6, ink, **style)
 
     def numbers(self, axes: Axes, shot: Shot) -> None:
         """Write numbers from 1 on the sensors' markers; on white for those that are hidden."""
@@ -173,10 +168,8 @@ class Page:
                 [x], [y], s=62 * self.unit**2, facecolors=face, edgecolors=ink,
                 linewidths=0.7 * self.unit, zorder=above,
             )  # fmt: skip
-            axes.text(
-                x, y, str(k + 1), ha="center", va="center_baseline", color=ink, family=FONT,
-                fontsize=(5.6 if k < 99 else 4.4) * self.unit, weight="bold", zorder=above,
-            )  # fmt: skip
+            style = {"va": "center_baseline", "weight": "bold", "zorder": above}
+            self._text(axes, (x, y), str(k + 1), 5.6 if k < 99 else 4.4, ink, **style)
 
     def lines(self, axes: Axes, shot: Shot, segments: Floats, width: float, alpha: float) -> None:
         """Draw the visible parts of segments (n, 2, 3), in the sensors' colour."""
@@ -187,24 +180,33 @@ class Page:
             )
         )
 
+    def chart(self, frame: tuple[float, float, float, float], **given: Any) -> Axes:
+        """Axes with a grid in a frame: left, bottom, width and height as fractions of the page."""
+        axes, small = self.figure.add_axes(frame), 0.6 * self.unit
+        axes.set(facecolor=theme.GROUND, axisbelow=True, **given)
+        axes.grid(color=theme.LINE, lw=0.5 * self.unit)
+        axes.spines[:].set(color=theme.LINE, linewidth=small)
+        for side in (axes.xaxis, axes.yaxis):
+            side.label.set(fontsize=7.6 * self.unit, color=theme.INK, family=FONT)
+        axes.tick_params(
+            labelsize=6.8 * self.unit, labelcolor=theme.MUTED, color=theme.LINE,
+            length=2.5 * self.unit, width=small, labelfontfamily=FONT,
+        )  # fmt: skip
+        return axes
+
     def title(self, text: str, *details: str) -> None:
         """Write a title at the top left, and lines of detail under it."""
         line = 0.05 * self.size[0] / self.size[1] / 1.6
-        self.figure.text(
-            0.03, 1 - line, text, fontsize=11 * self.unit, weight="bold", color=theme.INK,
-            va="center", family=FONT,
-        )  # fmt: skip
+        place = 0.03, 1 - line
+        self._text(self.figure, place, text, 11, theme.INK, ha="left", weight="bold")
         for number, detail in enumerate(details):
-            text_ = self.figure.text(
-                0.03, 1 - (1.84 + 0.62 * number) * line, detail, fontsize=7.2 * self.unit,
-                color=theme.MUTED, va="center", family=FONT,
-            )  # fmt: skip
-            text_.set_parse_math(False)  # names come from files
+            place = 0.03, 1 - (1.84 + 0.62 * number) * line
+            self._text(self.figure, place, detail, 7.2, theme.MUTED, ha="left")
 
-    def legend(self, entries: Sequence[tuple[str, Any]]) -> None:
+    def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
         """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
         rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
-        rows.append(("o", "Sensor", theme.SENSOR))
+        rows.append(("o", sensor, theme.SENSOR))
         if len(entries) > LEGEND_ROWS:
             rows.append(("", f"and {len(entries) - LEGEND_ROWS:,} more", theme.MUTED))
         size = min(7.4, 175 / len(rows))

@@ -48,30 +48,24 @@ def draw_scene(shot: Shot, triangles: int) -> Page:
 
 
 def draw_intensity(
-    shot: Shot,
-    hit_counts: NDArray[Any],
-    points: Floats,
-    sample_rays: NDArray[np.floating],
-    count: int,
+    shot: Shot, hit_counts: NDArray[Any], points: Floats, sample_rays: NDArray[np.floating]
 ) -> Page:
     """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
 
     Parameters
     ----------
     hit_counts
-        (f,) hits of each triangle that is drawn.
+        (f,) hits of each triangle of the scene.
     points
-        (n, 3) an evenly spaced sample of the hits, metres, local coordinates; it may lack some.
+        (n, 3) an evenly spaced sample of the hits, local metres; it may lack some.
     sample_rays
-        (n, 2, 3) start and end of rays, metres, local coordinates; some of those that end in the
-        picture are drawn.
-    count
-        Number of all hits.
+        (n, 2, 3) ends of rays, local metres; some of those that end in the picture are drawn.
     """
+    hits = hit_counts[shot.part.parents] * shot.part.shares
     corners = shot.scene.vertices[shot.scene.faces].astype(np.float32)
     some = points[:: -(-len(points) // MOST_HITS) or 1].astype(np.float32)
     most = MOST_PIECES + len(corners)
-    pieces, owner, colours, limits = hit_colours(shot.scene, corners, hit_counts, some, most)
+    pieces, owner, colours, limits = hit_colours(shot.scene, corners, hits, some, most)
     page = Page(shot.camera.size)
     axes = page.show(shot, shot.divided(pieces, owner).paint(colours, 0.5))
     slack, (lowest, highest) = 1e-3 * shot.stage.size, shot.stage.bounds
@@ -82,36 +76,28 @@ def draw_intensity(
     rays = np.linspace(0, len(sample_rays) - 1, most).astype(int)
     page.lines(axes, shot, sample_rays[rays].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(*limits), "hits per square metre; grey: none")
-    page.title("Ray intensity", f"{counted(count, 'hit')} · {shot.when}", shot.models)
+    page.title(
+        "Ray intensity", f"{counted(int(hit_counts.sum()), 'hit')} · {shot.when}", shot.models
+    )
     return page
 
 
 def draw_cloud(
-    shot: Shot,
-    cloud: Cloud,
-    count: int,
-    column: Column = Z,
-    names: Sequence[str] = (),
+    shot: Shot, cloud: Cloud, count: int, column: Column = Z, names: Sequence[str] = ()
 ) -> Page:
     """Draw points of a cloud coloured by a column, over the scene drawn pale.
 
-    Parameters
-    ----------
-    cloud
-        The points; hidden ones are left out.
-    count
-        Number of points of the whole cloud, of which these are a sample.
-    column
-        Column to colour them by.
-    names
-        Names of its values 0, 1, 2, …, if it is a label.
+    They are a sample of `count` points; hidden ones are left out. `names` are those of the values
+    0, 1, 2, … of the column, if it is a label.
     """
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
     if len(cloud):
         values = cloud.positions[:, 2] if column is Z else cloud[column.name]
         coloured = colours_of(values, column, names)
-        image = with_points(image, shot, cloud.positions - shot.scene.origin, coloured.colours)
+        image = with_points(
+            image, shot, cloud.positions - shot.scene.origin, coloured.paint(values)
+        )
         if coloured.limits is None:
             page.legend(coloured.labels)
         else:

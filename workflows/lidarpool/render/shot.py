@@ -16,6 +16,7 @@ from ..base.words import counted
 from ..scene.scene import Scene
 from . import theme
 from .camera import Camera, fit_camera
+from .closeup import Part, around_ways, floor_and_cut
 from .cutaway import cast_through, plan_cutaway
 from .light import STRIDE, alike, make_light_map, plane_tolerance
 from .stage import Stage
@@ -77,7 +78,8 @@ class Samples:
 class Shot:
     """A scene on its ground with sensors in it, seen by a camera."""
 
-    scene: Scene
+    part: Part
+    uncut: Scene  # what there was of the part before it was cut open
     sensors: Floats  # (p, 3) metres, local coordinates
     paths: tuple[Floats, ...]  # of moving sensors, (k, 3) each
     actors: int  # number of actors, the last objects of the scene, which are labelled
@@ -90,6 +92,11 @@ class Shot:
     finer: Samples  # several of each of these in turn
 
     @property
+    def scene(self) -> Scene:
+        """The triangles that are drawn."""
+        return self.part.scene
+
+    @property
     def depth(self) -> Reals:
         """Metres (height, width) from the eye to the surface in each pixel, infinite for none."""
         return self.whole.distance.reshape(self.camera.size[::-1])
@@ -97,12 +104,8 @@ class Shot:
     def paint(self, face_colours: Floats, contrast: float = 1.0) -> Reals:
         """Colour the shot.
 
-        Parameters
-        ----------
-        face_colours
-            (f, 3) in 0 to 1, or (f, 3, 3) at the corners.
-        contrast
-            0 for flat colours, 1 for full light and shade.
+        `face_colours` are (f, 3) in 0 to 1, or (f, 3, 3) at the corners; a `contrast` of 0 is for
+        flat colours, of 1 for full light and shade.
 
         Returns
         -------
@@ -155,17 +158,9 @@ class Shot:
     def runs(
         self, segments: Floats, seen: Callable[[Floats], tuple[Floats, Bools]]
     ) -> list[Floats]:
-        """Split line segments (n, 2, 3) into their visible pieces.
+        """Split line segments (n, 2, 3) into their visible pieces; `seen` tells whether they are.
 
-        Parameters
-        ----------
-        seen
-            `visible` or `on_ground`.
-
-        Returns
-        -------
-        list of (2, 2)
-            Pixel coordinates of the ends of each piece.
+        Returns the pixel coordinates (2, 2) of the ends of each piece.
         """
         # Steps of equal length in the picture: interpolate 1 / depth, which is linear there.
         near, far = ((segments[:, end] - self.camera.eye) @ self.camera.axes[2] for end in (0, 1))
@@ -185,6 +180,7 @@ def take_shot(
     poses: ArrayLike,
     *,
     paths: Sequence[Floats] = (),
+    around: Sequence[Floats] = (),
     actors: int = 0,
     when: str = "",
     models: str = "",
@@ -194,7 +190,8 @@ def take_shot(
     """Look at a scene from a good viewpoint.
 
     The camera looks down from the side on which the scene is wider. If the sensors stand inside a
-    building, the walls and roofs in front of them are removed.
+    building, the walls and roofs in front of them are removed; a part of a large scene is cut open
+    above them.
 
     Parameters
     ----------
@@ -204,24 +201,37 @@ def take_shot(
         (p, 3) sensor positions, world coordinates.
     paths
         Trajectories of moving sensors, (k, 3) each, local coordinates.
+    around
+        Trajectories in a scene that may be much larger: only their surroundings are shown then,
+        and the caption says so.
     actors
         How many of the last objects are actors.
-    when
-        Caption on the number of sensors and the time; by default the number.
-    models
-        What the sensors are.
-    size
-        Width and height of the picture in pixels.
-    backend
-        Ray caster, see `raybeam.RayCaster`.
+    when, models
+        Captions: the number of sensors, by default, and the time; what the sensors are.
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
-    stage = _stage(scene, np.concatenate([sensors, *paths]))
-    scene = apart(scene, scene.face_object, _APART * float(np.linalg.norm(np.ptp(scene.bounds, 0))))
     everywhere = np.concatenate([sensors, *paths])
-    surface = Surface.of(scene, backend)
+    when = when or counted(len(sensors), "sensor position")
+    box = around_ways(scene.bounds, around)
+    part = Part.whole(scene) if box is None else Part.whole(scene).cut(box)
+    bounds = part.scene.bounds
+    step = _APART * float(np.linalg.norm(np.ptp(bounds, 0)))
+    part = uncut = replace(part, scene=apart(part.scene, part.scene.face_object, step))
+    surface, cut = Surface.of(part.scene, backend), None
+    if box is not None and len(everywhere):
+        _, cut = floor_and_cut(part.scene, surface.caster, everywhere)
+    if cut is not None:
+        bounds = bounds.clip(max=[np.inf, np.inf, cut])
+        part = part.cut(bounds)
+        surface = Surface.of(part.scene, backend)
+    scene = part.scene
+    if box is not None:
+        wide, deep, _ = np.ptp(box, axis=0)
+        top = scene.origin[2] + (box[1, 2] if cut is None else cut)
+        when += f" · drawn: {wide:,.0f} × {deep:,.0f} m around what moves, below z = {top:,.0f} m"
+    stage = _stage(bounds, everywhere, scene.origin)
     # Moving objects are on the ground, between other objects.
-    camera, reach = _camera(stage, size, 48.0 if len(paths) or actors else 33.0), np.inf
+    camera, reach = _camera(stage, size, 48.0 if paths or actors else 33.0), np.inf
     cutaway = plan_cutaway(surface, everywhere, camera.eye)
     if cutaway is not None:
         # From higher up more of the floor is visible between objects.
@@ -265,19 +275,29 @@ def take_shot(
             pixels[there], samples.position[there], samples.normal[there],
             samples.triangle[there] == GROUND,
         )  # fmt: skip
-    when = when or counted(len(sensors), "sensor position")
     return Shot(
-        scene, sensors, tuple(paths), actors, when, models, stage, camera, whole, edges, finer
+        part,
+        uncut.scene,
+        sensors,
+        tuple(paths),
+        actors,
+        when,
+        models,
+        stage,
+        camera,
+        whole,
+        edges,
+        finer,
     )
 
 
-def _stage(scene: Scene, sensors: Floats) -> Stage:
-    """Choose the box to show: the scene, and the sensors that are near it."""
-    low, high = scene.bounds
+def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> Stage:
+    """Choose the box to show: that of the scene, and the sensors that are near it."""
+    low, high = bounds
     reach = 2 * max(float(np.linalg.norm(high - low)), 1e-3)
     near = sensors[((sensors > low - reach) & (sensors < high + reach)).all(axis=1)]
-    shown = np.concatenate([scene.bounds, near])
-    return Stage.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), scene.origin)
+    shown = np.concatenate([bounds, near])
+    return Stage.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), origin)
 
 
 def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera:

@@ -19,7 +19,6 @@ class Axis:
     """Ticks of one axis."""
 
     title: str  # its name, what the labels leave out, and unit
-    step: float  # from tick to tick, metres
     ticks: Floats  # (n,) local metres; round numbers in world coordinates
     labels: tuple[str, ...]  # the world coordinates, less what the title says
 
@@ -46,15 +45,7 @@ class Stage:
 
     @classmethod
     def around(cls, bounds: Floats, origin: Floats) -> Stage:
-        """Build the stage of a box.
-
-        Parameters
-        ----------
-        bounds
-            (2, 3) local metres; it may be flat or a single point.
-        origin
-            (3,) what local coordinates are added to.
-        """
+        """Build the stage of a box (2, 3), local metres, which may be flat or a single point."""
         low, high = bounds
         widest = float((high - low).max()) or 1.0
         # A flat or pointlike box gets some width, so that there is something to look at.
@@ -88,7 +79,7 @@ def make_axis(name: str, low: float, high: float, step: float, origin: float) ->
         name = f"{name} {sign} {abs(offset):,.0f}".replace(",", "\u2009")
     decimals = max(0, -math.floor(math.log10(step) + 1e-9))
     labels = tuple(f"{value + 0.0:.{decimals}f}".replace("-", "−") for value in world - offset)
-    return Axis(f"{name} (m)", step, world - origin, labels)
+    return Axis(f"{name} (m)", world - origin, labels)
 
 
 def nice_step(length: float) -> float:

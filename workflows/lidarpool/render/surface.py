@@ -46,14 +46,7 @@ class Surface:
         """Shading normals (n, 3) at hits, on the side of the ray.
 
         Interpolated from the corners (Phong 1975), except across creases, where the face's normal
-        replaces a corner's.
-
-        Parameters
-        ----------
-        triangle, u, v
-            (n,) from the ray caster.
-        towards
-            (n, 3) directions of the rays.
+        replaces a corner's. `towards` (n, 3) are the directions of the rays.
         """
         flat = self.face_normals[triangle]
         corners = self.scene.faces[triangle]
@@ -108,6 +101,21 @@ def _places(scene: Scene, objects: NDArray[np.integer[Any]]) -> Ints:
 def dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
     """Scalar products (...,) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
+
+
+def triangle_areas(corners: NDArray[np.floating]) -> Floats:
+    """Areas (n,) of triangles with these corners (n, 3, 3)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return np.asarray(doubled / 2, np.float64)
+
+
+def spiral(count: int, lowest: float = 0.0) -> Floats:
+    """Spread unit vectors (count, 3) over the sphere above a height: a golden spiral."""
+    n = np.arange(count)
+    turn, up = 2 * np.pi * 0.6180339887 * n, lowest + (1 - lowest) * (n + 0.5) / count
+    level = np.sqrt(1 - up * up)
+    return np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
 
 
 def unit(vectors: Floats) -> Floats:

@@ -17,23 +17,8 @@ _ENOUGH = 12  # points in a cell from which a density is estimated
 class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
 
-    Parameters
-    ----------
-    cloud
-        The points, in world coordinates.
-    objects
-        How many objects there are.
-
-    Attributes
-    ----------
-    by_object : int64 (objects,)
-        Points of each.
-    limits : dict
-        {column: minimum and maximum}; empty without points.
-    bounds : float64 (2, 3)
-        Lowest and highest coordinates in the world.
-    density : float or None
-        Of what was read: points per square metre, the median over the surfaces.
+    `by_object` are the points of each object, `limits` are {column: minimum and maximum}, and
+    `bounds` (2, 3) the lowest and highest coordinates in the world.
     """
 
     def __init__(self, cloud: CloudLike, objects: int) -> None:
@@ -58,13 +43,14 @@ class CountedCloud:
                 low, high = self.limits.get(name, (np.inf, -np.inf))
                 self.limits[name] = min(low, values.min().item()), max(high, values.max().item())
             cell = ((chunk.positions - self.bounds[0]) / self._side).astype(np.int64)
-            cell = cell.clip(0, _CELLS - 1) @ [_CELLS**2, _CELLS, 1]
+            x, y, z = cell.clip(0, _CELLS - 1).T
+            cell = (x * _CELLS + y) * _CELLS + z  # a product of whole numbers by `@` is slow
             self._cells += np.bincount(cell, minlength=len(self._cells))
             yield chunk
 
     @property
     def density(self) -> float | None:
-        """Points per square metre of surface."""
+        """Points per square metre of what was read, the median over the surfaces; None without."""
         if not self._cells.any():
             return None
         cells, side = self._cells.reshape(3 * (_CELLS,)), self._side

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,6 @@ from ..base.errors import LidarpoolError, explained
 from ..base.interrupts import deferred_interrupts
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
-from ..columns.parts import StoredCloud
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -36,20 +36,11 @@ _EXPORTS = tuple(FORMATS[name].file for name in EXPORTS)
 
 
 def refuse_to_replace(
-    place: Path | Storage,
-    identity: Callable[[], Mapping[str, str]],
-    formats: Sequence[Format] = (),
+    place: Path | Storage, identity: Callable[[], Mapping[str, str]], formats: Sequence[Format] = ()
 ) -> None:
     """Refuse a folder that holds the result of another survey, or files of no result.
 
-    Parameters
-    ----------
-    place
-        Place for the new result.
-    identity
-        Returns that of this result, see `RunResult.identity`; large scenes take a moment.
-    formats
-        That the cloud will be exported to.
+    `identity` returns that of this result, see `RunResult.identity`: large scenes take a moment.
 
     Raises
     ------
@@ -109,12 +100,10 @@ def write_result(
     Where `place` is a storage, all is put into it, report.json last; `folder` is a temporary one
     then. Files of workers go there directly, and an earlier result is removed before.
 
-    Raises
-    ------
-    LidarpoolError
-        If a file cannot be written.
+    LidarpoolError if a file cannot be written.
     """
-    target = _InStorage(place) if isinstance(place, Storage) else _InFolder(folder)
+    storage = place if isinstance(place, Storage) else None
+    _, earlier = _earlier(storage or Storage.at(folder))
     points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
     cloud = CountedCloud(points, len(result.scene.all_names))
     advice = "make room or give another folder with --out"
@@ -126,10 +115,21 @@ def write_result(
         drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
         exports = [one.file for one in formats]
         files = [CLOUD, *exports, *drawn, SWEEPS_FILE, *page, REPORT]
+
+        @cache
+        def clear(storage: Storage) -> None:
+            """Remove once what an earlier result has there and this one would not replace."""
+            for name in (REPORT, PAGE, *_stale(earlier, files)):
+                storage.discard(name)
+
         sweeps.save(staged / SWEEPS_FILE)
         Format("ply").write(staged / CLOUD, cloud, sweeps)
         for one in sorted(formats, key=lambda one: one.in_pieces):
-            target.export(one, staged, points, sweeps, workers, files)
+            if storage and workers and one.in_pieces:
+                clear(storage)
+                one.put(storage, points, sweeps, workers)
+            else:
+                one.write(staged / one.file, points, sweeps, workers=None if storage else workers)
         if workers:
             result = workers.recorded(result)
         report = make_report(result, files, cloud)
@@ -138,8 +138,54 @@ def write_result(
             pictures.write_page(report, result, cloud, scenario)
         text = json.dumps(report, indent=1, allow_nan=False) + "\n"
         (staged / REPORT).write_text(text, encoding="utf-8")
-        target.publish(staged, files, then)
+        if storage is None:
+            _move(staged, folder, files, earlier, then)
+        else:
+            clear(storage)
+            for name in (*_EXPORTS, *FILES):
+                if (staged / name).exists():
+                    storage.put(staged / name, name)
+            with deferred_interrupts():
+                then()
     return report
+
+
+def _move(
+    staged: Path,
+    folder: Path,
+    files: Collection[str],
+    earlier: Collection[str],
+    then: Callable[[], object],
+) -> None:
+    """Move a whole result into place.
+
+    A folder with a report is a result: the earlier report is removed first, and the new one is
+    moved last. If the process is killed in between, --resume continues from the run's folder.
+    """
+    for name in files:
+        flush(staged / name)
+    with deferred_interrupts():
+        for name in (REPORT, PAGE):
+            (folder / name).unlink(missing_ok=True)
+        flush(folder)
+        # A path of an earlier run would look like this one's; folders are not replaced.
+        for name in _stale(earlier, files):
+            remove(folder / name)
+        for name in (*_EXPORTS, *FILES):
+            if name in files:
+                (staged / name).replace(folder / name)
+        flush(folder)
+        then()
+
+
+def _stale(earlier: Collection[str], files: Collection[str]) -> list[str]:
+    """Files that are removed before a result of `files` is put into its place.
+
+    Folders and files of formats only if they are replaced, or the earlier result lists them. If a
+    killed run has removed the earlier report, they stay.
+    """
+    exports = [name for name in _EXPORTS if name in files or name in earlier]
+    return exports + [name for name in FILES if name not in files]
 
 
 class _Pictures:
@@ -164,12 +210,12 @@ class _Pictures:
         self._thread.shutdown(cancel_futures=True)
 
     def _begun(self, name: str) -> Future[str]:
-        return self._thread.submit(self._draw, name)
+        def draw() -> str:
+            page = self._makers[name]()
+            page.save(self._staged / f"{name}.png")
+            return page.svg()
 
-    def _draw(self, name: str) -> str:
-        page = self._makers[name]()
-        page.save(self._staged / f"{name}.png")
-        return page.svg()
+        return self._thread.submit(draw)
 
     def write_page(
         self,
@@ -185,95 +231,3 @@ class _Pictures:
         self._pictured.save(self._staged / PICTURE_FILE)
         images = {name: self._drawn[name].result() for name in self._makers}
         write_page(self._staged / PAGE, report, result, cloud, images, scenario)
-
-
-class _InFolder:
-    """A folder as the place of a result."""
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        _, self._earlier = _earlier(Storage.at(folder))
-
-    def export(
-        self,
-        one: Format,
-        staged: Path,
-        points: StoredCloud,
-        sweeps: Sweeps,
-        workers: LidarWorkers | None,
-        files: Collection[str],
-    ) -> None:
-        """Write a format of the cloud into the temporary folder `staged`."""
-        one.write(staged / one.file, points, sweeps, workers=workers)
-
-    def publish(self, staged: Path, files: Collection[str], then: Callable[[], object]) -> None:
-        """Move a whole result into place.
-
-        A folder with a report is a result: the earlier report is removed first, and the new one is
-        moved last. If the process is killed in between, --resume continues from the run's folder.
-        """
-        for name in files:
-            flush(staged / name)
-        with deferred_interrupts():
-            for name in (REPORT, PAGE):
-                (self._folder / name).unlink(missing_ok=True)
-            flush(self._folder)
-            for name in (*_EXPORTS, *FILES):
-                # A path of an earlier run would look like this one's; folders are not replaced.
-                if _goes(name, self._earlier, files):
-                    remove(self._folder / name)
-                if name in files:
-                    (staged / name).replace(self._folder / name)
-            flush(self._folder)
-            then()
-
-
-class _InStorage:
-    """A storage as the place of a result."""
-
-    def __init__(self, storage: Storage) -> None:
-        self._storage, self._cleared = storage, False
-        _, self._earlier = _earlier(storage)
-
-    def export(
-        self,
-        one: Format,
-        staged: Path,
-        points: StoredCloud,
-        sweeps: Sweeps,
-        workers: LidarWorkers | None,
-        files: Collection[str],
-    ) -> None:
-        """Write a format of the cloud: directly if workers do it, else into a temporary folder."""
-        if workers is None or not one.in_pieces:
-            one.write(staged / one.file, points, sweeps)
-            return
-        self._clear(files)
-        one.put(self._storage, points, sweeps, workers)
-
-    def publish(self, staged: Path, files: Collection[str], then: Callable[[], object]) -> None:
-        """Put the files of a result into the storage, the report last."""
-        self._clear(files)
-        for name in (*_EXPORTS, *FILES):
-            if (staged / name).exists():
-                self._storage.put(staged / name, name)
-        with deferred_interrupts():
-            then()
-
-    def _clear(self, files: Collection[str]) -> None:
-        """Remove once what an earlier result has there and this one would not replace."""
-        for name in () if self._cleared else (REPORT, PAGE, *_EXPORTS, *FILES):
-            if name in (REPORT, PAGE) or _goes(name, self._earlier, files):
-                self._storage.discard(name)
-        self._cleared = True
-
-
-def _goes(name: str, earlier: Collection[str], files: Collection[str]) -> bool:
-    """Whether a file is removed before a result of these files is put into its place.
-
-    Folders and files of formats only if they are replaced, or the earlier result lists them. If a
-    killed run has removed the earlier report, they stay.
-    """
-    if name in _EXPORTS:
-        return name in files or name in earlier
-    return name not in files

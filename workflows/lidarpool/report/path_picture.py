@@ -28,30 +28,28 @@ PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#5b8fd0"
 
 
 def draw_path(
-    planning: Planning,
-    plan: Plan,
-    trials: Sequence[Floats],
-    origin: Floats,
-    size: tuple[int, int],
+    planning: Planning, plan: Plan, trials: Sequence[Floats], origin: Floats, size: tuple[int, int]
 ) -> Page:
     """Draw a plan from above: obstacles, ends, the trials' paths faint and the best one bold.
 
-    Parameters
-    ----------
-    trials
-        Corners of each trial's path, (w, 2); of more than 1000 an evenly spaced sample is drawn.
-    origin
-        x and y of the local origin: the axes have world coordinates, local + origin.
-    size
-        Width and height in pixels.
+    `trials` are the corners (w, 2) of their paths; of more than 1000 an evenly spaced sample is
+    drawn. `origin` is x and y of the local origin: the axes have world coordinates.
     """
     page = Page(size)
     unit = page.unit
     best = plan.path
     every = [np.concatenate([best[:1], trial, best[-1:]]) for trial in trials]
     others = [every[k] for k in one_of_each_part(len(every), MOST_TRIALS)]
-    axes = page.figure.add_axes(FRAME)
-    _frame(axes, page, _limits(best, others, planning, size), origin)
+    (x0, y0), (x1, y1) = _limits(best, others, planning, size).tolist()
+    axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    step = nice_step((x1 - x0) / 8)
+    for side, name, low, high, start in (
+        (axes.xaxis, "x", x0, x1, origin[0]),
+        (axes.yaxis, "y", y0, y1, origin[1]),
+    ):
+        ticks = make_axis(name, low, high, step, float(start))
+        side.set_ticks(ticks.ticks, ticks.labels)
+        side.set_label_text(ticks.title)
     circles = zip(planning.centres, planning.radii, strict=True)
     discs = PatchCollection(
         [Circle((x, y), radius) for (x, y), radius in circles],
@@ -81,11 +79,10 @@ def draw_path(
 
 def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:
     """Caption: length, shortest possible, collisions, and the other trials."""
-    length = f"length {plan.length:.2f} m"
+    shortest = "discs cut the target off"
     if math.isfinite(plan.shortest_possible) and plan.shortest_possible > 0:
-        length += f" · shortest possible {plan.shortest_possible:.2f} m ({plan.excess:+.2%})"
-    else:
-        length += " · discs cut the target off"
+        shortest = f"shortest possible {plan.shortest_possible:.2f} m ({plan.excess:+.2%})"
+    length = f"length {plan.length:.2f} m · {shortest}"
     state = "collision-free" if plan.collision_free else "enters a disc"
     best_of = f"best of {counted(plan.trials, 'trial')}"
     if len(trials) > 1:  # equal paths are hidden by the best one
@@ -106,27 +103,6 @@ def _limits(
     half = room * (width / room).max() / 2
     middle = (low + high) / 2
     return np.stack([middle - half, middle + half])
-
-
-def _frame(axes: Axes, page: Page, limits: Floats, origin: Floats) -> None:
-    """Set local limits, grid and round ticks of the world, the same on both axes."""
-    step = nice_step(float(np.ptp(limits[:, 0])) / 8)
-    (x0, y0), (x1, y1) = limits.tolist()
-    axes.set(xlim=(x0, x1), ylim=(y0, y1), facecolor=theme.GROUND, aspect="equal")
-    axes.grid(color=theme.LINE, lw=0.5 * page.unit)
-    axes.set_axisbelow(True)
-    axes.spines[:].set(color=theme.LINE, linewidth=0.6 * page.unit)
-    for side, name, low, high, start in (
-        (axes.xaxis, "x", x0, x1, origin[0]),
-        (axes.yaxis, "y", y0, y1, origin[1]),
-    ):
-        ticks = make_axis(name, low, high, step, float(start))
-        side.set_ticks(ticks.ticks, ticks.labels)
-        side.set_label_text(ticks.title, fontsize=7.6 * page.unit, color=theme.INK, family=FONT)
-    axes.tick_params(
-        labelsize=6.8 * page.unit, labelcolor=theme.MUTED, color=theme.LINE, length=2.5 * page.unit,
-        width=0.6 * page.unit, labelfontfamily=FONT,
-    )  # fmt: skip
 
 
 def _ends(axes: Axes, page: Page, planning: Planning) -> None:

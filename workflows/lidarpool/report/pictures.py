@@ -7,7 +7,6 @@ from functools import cache
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError, explained
 from ..base.vocabulary import PICTURES
@@ -15,12 +14,10 @@ from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.table import Z
-from ..render.closeup import CUT, around_ways, cut_out, floor_and_roof
 from ..render.page import Page
 from ..render.pictures import MOST_POINTS, draw_cloud, draw_intensity, draw_scene
 from ..render.shot import SIZE, Shot, take_shot
 from ..run.picture_file import Pictured, ways_of
-from ..scene.scene import Scene
 from .path_picture import draw_path
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
@@ -45,10 +42,7 @@ def draw_pictures(
     size: tuple[int, int] = SIZE,
     colour: str = Z.name,
 ) -> Iterator[Path]:
-    """Draw pictures into a folder, which is made, and return their files; see `picture_makers`.
-
-    `only` selects some by name.
-    """
+    """Draw pictures, those in `only`, into a folder, which is made; see `picture_makers`."""
     check_size(size)
     makers = picture_makers(shown, cloud, size, colour)
     for name in only:
@@ -72,53 +66,24 @@ def picture_makers(
     """Return functions that draw pictures, all from the same viewpoint.
 
     Without planning there is no picture of the path; and none of points in the axes of their
-    sensors, which do not fit the scene.
-
-    Parameters
-    ----------
-    shown
-        What to draw.
-    cloud
-        File of the cloud, read when it is drawn.
-    size
-        Width and height in pixels.
-    colour
-        Column that the cloud is coloured by.
+    sensors, which do not fit the scene. The file `cloud` is read when it is drawn, and coloured by
+    the column `colour`.
     """
     alone = shown.coordinates == "sensor"
-    middle, moving = shown.duration_ns / 2, [way for way in shown.sensors if way.moves]
-    ways = [way.positions for way in moving]
-
-    @cache
-    def part() -> tuple[Scene, NDArray[np.int64], NDArray[np.float64], str]:
-        """Cut out what is drawn; with each triangle's original and its share, and a caption."""
-        scene = shown.scene.solid(middle)
-        happening = ways_of(shown.sensors, shown.scene.actors, shown.duration_ns)
-        box = around_ways(scene.bounds, happening)
-        if box is None:
-            return scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)), ""
-        places = np.concatenate(happening)
-        _, roof = floor_and_roof(scene, places)
-        if roof is not None:
-            top = float(places[:, 2].max())
-            box[1, 2] = min(box[1, 2], top + CUT * (roof - top))
-        wide, deep, _ = box[1] - box[0]
-        top = box[1, 2] + scene.origin[2]
-        return *cut_out(scene, box), (
-            f" · drawn: {wide:,.0f} × {deep:,.0f} m around what moves, below z = {top:,.0f} m"
-        )
+    middle = shown.duration_ns / 2
 
     @cache
     def shot() -> Shot:
         # A moving sensor has a marker at half time, and a line for its trajectory.
         places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
-        scene, _, _, words = part()
+        scene = shown.scene
         return take_shot(
-            scene,
+            scene.solid(middle),
             np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
-            paths=ways,
-            actors=len(shown.scene.actors),
-            when=shown.when + words,
+            paths=[way.positions for way in shown.sensors if way.moves],
+            around=ways_of(shown.sensors, scene.actors, shown.duration_ns),
+            actors=len(scene.actors),
+            when=shown.when,
             models=shown.models,
             size=size,
         )
@@ -128,11 +93,8 @@ def picture_makers(
         return CloudFile(cloud, shown.own).choose(MOST_POINTS)
 
     def draw_hits() -> Page:
-        _, parents, shares, _ = part()
-        hits = int(shown.hit_counts.sum())
-        counts = shown.hit_counts[parents] * shares
         places = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
-        return draw_intensity(shot(), counts, places, shown.sample_rays, hits)
+        return draw_intensity(shot(), shown.hit_counts, places, shown.sample_rays)
 
     def draw_points() -> Page:
         file = CloudFile(cloud, shown.own)

@@ -15,8 +15,8 @@ import numpy as np
 from .._version import __version__
 from ..base.declared import declared
 from ..base.storage import Storage
-from ..base.task_book import StageTotals, union
 from ..pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
+from ..pipeline.task_book import StageTotals, union
 from ..plan.planning import Search
 from ..run.result import RunResult
 from ..run.trials import TRIAL
@@ -29,8 +29,8 @@ ELEVATION_RAYS = 20_000  # whose elevations are examined
 _ORDER = (GENERATE, INTERSECT, SORT, COLLECT, EXPORT, TRIAL)  # in which stages are listed
 
 _PACKAGES = (
-    "numpy", "dask", "distributed", "trimesh", "embreex", "open3d-cpu", "open3d", "matplotlib",
-    "cupy-cuda12x", "cupy-cuda13x",
+    "numpy", "dask", "distributed", "trimesh", "embreex", "numba", "open3d-cpu", "open3d",
+    "matplotlib", "cupy-cuda12x", "cupy-cuda13x",
 )  # fmt: skip
 # What `--json` prints of a report.
 _FIGURES = (
@@ -51,16 +51,16 @@ def versions() -> dict[str, str]:
     return found
 
 
-def make_report(
-    result: RunResult,
-    files: Sequence[str],
-    cloud: CountedCloud,
-) -> dict[str, Any]:
+def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) -> dict[str, Any]:
     """Report of a run, ready for JSON.
 
     Lengths are in metres, times in seconds; infinite and unknown values are None.
     """
     scene, survey = result.scene, result.survey
+    tasks: dict[str, dict[str, int]] = {}  # by the partition where they ran, and by stage
+    for stage in result.stages:
+        for name, count in stage.resources.items():
+            tasks.setdefault(name, {})[stage.stage] = count
     return {
         "versions": versions(),
         "identity": dict(result.identity),
@@ -84,7 +84,7 @@ def make_report(
             "survey_and_planning_overlap": round(overlap_seconds(result.stages), 3),
         },
         "stages": _stages(result.stages),
-        "tasks": _tasks(result.stages),
+        "tasks": tasks,
         "placement_violations": sum(stage.violations for stage in result.stages),
         "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
         "replayed": result.replayed,
@@ -95,15 +95,7 @@ def make_report(
 
 
 def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
-    """Return what `--json` prints: main figures of a report, and where the files are.
-
-    Parameters
-    ----------
-    folder
-        Where the files are.
-    report
-        See `make_report`.
-    """
+    """Return what `--json` prints: main figures of a report, and where its files are."""
     planning = report["planning"]
     return {
         "folder": str(folder),
@@ -187,15 +179,6 @@ def _stages(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
         }
         for stage in sorted(totals, key=lambda totals: _ORDER.index(totals.stage))
     }
-
-
-def _tasks(totals: Iterable[StageTotals]) -> dict[str, dict[str, int]]:
-    """Tasks by the partition where they ran, and by stage."""
-    tasks: dict[str, dict[str, int]] = {}
-    for stage in totals:
-        for name, count in stage.resources.items():
-            tasks.setdefault(name, {})[stage.stage] = count
-    return tasks
 
 
 def overlap_seconds(totals: Iterable[StageTotals]) -> float:

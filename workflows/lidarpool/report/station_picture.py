@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from matplotlib.lines import Line2D
 from numpy.typing import NDArray
 
 from ..base.words import counted
@@ -25,29 +24,16 @@ _BLOCK = 4  # pixels a side
 
 
 def draw_stations(scene: Scene, plan: StationPlan, size: tuple[int, int] = SIZE) -> Page:
-    """Draw a scene by what stations see of it: exactly, in each pixel, with shadows.
+    """Draw the scene of a plan by what its stations see: exactly, in each pixel, with shadows.
 
-    Parameters
-    ----------
-    scene
-        That of the plan; actors are left out.
-    plan
-        What was chosen.
-    size
-        Width and height in pixels.
+    Actors are left out.
     """
     shot = take_shot(replace(scene, actors=()), plan.stations, size=size)
     page = Page(size)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLOURS, 0.6))
     page.numbers(axes, shot)
     names = ("covered", "not covered", "out of sight")
-    marks = [("s", name, colour) for name, colour in zip(names, COLOURS, strict=True)]
-    marks.append(("o", "station", theme.SENSOR))
-    handles = [
-        Line2D([], [], ls="", marker=marker, color=colour, ms=6 * page.unit, mec="none", label=name)
-        for marker, name, colour in marks
-    ]
-    page.key(handles, 7.0)
+    page.legend([*zip(names, COLOURS, strict=True)], "station")
     places = counted(len(plan.candidates), "place")
     page.title(
         counted(len(plan.stations), "station").capitalize(),
@@ -59,7 +45,7 @@ def draw_stations(scene: Scene, plan: StationPlan, size: tuple[int, int] = SIZE)
 
 def _by_coverage(shot: Shot, plan: StationPlan) -> Shot:
     """Return the shot with COVERED, UNCOVERED or HIDDEN in place of triangles."""
-    sight = Sight(shot.scene, plan.sight.sensor, plan.sight.slant_deg)  # it has been moved a little
+    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)  # it has been moved a little
     stations, places = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
     width = shot.camera.size[0]
     kinds = np.full(shot.whole.triangle.size, HIDDEN)

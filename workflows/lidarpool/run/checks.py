@@ -8,7 +8,6 @@ from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
 from distributed import Client
 
 from poolpart import Pool, PoolError, WorkerInfo, ask_workers, worker_identities
@@ -18,41 +17,25 @@ from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
 from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
-from ..scene.scene import Scene
-from ..sensor import Survey
 from ..simulator.world import AUTO_TAKES
-from .waiting import Waiting
+from .job import Job
+from .watch import Waiting
 
 LOOK_EVERY_S = 0.2
-_ALL_LEFT = "The workers of partition 'GPU' left before the run started: their logs say why."
 
 
 class TooFewWorkersError(LidarpoolError):
     """A partition lacks workers or slots; more may join."""
 
 
-def slots_needed(collectors: int, planning: bool) -> dict[str, int]:
+def slots_needed(job: Job) -> dict[str, int]:
     """Slots that a run needs in each partition: {name: slots}."""
-    return {GPU: 1, LIDAR: 2 + collectors} | ({OTHER: 1} if planning else {})
-
-
-def check_precision(scene: Scene, survey: Survey) -> None:
-    """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
-    reach = float(np.abs(scene.vertices).max(initial=0.0))
-    for actor in scene.actors:
-        ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-        reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
-    if reach / survey.precision_m >= 2**31 - 1:
-        raise LidarpoolError(
-            f"precision_m {survey.precision_m} is too fine for a scene that reaches {reach:.0f} m "
-            f"from its origin: use at least {reach / 2**31:.2g}."
-        )
+    return {GPU: 1, LIDAR: 2 + job.collectors} | ({OTHER: 1} if job.planning else {})
 
 
 def find_workers(
     client: Client,
-    collectors: int,
-    planning: bool,
+    job: Job,
     wanted: str,
     advice: str = AUTO_TAKES,
     earlier: Mapping[str, str] | None = None,
@@ -60,25 +43,11 @@ def find_workers(
 ) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
     """Find all workers, the casting ones among them, their backend and their software.
 
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    collectors, planning
-        Tasks of stage 4, and whether there is planning.
-    wanted
-        Backend.
-    advice
-        End of the message if it is not available.
-    earlier
-        Software that a resumed run was cast with.
-    waiting
-        How long to wait for missing workers, or ones that just died; by default not at all.
+    `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
+    software that a resumed run was cast with. Workers that are missing or just died are waited
+    for as long as `waiting` says.
 
-    Raises
-    ------
-    LidarpoolError
-        If workers, slots or the backend are missing, or versions differ.
+    LidarpoolError if workers, slots or the backend are missing, or versions differ.
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
@@ -86,7 +55,7 @@ def find_workers(
     while True:
         looked = time.monotonic()
         try:
-            pool = _survey_pool(client, slots_needed(collectors, planning))
+            pool = _survey_pool(client, slots_needed(job))
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             backend = common_backend(client, wanted, casting, advice)
             casts = common_software(client, backend, casting, earlier or {})
@@ -137,16 +106,13 @@ def _check_versions(client: Client, workers: Sequence[str]) -> None:
                 f"The worker at {address} has Python {python}, here it is {here}: install the same "
                 "one on both sides."
             )
-
     ours = software()["lidarpool"]
-    for address, answer in ask_workers(client, software_there(), workers).items():
-        if answer == {}:
+    for address, answer in _answers(client, software_there(), workers).items():
+        if not answer:
             raise LidarpoolError(
                 f"The worker at {address} does not have lidarpool: install lidarpool "
                 f"{__version__} in the environment that dask worker is started from."
             )
-        if isinstance(answer, BaseException):
-            raise answer
         if answer["lidarpool"] != ours:
             raise LidarpoolError(
                 f"The worker at {address} has lidarpool {answer['lidarpool']}, here it is "
@@ -159,14 +125,10 @@ def common_software(
 ) -> dict[str, str]:
     """Software of the workers that cast: `earlier` if there is one, else what most of them have.
 
-    Workers with another are refused one by one when they are prepared.
-
-    Raises
-    ------
-    LidarpoolError
-        If no worker has the earlier one.
+    Workers with another are refused one by one when they are prepared. LidarpoolError if none has
+    the earlier one.
     """
-    answers = _answers(client, software_there(backend), workers)
+    answers = _casting_answers(client, software_there(backend), workers)
     if earlier and dict(earlier) not in answers.values():
         address, there = next(iter(answers.items()))
         raise LidarpoolError(
@@ -180,15 +142,23 @@ def common_software(
 
 
 def _answers(
-    client: Client, question: Callable[[], Any], workers: Sequence[WorkerInfo]
+    client: Client, question: Callable[[], Any], workers: Sequence[str]
 ) -> Mapping[str, Any]:
-    """Return what workers answer, by address; the first error of one is raised."""
-    answers = ask_workers(client, question, [worker.address for worker in workers])
+    """Return what the workers at these addresses answer; the first error of one is raised."""
+    answers = ask_workers(client, question, workers)
     for answer in answers.values():
         if isinstance(answer, BaseException):
             raise answer
-    if not answers:
-        raise TooFewWorkersError(_ALL_LEFT)
+    return answers
+
+
+def _casting_answers(
+    client: Client, question: Callable[[], Any], workers: Sequence[WorkerInfo]
+) -> Mapping[str, Any]:
+    if not (answers := _answers(client, question, [worker.address for worker in workers])):
+        raise TooFewWorkersError(
+            "The workers of partition 'GPU' left before the run started: their logs say why."
+        )
     return answers
 
 
@@ -207,14 +177,9 @@ def common_backend(
     """Name of the ray-casting backend to use on all these workers.
 
     "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on which
-    worker casts which scan. `advice` ends the message if the backend is not available.
-
-    Raises
-    ------
-    LidarpoolError
-        If a worker lacks the requested backend.
+    worker casts which scan. LidarpoolError, which ends with `advice`, if a worker lacks it.
     """
-    answers = _answers(client, available_backends, workers)
+    answers = _casting_answers(client, available_backends, workers)
     if wanted == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))

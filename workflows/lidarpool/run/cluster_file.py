@@ -38,21 +38,11 @@ class Workers(BaseModel):
 
 
 class ClusterFile(BaseModel):
-    """The cluster to start; see docs/how-to/queues.md.
-
-    Parameters
-    ----------
-    cluster
-        Class, such as ``dask_jobqueue.SLURMCluster`` or ``distributed.SSHCluster``.
-    arguments
-        Its arguments.
-    partitions
-        Workers by partition.
-    """
+    """The cluster to start; see docs/how-to/queues.md."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    cluster: str
+    cluster: str  # class, such as ``dask_jobqueue.SLURMCluster`` or ``distributed.SSHCluster``
     arguments: dict[str, Any] = {}
     partitions: dict[str, Workers]
     _source: str = PrivateAttr("cluster file")
@@ -61,11 +51,8 @@ class ClusterFile(BaseModel):
     def load(cls, path: Path) -> ClusterFile:
         """Read a file and import what it names; nothing is started.
 
-        Raises
-        ------
-        LidarpoolError
-            If it cannot be read, a field is wrong, a package is missing, or the class is not a
-            cluster.
+        LidarpoolError if it cannot be read, a field is wrong, a package is missing, or the class is
+        not a cluster.
         """
         content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
         try:
@@ -106,15 +93,8 @@ class ClusterFile(BaseModel):
     def started(self, tell: Callable[[str], object]) -> Iterator[SpecCluster]:
         """Cluster with these workers, which are there or in a queue, as long as the body runs.
 
-        Parameters
-        ----------
-        tell
-            Called with what goes wrong with workers meanwhile.
-
-        Raises
-        ------
-        LidarpoolError
-            If it does not start, or does not take an argument.
+        `tell` is called with what goes wrong with workers meanwhile. LidarpoolError if it does not
+        start, or does not take an argument.
         """
         arguments = dict(self.arguments)
         partitions = {

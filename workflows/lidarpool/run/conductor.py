@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from functools import partial
 from pathlib import Path
-from typing import Any, Protocol
 
 from distributed import Client
 
@@ -19,11 +18,11 @@ from .ranges import LidarWorkers
 from .result import RunResult
 from .run import Run, make_result
 from .store import RunStore
-from .waiting import Waiting
+from .watch import Waiting
 
 
-class Page(Protocol):
-    """What a run tells its live page, see `lidarpool.live.run_page`."""
+class Page:
+    """What a run tells its live page, see `lidarpool.live.run_page`; here of one without a page."""
 
     def follow(self, store: RunStore) -> None:
         """Show what is committed from now on."""
@@ -43,15 +42,6 @@ class Page(Protocol):
         """Keep the page until its user ends it; points are read from the written `cloud`."""
 
 
-class NoPage(Page):
-    """Stands for the live page of a run that has none."""
-
-    def _ignore(self, *_: Any, **__: Any) -> None:
-        pass
-
-    follow = finish = stay = _ignore
-
-
 @contextmanager
 def conducted(
     store: RunStore,
@@ -66,24 +56,14 @@ def conducted(
 ) -> Iterator[tuple[RunResult, LidarWorkers | None]]:
     """Do what is left of a run; the body gets its result.
 
+    `cluster` starts a cluster or connects to one, if anything is left to do; it shares its time to
+    wait with the workers. `own` says that it is a local one for this run: then the backend must be
+    available here, and there is no page of partitions. With `keep` the cluster lasts as long as the
+    body, which also gets workers of LIDAR that write formats of many files, or None if nothing was
+    left to do.
+
     An error or interrupt, also of the body, is noted with how to resume. LidarpoolError if the
     cluster lacks something or a task fails.
-
-    Parameters
-    ----------
-    store
-        Store of the run, with what an earlier run has left.
-    cluster
-        Starts a cluster or connects to one, if anything is left to do; it shares its time to wait
-        with the workers.
-    own
-        Whether that is a local cluster for this run: then the backend must be available here, and
-        there is no page of partitions.
-    progress, page, tell, on_frame
-        Where progress, the run itself, messages and frames are shown.
-    keep
-        Whether the cluster lasts as long as the body, which also gets workers of LIDAR that write
-        formats of many files; None if nothing was left to do.
     """
     workers = None
     with store.kept_on_error(), page as live, ExitStack() as stack:

@@ -22,9 +22,10 @@ from ..base.interrupts import children_spared, deferred_interrupts
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile
 from .local import local_cluster
-from .waiting import Waiting
+from .watch import Waiting
 
 CONNECT_TIMEOUT_S = 10
+KNOCK_S = 5.0  # of a scheduler that is waited for
 _UNREACHABLE = (errno.EHOSTUNREACH, errno.ENETUNREACH, errno.EHOSTDOWN)  # a host that is starting
 
 # What Dask watches many times a second in each process, for a dashboard that a cluster of one run
@@ -83,12 +84,8 @@ def local_client(
 def started_client(file: ClusterFile, tell: Callable[[str], object]) -> Iterator[Client]:
     """Client of a cluster that is started for it and lasts as long as the body.
 
-    `tell` is called when it has started, and with what goes wrong with workers.
-
-    Raises
-    ------
-    LidarpoolError
-        If it does not start.
+    `tell` is called when it has started, and with what goes wrong with workers. LidarpoolError if
+    it does not start.
     """
     with _client_of(file.started(tell)) as client:
         tell(f"started {file}")
@@ -123,20 +120,10 @@ def connected(
 ) -> Iterator[Client]:
     """Client of a cluster that is running already, or will be soon.
 
-    Parameters
-    ----------
-    scheduler
-        Address, ``tcp://host:8786`` or ``tls://host:8786``.
-    files
-        Certificates for the latter; by default those of Dask's configuration.
-    waiting
-        How long to wait for a scheduler that nobody has started yet; by default some seconds, for
-        a slow one.
-
-    Raises
-    ------
-    LidarpoolError
-        If no scheduler answers at this address, or the certificates are wrong.
+    `scheduler` is an address such as ``tcp://host:8786`` or ``tls://host:8786``; certificates for
+    the latter are by default those of Dask's configuration. A scheduler that nobody has started yet
+    is waited for as `waiting` says, by default some seconds. LidarpoolError if none answers, or the
+    certificates are wrong.
     """
     if not scheduler.startswith("inproc"):
         _check_address(scheduler)
@@ -167,15 +154,15 @@ def _check_address(address: str) -> None:
     """Refuse an address at which nothing can ever be."""
     host, _, port = address.rpartition("//")[2].partition("/")[0].rpartition(":")
     if not host:
-        raise LidarpoolError(
-            f"The address {address!r} has no {'host' if port.isdigit() else 'port'}: give that of "
-            f"the scheduler, such as {'tcp://host' if port.isdigit() else address}:8786."
-        )
-    if port.isdigit() and not 0 < int(port) < 1 << 16:
-        raise LidarpoolError(
-            f"The address {address!r} has the port {port}: ports are 1 to 65535; a scheduler's is "
-            "8786 if nothing else is said, tcp://host:8786."
-        )
+        what = "host" if port.isdigit() else "port"
+    elif port.isdigit() and not 0 < int(port) < 1 << 16:
+        what = f"port of 1 to 65535, but {port}"
+    else:
+        return
+    raise LidarpoolError(
+        f"The address {address!r} has no {what}: give that of the scheduler, such as "
+        "tcp://host:8786."
+    )
 
 
 async def _reach(address: str, security: Security, waiting: Waiting) -> None:
@@ -184,32 +171,29 @@ async def _reach(address: str, security: Security, waiting: Waiting) -> None:
     while True:
         timeout: float = CONNECT_TIMEOUT_S
         if waiting.seconds:
-            timeout = min(timeout, max(waiting.left(), 1.0))
-        knock = asyncio.ensure_future(asyncio.wait_for(_knock(address, security), timeout))
-        while not (await asyncio.wait({knock}, timeout=LOOK_EVERY_S))[0]:
-            waiting.tell(f"the scheduler at {address}", why)
-        if (error := knock.exception()) is None:
-            return
-        if not waiting.left() or not _absent(error):
-            raise error
-        why = _reason(error)
+            timeout = min(KNOCK_S, max(waiting.left(), 1.0))
         waiting.tell(f"the scheduler at {address}", why)
+        try:
+            options = security.get_connection_args("client")
+            # A little later than `connect`, which says why, unless what listens says nothing.
+            answer = connect(address, timeout=timeout, **options)
+            comm = await asyncio.wait_for(answer, timeout + 1)
+            comm.abort()
+            return
+        except Exception as error:
+            if not waiting.left() or not _absent(error):
+                raise
+            why = _reason(error)
         await asyncio.sleep(LOOK_EVERY_S)
-
-
-async def _knock(address: str, security: Security) -> None:
-    """Check that a scheduler answers."""
-    comm = await connect(
-        address, timeout=CONNECT_TIMEOUT_S, **security.get_connection_args("client")
-    )
-    comm.abort()
 
 
 def _root(error: BaseException) -> BaseException:
     """First cause of an error. Another program may listen there, and its answer may cause any."""
-    while error.__cause__ or error.__context__:
-        error = error.__cause__ or error.__context__  # type: ignore[assignment]
-    return error
+    cause = error.__cause__ or error.__context__
+    # What was cut off by a time-out says less than the time-out.
+    if cause is None or isinstance(cause, asyncio.CancelledError):
+        return error
+    return _root(cause)
 
 
 def _absent(error: BaseException) -> bool:

@@ -20,10 +20,7 @@ def identity_of(job: Job) -> dict[str, str]:
 
     The software of the workers that cast is no part of it: see `RunStore.casting`.
 
-    Raises
-    ------
-    LidarpoolError
-        If a sensor, column or trajectory has a field without a fingerprint.
+    LidarpoolError if a sensor, column or trajectory has a field without a fingerprint.
     """
     names = [field.name for field in fields(job) if field.name not in _MAY_CHANGE]
     return software() | {name: fingerprint(getattr(job, name)) for name in names}

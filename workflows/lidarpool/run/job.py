@@ -5,11 +5,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import Field
 
 from ..base.arguments import checked_fields
 from ..base.declared import declared
-from ..base.errors import Mistakes
+from ..base.errors import LidarpoolError, Mistakes
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
 from ..scenario.scenario import Scenario
@@ -17,7 +18,6 @@ from ..scenario.sections import TaskOptions
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.materials import MaterialTable
-from .checks import check_precision
 
 
 @dataclass(frozen=True, eq=False)
@@ -25,25 +25,14 @@ from .checks import check_precision
 class Job(TaskOptions):
     """A survey, possibly a planning, and how to run both.
 
-    Parameters
-    ----------
-    scene, survey, planning
-        The scene, how to scan it, and what to plan.
-    wait_s
-        How long to wait for partitions that are empty at the start, seconds.
-    patience_s
-        How long to wait for partitions that become empty later, seconds.
-
-    Raises
-    ------
-    LidarpoolError
-        If a number is below 1, the survey's precision too fine for the scene, a material is for
-        no object, or an object lacks a material while others have one.
+    LidarpoolError if a number is below 1, the survey's precision too fine for the scene, a material
+    is for no object, or an object lacks a material while others have one.
     """
 
     scene: Scene
     survey: Survey
     planning: Planning | None = None
+    # How long to wait for partitions that are empty at the start, and that become empty later.
     wait_s: Annotated[float, Field(ge=0)] = WAIT_S
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
 
@@ -51,7 +40,7 @@ class Job(TaskOptions):
         MaterialTable.of(self.survey.materials, self.scene.all_names)  # that they fit
         for actor in self.scene.actors:
             actor.check(0.0, self.survey.duration_ns)
-        check_precision(self.scene, self.survey)
+        _check_precision(self.scene, self.survey)
 
     @property
     def trials(self) -> int:
@@ -64,10 +53,7 @@ def make_job(
 ) -> Job:
     """Read the scene and make the job of a scenario; options override it.
 
-    Raises
-    ------
-    LidarpoolError
-        If a mesh file cannot be read, or fields do not fit together or the scene.
+    LidarpoolError if a mesh file cannot be read, or fields do not fit together or the scene.
     """
     scene, survey, planning = scenario.build_scene(), None, None
     mistakes = Mistakes()
@@ -80,3 +66,16 @@ def make_job(
     assert survey is not None, "a survey without mistakes"
     tasks = declared(scenario.pool, TaskOptions) | ({"backend": backend} if backend else {})
     return Job(scene, survey, planning, **tasks, **options)
+
+
+def _check_precision(scene: Scene, survey: Survey) -> None:
+    """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
+    reach = float(np.abs(scene.vertices).max(initial=0.0))
+    for actor in scene.actors:
+        ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
+        reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
+    if reach / survey.precision_m >= 2**31 - 1:
+        raise LidarpoolError(
+            f"precision_m {survey.precision_m} is too fine for a scene that reaches {reach:.0f} m "
+            f"from its origin: use at least {reach / 2**31:.2g}."
+        )

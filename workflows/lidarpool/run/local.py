@@ -8,8 +8,8 @@ from dask.system import CPU_COUNT
 from distributed import SpecCluster
 
 import poolpart
-from poolpart.local import check_count
 from poolpart.probe import visible_gpus
+from poolpart.rules import check_count
 
 from ..pipeline import GPU, LIDAR, OTHER
 
@@ -39,22 +39,9 @@ def local_cluster(
 ) -> SpecCluster:
     """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
 
-    Parameters
-    ----------
-    gpu_workers
-        Workers of the GPU partition, one thread each; by default one for each GPU, or without GPUs
-        for three quarters of the cores.
-    lidar_slots
-        Threads, and slots, of the one LIDAR worker.
-    other_workers
-        Workers of the OTHER partition, one thread each; by default the remaining cores. 0 for none.
-    **options
-        Further options of `poolpart.local_cluster`.
-
-    Raises
-    ------
-    PoolError
-        If a number is too small, or for the reasons of `poolpart.local_cluster`.
+    Workers of GPU and OTHER have one thread each; their default numbers are `default_workers` of
+    this machine, and OTHER may have none. The one LIDAR worker has `lidar_slots` threads and slots.
+    Further options, and the errors, are those of `poolpart.local_cluster`.
     """
     defaults = default_workers(CPU_COUNT, len(visible_gpus()))
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers

@@ -35,24 +35,12 @@ _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
 @dataclass(frozen=True, eq=False)
 class SensorWay:
-    """Positions of a sensor over time.
+    """Positions of a sensor over time."""
 
-    Parameters
-    ----------
-    times_ns
-        float64 (k,), ascending, nanoseconds since the survey's start.
-    positions
-        float64 (k, 3): its positions then, metres, local coordinates.
-    moves
-        Whether it moves from each position to the next; else it stands until the next time.
-    name, model
-        Its name, "" for a single sensor; and its model.
-    """
-
-    times_ns: NDArray[np.float64]
-    positions: NDArray[np.float64]
-    moves: bool = False
-    name: str = ""
+    times_ns: NDArray[np.float64]  # (k,), ascending, nanoseconds since the survey's start
+    positions: NDArray[np.float64]  # (k, 3), metres, local coordinates
+    moves: bool = False  # from each position to the next; else it stands until the next time
+    name: str = ""  # "" for a single sensor
     model: str = ""
 
     def at(self, time_ns: float) -> NDArray[np.float64]:
@@ -65,45 +53,21 @@ class SensorWay:
 
 @dataclass(frozen=True, eq=False)
 class Pictured:
-    """Content of a result's pictures, except the points.
+    """Content of a result's pictures, except the points."""
 
-    Parameters
-    ----------
-    scene
-        The scene; trajectories of its actors have a thousand poses at most.
-    sensors
-        Their positions.
-    hit_counts
-        int64 (f,): hits of each triangle, those of actors after the others.
-    sample_rays
-        float32 (k, 2, 3): ends of some rays, metres, local coordinates.
-    planning, plan
-        The planning and the best path; None without planning.
-    trials
-        All trials, float64 (w, 2) each: corners of the paths between the two ends, metres, local
-        coordinates.
-    duration_ns
-        Duration of the survey, by its own clock.
-    reflectance
-        float64 (objects,): share of light that each object reflects, actors after the others;
-        None if it is not known.
-    own
-        Columns of the cloud that are not in the table of columns; their values are in its file.
-    coordinates
-        Of the cloud's points: "world", or "sensor", where they do not fit the scene.
-    """
-
-    scene: Scene
+    scene: Scene  # trajectories of its actors have a thousand poses at most
     sensors: Sequence[SensorWay]
-    hit_counts: NDArray[np.int64]
-    sample_rays: NDArray[np.float32]
+    hit_counts: NDArray[np.int64]  # (f,): of each triangle, those of actors after the others
+    sample_rays: NDArray[np.float32]  # (k, 2, 3): ends of some rays, metres, local coordinates
     planning: Planning | None
     plan: Plan | None
+    # (w, 2) each: corners of the paths of all trials between the two ends, metres.
     trials: Sequence[NDArray[np.float64]]
-    duration_ns: float = 0.0
-    own: Sequence[Column] = ()
+    duration_ns: float = 0.0  # of the survey, by its own clock
+    own: Sequence[Column] = ()  # columns of the cloud's file that are not in the table of columns
+    # (objects,): share of light that each reflects, actors after the others; None if unknown.
     reflectance: NDArray[np.float64] | None = None
-    coordinates: str = "world"
+    coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
 
     @classmethod
     def of(cls, result: RunResult) -> Pictured:
@@ -151,13 +115,7 @@ class Pictured:
         return self.scene.all_names if column.name == "object" else ()
 
     def save(self, path: Path) -> None:
-        """Write it as a NumPy archive; the same content gives the same bytes.
-
-        Raises
-        ------
-        OSError
-            If it cannot be written.
-        """
+        """Write it as a NumPy archive; the same content gives the same bytes."""
         names = {
             "objects": self.scene.names,
             "actors": [actor.name for actor in self.scene.actors],
@@ -205,13 +163,7 @@ class Pictured:
 
     @classmethod
     def load(cls, path: Path) -> Pictured:
-        """Read what `save` wrote. Nothing in the file is run.
-
-        Raises
-        ------
-        LidarpoolError
-            If the file cannot be read, is damaged, or of another version.
-        """
+        """Read what `save` wrote; LidarpoolError if it is damaged. Nothing in the file is run."""
         with open_archive(path) as archive:
             return cls._from_arrays(archive)
 

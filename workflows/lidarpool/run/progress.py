@@ -21,25 +21,19 @@ SURE_SHARE, SURE_S = 0.05, 20.0
 
 @dataclass(frozen=True)
 class Progress:
-    """Counts of a run at one moment.
-
-    `generated`, `cast`, `framed` and `collected` are scans that have passed stage 1 to 4, out
-    of `scans`; `trials_done` are planning trials out of `trials`. `seconds` is since the start,
-    `replayed` are batches that were sent or cast once more. `waits_for` is the partition whose
-    slots the survey needs and other runs hold; empty when it has them.
-    """
+    """Counts of a run at one moment."""
 
     scans: int
-    generated: int
+    generated: int  # scans that have passed stage 1, and so on to 4
     cast: int
     framed: int
     collected: int
     points: int
     trials: int
     trials_done: int
-    seconds: float
-    replayed: int = 0
-    waits_for: str = ""
+    seconds: float  # since the start
+    replayed: int = 0  # batches that were sent or cast once more
+    waits_for: str = ""  # partition whose slots the survey needs and other runs hold
 
 
 Show = Callable[[Progress], None]

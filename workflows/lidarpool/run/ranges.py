@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-import warnings
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -15,10 +14,11 @@ from poolpart import Partition, Recorder, TaskRecord, fetch_available, own_clien
 
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike, software
-from ..base.task_book import TaskBook
 from ..export.pieces import RangeWriter, Span, Written
 from ..pipeline import EXPORT, LIDAR
 from ..pipeline.failures import raise_if_failed
+from ..pipeline.task_book import TaskBook
+from ..pipeline.workers import share
 from .result import RunResult
 from .watch import Watch
 
@@ -47,11 +47,9 @@ class LidarWorkers:
         running: dict[Future, Span] = {}
         written: dict[Span, Written] = {}
         watch = Watch(self._client, [LIDAR], patience_s=self._patience_s, tell=self._tell)
-        with warnings.catch_warnings():
-            # Of many sweeps. Workers fetch it from the one that has it: as an argument of the
-            # tasks it would make Dask send them all to that worker.
-            warnings.filterwarnings("ignore", message="Sending large graph")
-            shared = self._partition.submit(_same, writer, priority=10)
+        # Workers fetch it from the one that has it: as an argument of the tasks it would make Dask
+        # send them all to that worker.
+        shared = share(self._partition, writer, priority=10)
         try:
             while waiting or running:
                 while waiting and len(running) < most:
@@ -89,10 +87,6 @@ class LidarWorkers:
             records=(*result.records, *book.records),
             stages=(*result.stages, *book.stages.values()),
         )
-
-
-def _same(writer: RangeWriter) -> RangeWriter:
-    return writer
 
 
 @lru_cache(maxsize=1)

@@ -27,15 +27,7 @@ class RemoteRun:
     A resumed run takes over what an earlier run left. If the earlier run is still alive, it detects
     this before its next copy, and ends.
 
-    Parameters
-    ----------
-    storage
-        Where the run is.
-
-    Raises
-    ------
-    LidarpoolError
-        If nothing can be written there; in all methods, if the storage fails.
+    All methods raise LidarpoolError if the storage fails, and also if nothing can be written there.
     """
 
     def __init__(self, storage: Storage) -> None:
@@ -54,10 +46,7 @@ class RemoteRun:
     def save(self, db: RunDatabase, *, now: bool = False) -> None:
         """Put a copy of the database into the storage, if it is time or `now`.
 
-        Raises
-        ------
-        LidarpoolError
-            If another run has taken over; or as above.
+        LidarpoolError if another run has taken over.
         """
         began = time.monotonic()
         if began < self._due and not now:
@@ -85,12 +74,6 @@ class RemoteRun:
 
 
 def fetch_database(storage: Storage, folder: Path) -> None:
-    """Copy the database of a run, if there is one, into a folder of this machine.
-
-    Raises
-    ------
-    OSError
-        If the storage cannot be read.
-    """
+    """Copy the database of a run, if there is one, into a folder of this machine."""
     if FILE in storage.sizes():
         storage.get(FILE, folder / FILE)

@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from poolpart import TaskRecord
 
-from ..base.task_book import StageTotals
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
+from ..pipeline.task_book import StageTotals
 from ..plan import Plan, Planning, Trial
 from ..scene.scene import Scene
 from ..sensor import Survey
@@ -25,8 +25,6 @@ class RunResult:
 
     Parameters
     ----------
-    scene, survey, planning
-        The scene, the survey, and the planning or None.
     points
         The points, in parts: read in order a piece at a time, or written with their `save`.
     plan, trials
@@ -39,16 +37,18 @@ class RunResult:
         Tasks of the run, with worker and time; every n-th of a stage with thousands.
     stages
         All tasks of each stage together.
-    seconds, survey_seconds, planning_seconds
-        Wall time of all, of the survey and of the planning.
-    replayed
-        Batches that were offered again.
     resumed
         Scans from an earlier run. `records` and seconds are of this run only.
     notes
         Remarks for the user, such as that the GPU partition had no GPU.
     identity
         Fingerprints of scene, survey and planning, and versions of the software.
+    sample_rays
+        float32 (k, 2, 3): first and last point of some rays, metres, local coordinates.
+    seconds, survey_seconds, planning_seconds
+        Wall time of all, of the survey and of the planning.
+    replayed
+        Batches that were offered again.
     """
 
     scene: Scene
@@ -66,7 +66,7 @@ class RunResult:
     notes: tuple[str, ...]
     identity: Mapping[str, str]
     _hit_counts: Callable[[], NDArray[np.int64]] = field(repr=False)
-    _sample_rays: Callable[[], NDArray[np.float32]] = field(repr=False)
+    sample_rays: NDArray[np.float32] = field(repr=False)
     seconds: float = 0.0
     survey_seconds: float = 0.0
     planning_seconds: float = 0.0
@@ -87,8 +87,3 @@ class RunResult:
     def hit_counts(self) -> NDArray[np.int64]:
         """Rays that hit each triangle of scene and actors, (f,), read when first asked for."""
         return self._hit_counts()
-
-    @cached_property
-    def sample_rays(self) -> NDArray[np.float32]:
-        """First and last point of some rays, (k, 2, 3), metres, local coordinates."""
-        return self._sample_rays()

@@ -7,6 +7,7 @@ import uuid
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any, TypeVar
 
 from distributed import Client
@@ -18,29 +19,18 @@ from poolpart import (
     PipeClosed,
     PipeFailed,
     PoolError,
-    assign_devices,
 )
 
 from ..base.errors import LidarpoolError
-from ..base.task_book import TaskBook
-from ..pipeline import (
-    GPU,
-    LIDAR,
-    OTHER,
-    CastingWorkers,
-    Frame,
-    LongStages,
-    RigPlan,
-    SurveyDriver,
-)
+from ..pipeline import GPU, LIDAR, OTHER, CastingWorkers, Frame, LongStages, RigPlan, SurveyDriver
+from ..pipeline.task_book import TaskBook
 from ..plan import best
 from .checks import find_workers, gpu_note
 from .progress import Progress
 from .result import RunResult
 from .store import RunStore
 from .trials import TrialPump
-from .waiting import Waiting
-from .watch import Watch
+from .watch import Waiting, Watch
 
 T = TypeVar("T")
 
@@ -56,29 +46,12 @@ LONGEST_PAUSE_S = 0.05  # while nothing moves
 class Run:
     """One run on one cluster, checked and ready to be driven.
 
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    store
-        Store of parts and receipts, with what an earlier run has left.
-    tell
-        Called every few seconds with a message while the run waits.
-    waiting
-        How long to wait for workers at the start; by default as long as the job says.
-
-    Raises
-    ------
-    LidarpoolError
-        If the cluster lacks something.
+    `tell` is called every few seconds with a message while the run waits, and `waiting` says how
+    long to wait for workers at the start. LidarpoolError if the cluster lacks something.
     """
 
     def __init__(
-        self,
-        client: Client,
-        store: RunStore,
-        tell: Callable[[str], None] = lambda words: None,
-        waiting: Waiting | None = None,
+        self, client: Client, store: RunStore, tell: Callable[[str], None], waiting: Waiting
     ) -> None:
         job = store.job
         self.client, self.job, self.store = client, job, store
@@ -88,17 +61,13 @@ class Run:
         try:
             pool, casting, backend, software = find_workers(
                 client,
-                job.collectors,
-                job.planning is not None,
+                job,
                 store.backend or job.backend,
                 store.advice,
                 store.casting if store.resumed else {},
-                waiting or Waiting(job.wait_s, tell),
+                waiting,
             )
             store.backend, store.casting = backend, software
-            assign_devices(
-                client, casting
-            )  # all at once: workers that see few devices choose first
         except LidarpoolError:
             raise
         except Exception as error:  # the kind depends on the request
@@ -134,9 +103,7 @@ class Run:
                     self._pool.leave_page()
 
     def drive(
-        self,
-        on_frame: Callable[[Frame], None] | None,
-        on_progress: Callable[[Progress], None] | None,
+        self, on_frame: Callable[[Frame], None], on_progress: Callable[[Progress], None]
     ) -> RunResult:
         """Run to the end; on any error, everything has been stopped."""
         started = time.monotonic()
@@ -185,11 +152,7 @@ class Run:
             replayed=survey.offered_again,
         )
 
-    def _survey_driver(self, on_frame: Callable[[Frame], None] | None) -> SurveyDriver:
-        def take(frame: Frame) -> None:
-            if on_frame:
-                self._call(on_frame, frame)
-
+    def _survey_driver(self, on_frame: Callable[[Frame], None]) -> SurveyDriver:
         job, store = self.job, self.store
         run, plan = uuid.uuid4().hex[:8], RigPlan(job.scene, job.survey, store.backend)
         return SurveyDriver(
@@ -209,8 +172,8 @@ class Run:
             store.db,
             store.storage,
             store.points_of_scan,
-            take,
-            lambda parts: store.on_parts(parts) if store.on_parts else None,
+            partial(self._call, on_frame),
+            store.on_parts,
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:
@@ -226,7 +189,7 @@ class Run:
         pumps: list[SurveyDriver | TrialPump],
         survey: SurveyDriver,
         trials: TrialPump | None,
-        on_progress: Callable[[Progress], None] | None,
+        on_progress: Callable[[Progress], None],
         started: float,
     ) -> dict[type, float]:
         """Step the pumps until all have finished; returns the time of each, in seconds."""
@@ -255,7 +218,7 @@ class Run:
                 saved = now
                 self.store.save()
             watch.look(now)
-            if on_progress and (now - told >= PROGRESS_EVERY_S or len(times) == len(pumps)):
+            if now - told >= PROGRESS_EVERY_S or len(times) == len(pumps):
                 told = now
                 self._call(on_progress, self._progress(survey, trials, now - started))
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
@@ -297,7 +260,7 @@ def make_result(
         notes=(*store.notes, *notes),
         identity=store.identity,
         _hit_counts=store.hit_counts,
-        _sample_rays=store.sample_rays,
+        sample_rays=store.sample_rays(),
         **figures,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import json
 import os
+import secrets
 import shutil
 import tempfile
 import weakref
@@ -24,6 +25,7 @@ from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
 from ..export.sweeps import Sweeps
 from ..pipeline.database import FILE, RunDatabase, parts_folder, read_place
+from ..pipeline.failures import storing
 from ..pipeline.messages import Receipt, samples_of_scan, summary_type
 from ..simulator.world import AUTO_TAKES
 from .identity import difference, identity_of
@@ -58,12 +60,9 @@ class RunStore:
     resume
         Whether to continue an existing run; otherwise there must be none.
 
-    Raises
-    ------
-    LidarpoolError
-        If it holds an unfinished run and that is not to be resumed, or cannot be: it is damaged,
-        of another run, in use, or cast with another backend than is asked for; or if there are
-        `parts` without a `place`, whose database says which parts there are.
+    LidarpoolError if it holds an unfinished run and that is not to be resumed, or cannot be: it is
+    damaged, of another run, in use, or cast with another backend than is asked for; or if there are
+    `parts` without a `place`, whose database says which parts there are.
     """
 
     def __init__(
@@ -82,7 +81,7 @@ class RunStore:
         self.job = job
         self.lasting = place is not None
         self.notes: list[str] = []  # remarks for the user
-        self.on_parts: Callable[[list[Receipt]], None] | None = None  # called with new ones
+        self.on_parts: Callable[[list[Receipt]], None] = lambda parts: None  # called with new ones
         self._gone = False
         self.identity = here = identity_of(job)
         self._remote = None
@@ -104,11 +103,7 @@ class RunStore:
             try:
                 self._claim(here, resume)
             except BaseException:
-                self.db.close()
-                if made and not self.kept:
-                    with suppress(OSError, LidarpoolError):
-                        _remove(Storage.at(folder), self.storage, self.db.meta["mark"])
-                    (folder / FILE).unlink(missing_ok=True)  # the place of the parts failed
+                self._close()
                 raise
         except BaseException:
             if made:
@@ -136,34 +131,24 @@ class RunStore:
         except OSError as error:
             raise LidarpoolError(f"The run in {self.place} cannot be read: {error}.") from error
         if self.lasting:
-            with _removing(self.place):
-                left = _remove(Storage.at(self.place), _storage(self.place, earlier), mark)
-            if left:
-                raise LidarpoolError(left)
+            _remove(self.place, _storage(self.place, earlier), mark)
         path.unlink(missing_ok=True)
         self._folder.mkdir(exist_ok=True)
-        shared = None if parts is None else Storage.at(parts)
+        mark = secrets.token_hex(8)
+        shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
+        new = {"mark": mark, "identity": json.dumps(here), "parts": shared}
         try:
-            db = RunDatabase(path, count, durable=durable)
-            try:
-                place = shared.path(parts_folder(db.meta["mark"])) if shared else ""
-                db.set(identity=json.dumps(here), parts=place)
-            except BaseException:
-                path.unlink()  # while its lock is held
-                db.close()
-                raise
+            return RunDatabase(path, count, durable=durable, **new)
         except LidarpoolError:
             if path.exists() and not path.stat().st_size:  # the disk is full
                 path.unlink()
                 path.with_name(f"{FILE}-journal").unlink(missing_ok=True)  # SQLite 3.37 leaves it
             raise
-        return db
 
     def _claim(self, here: dict[str, str], resume: bool) -> None:
         """Find the parts, check them if there are any, and mark their folder as this run's."""
         self.storage = _storage(self.place, self.db.meta["parts"], durable=self.lasting)
-        if self.storage.is_link:
-            raise LidarpoolError(_behind_link(self.storage))
+        _refuse_link(self.storage)
         with explained(f"{self.storage.url} cannot be looked at"):
             sizes = self.storage.sizes()  # also an error if the place cannot be opened
         if self.kept:
@@ -172,8 +157,7 @@ class RunStore:
             self._remote.claim(self.db)
         name = mark_name(self.db.meta["mark"])
         if name not in sizes:
-            advice = "make room there, or give another place with --parts"
-            with explained(f"The points cannot be kept in {self.storage.url}", advice):
+            with storing(self.storage):
                 self.storage.prepare()
                 self.storage.write(name, b"")
 
@@ -198,15 +182,16 @@ class RunStore:
 
     def _drop(self, sizes: dict[str, int]) -> None:
         """Have the scans of missing and damaged parts cast again."""
-        there = [part for part in self.db.ordered if part.name in sizes]
-        missing = [part for part in self.db.ordered if part.name not in sizes]
+        lost: dict[str, list[Receipt]] = {"missing": [], "damaged": []}
         pool = ThreadPoolExecutor(min(CHECKERS, os.cpu_count() or 1), "check")
         try:
-            whole = pool.map(lambda part: self._is_whole(part, sizes[part.name]), there)
-            damaged = [part for part, fine in zip(there, whole, strict=True) if not fine]
+            states = pool.map(lambda part: self._state(part, sizes), self.db.ordered)
+            for part, state in zip(self.db.ordered, states, strict=True):
+                if state:
+                    lost[state].append(part)
         finally:
             pool.shutdown(cancel_futures=True)
-        for what, parts in (("missing", missing), ("damaged", damaged)):
+        for what, parts in lost.items():
             if parts:
                 self.db.drop(parts)
                 names, scans = _listed([p.name for p in parts]), _listed([*map(_span, parts)])
@@ -215,22 +200,25 @@ class RunStore:
                     f"cast again: {scans}; {names} {verb} {what} in {self.storage.url}"
                 )
 
-    def _is_whole(self, part: Receipt, size: int) -> bool:
-        """Whether a part is what its receipt says, to the checksum of each column."""
-        if size != part.size:
-            return False
+    def _state(self, part: Receipt, sizes: dict[str, int]) -> str:
+        """Say whether a part is not what its receipt says, to the checksum of each column."""
+        if part.name not in sizes:
+            return "missing"
+        if sizes[part.name] != part.size:
+            return "damaged"
         try:
             found = unpack(self.storage.read(part.name))
         except LidarpoolError:
-            return False
+            return "damaged"
         except OSError as error:
             if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk; just removed
-                return False
+                return "damaged"
             raise LidarpoolError(
                 f"The part {self.storage.path(part.name)} cannot be read: "
                 f"{error.strerror or error}."
             ) from error
-        return (found.first, found.stop, len(found)) == (part.first, part.stop, part.rows)
+        as_said = (found.first, found.stop, len(found)) == (part.first, part.stop, part.rows)
+        return "" if as_said else "damaged"
 
     # -- reading ---------------------------------------------------------------------------
 
@@ -294,27 +282,21 @@ class RunStore:
             seconds=0.0,
         )
 
-    @property
-    def _cloud_origin(self) -> NDArray[np.float64]:
-        """Origin of the points: that of the scene, or none in sensor coordinates."""
-        world = self.job.survey.coordinates == "world"
-        return self.job.scene.origin if world else np.zeros(3)
-
     def points(self) -> StoredCloud:
         """Points committed so far."""
-        parts = self.db.ordered
-        survey = self.job.survey
+        parts, job = self.db.ordered, self.job
+        world = job.survey.coordinates == "world"
         return StoredCloud(
             self.storage,
             [part.name for part in parts],
             [part.first for part in parts],
             [part.rows for part in parts],
-            survey.stored_columns,
+            job.survey.stored_columns,
             self.db.cells,
-            survey.precision_m,
-            self._cloud_origin,
+            job.survey.precision_m,
+            job.scene.origin if world else np.zeros(3),
             keeper=self,
-            sweeps=partial(Sweeps.of, survey, self.job.scene),
+            sweeps=partial(Sweeps.of, job.survey, job.scene),
         )
 
     def points_of_scan(self, scan: int) -> Cloud:
@@ -356,10 +338,7 @@ class RunStore:
     def save(self, *, now: bool = False) -> None:
         """Keep how many frames were handed out; where it is time or `now`, copy the database.
 
-        Raises
-        ------
-        LidarpoolError
-            If that fails, or another run has taken over.
+        LidarpoolError if that fails, or another run has taken over.
         """
         self.db.save_frames()
         if self._remote:
@@ -372,20 +351,13 @@ class RunStore:
         with suppress(OSError, LidarpoolError):
             self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
 
-    def remove(self) -> str:
-        """Remove the store: the result is in place.
-
-        Returns
-        -------
-        What is left in the folder of the parts because it is not of this run, and what to do, as
-        a sentence; empty if nothing is.
-        """
+    def remove(self) -> None:
+        """Remove the store: the result is in place. Files of others among the parts stay."""
         if self._remote:
             self._remote.check()
         self._gone = True
         self.db.close()
-        with _removing(self.place):
-            return _remove(Storage.at(self.place), self.storage, self.db.meta["mark"])
+        _remove(self.place, self.storage, self.db.meta["mark"])
 
     @contextmanager
     def kept_on_error(self) -> Iterator[None]:
@@ -397,15 +369,21 @@ class RunStore:
                 raise
             with suppress(LidarpoolError):  # report the first error
                 self.save(now=True)
-            self.db.close()
             if self._remote and self._remote.lost:
+                self.db.close()
                 raise
-            if not self.kept:
-                with suppress(OSError):
-                    _remove(Storage.at(self.place), self.storage, self.db.meta["mark"])
-            elif (self._folder / FILE).exists():
+            self._close()
+            if self.kept and (self._folder / FILE).exists():
                 error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
             raise
+
+    def _close(self) -> None:
+        """Close the database after an error; remove a run that has committed nothing."""
+        self.db.close()
+        if not self.kept:
+            with suppress(OSError, LidarpoolError):
+                _remove(self.place, self.storage, self.db.meta["mark"])
+            (self._folder / FILE).unlink(missing_ok=True)  # where the place of the parts failed
 
 
 def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
@@ -417,7 +395,8 @@ def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
 def remove_run(folder: str | Path) -> None:
     """Remove a stored run and its parts, wherever they are, and nothing else.
 
-    If its database is damaged, its parts are found only in its folder.
+    Other files among the parts stay. If its database is damaged, its parts are found only in its
+    folder.
 
     Parameters
     ----------
@@ -427,8 +406,7 @@ def remove_run(folder: str | Path) -> None:
     Raises
     ------
     LidarpoolError
-        If another run uses it, it cannot be removed, or the folder of its parts holds other files
-        or is a link: these stay, and the message names them.
+        If another run uses it, it cannot be removed, or the folder of its parts is a link.
     """
     kept = Storage.at(folder)
     with _removing(folder), tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
@@ -439,30 +417,33 @@ def remove_run(folder: str | Path) -> None:
         except LidarpoolError as error:
             raise LidarpoolError(str(error).replace(temporary, str(folder))) from error
         mark, parts = found or (None, "")
-        left = _remove(kept, _storage(folder, parts), mark)
-    if left:
-        raise LidarpoolError(left)
+        _remove(folder, _storage(folder, parts), mark)
 
 
-def _remove(kept: Storage, parts: Storage, mark: str | None) -> str:
-    """Remove a run and what its mark says is its own; a sentence on what else is there.
+def _remove(place: str | Path, parts: Storage, mark: str | None) -> None:
+    """Remove a run and what its mark says is its own.
 
     `mark` is None if the database does not say it: then that in the folder of the parts counts.
     """
+    _refuse_link(parts)
+    with _removing(place):
+        parts.remove(own_files(parts, mark))
+        parts.remove_folder()
+        kept = Storage.at(place)
+        kept.remove([FILE, f"{FILE}-journal", OWNER])
+        kept.remove_folder()
+
+
+def _removing(place: str | Path) -> AbstractContextManager[None]:
+    return explained(f"The run in {place} cannot be removed")
+
+
+def _refuse_link(parts: Storage) -> None:
     if parts.is_link:
-        return _behind_link(parts)
-    parts.remove(own_files(parts, mark))
-    parts.remove_folder()
-    kept.remove([FILE, f"{FILE}-journal", OWNER])
-    kept.remove_folder()
-    if not (left := sorted(parts.entries())):
-        return ""
-    of_runs = len(own_files(parts, None)) == len(left)  # whose databases are gone
-    advice = f"drop it with {_DROP}" if of_runs else "move it elsewhere"
-    return (
-        f"{parts.url} holds what is not of this run and stays there, {_listed(left)}: {advice}, "
-        "or give another folder."
-    )
+        raise LidarpoolError(
+            f"{parts.url} is a link, and a run deletes nothing behind a link: put the folder "
+            "itself there, or remove the link; --parts gives the points another place."
+        )
 
 
 def _span(part: Receipt) -> str:
@@ -471,18 +452,7 @@ def _span(part: Receipt) -> str:
     return f"scan {last}" if part.first == last else f"scans {part.first} to {last}"
 
 
-def _behind_link(parts: Storage) -> str:
-    return (
-        f"{parts.url} is a link, and a run deletes nothing behind a link: put the folder itself "
-        "there, or remove the link; --parts gives the points another place."
-    )
-
-
 def _listed(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")
-
-
-def _removing(place: str | Path) -> AbstractContextManager[None]:
-    return explained(f"The run in {place} cannot be removed")

@@ -13,8 +13,8 @@ from poolpart import Partition, fetch_available, look_for_tasks, recorded
 
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike
-from ..base.task_book import TaskBook
 from ..pipeline.failures import was_killed
+from ..pipeline.task_book import TaskBook
 from ..plan import Planning, Trial, run_trial
 
 TRIAL = "trial"
@@ -25,18 +25,8 @@ LOOK_EVERY_S = 1.0
 class TrialPump:
     """Runs the trials of a planning; `step` it until `finished`, as a `SurveyDriver`.
 
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    partition
-        Partition of the trials.
-    planning
-        What to plan.
-    sources
-        ``lidarpool`` of the run's `software`.
-    done
-        Trials that an earlier run has finished.
+    `sources` is ``lidarpool`` of the run's `software`, and `done` are trials that an earlier run
+    has finished.
     """
 
     def __init__(
@@ -68,10 +58,7 @@ class TrialPump:
     def step(self) -> bool:
         """Take results and submit more; returns whether there was anything to do.
 
-        Raises
-        ------
-        LidarpoolError
-            If a trial has failed.
+        LidarpoolError if a trial has failed.
         """
         if self._running and time.monotonic() - self._looked_at > LOOK_EVERY_S:
             self._leave_silent_workers()

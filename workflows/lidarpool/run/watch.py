@@ -1,9 +1,10 @@
-"""Waiting for partitions whose workers are gone or take no tasks, with messages and a limit."""
+"""Waiting for a scheduler and workers, at the start and later, with messages and a limit."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
+from functools import cached_property
 from typing import Any
 
 from dask.utils import format_bytes
@@ -18,23 +19,39 @@ WATCH_EVERY_S = 1.0
 TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait
 
 
+class Waiting:
+    """Time that a start may take, from the first time that it is asked or told.
+
+    `tell` is called every few seconds with a line that says what it waits for.
+    """
+
+    def __init__(self, seconds: float = 0.0, tell: Callable[[str], None] = lambda words: None):
+        self.seconds, self._tell = seconds, tell
+        self._told = float("-inf")
+
+    @cached_property
+    def _began(self) -> float:
+        return time.monotonic()
+
+    def left(self, now: float | None = None) -> float:
+        """Seconds that are left; 0 when it is over."""
+        now = time.monotonic() if now is None else now
+        return max(0.0, self._began + self.seconds - now)
+
+    def tell(self, what: str, why: str) -> None:
+        """Say what is waited for, if it is time to."""
+        now = time.monotonic()
+        if now - max(self._told, self._began) >= max(TELL_EVERY_S, (now - self._began) / 10):
+            self._told = now
+            self._tell(f"waiting for {what}, for another {self.left(now):.0f} s: {why}")
+
+
 class Watch:
     """Detects a partition that stays without workers, or whose workers take no tasks.
 
-    Dask itself would wait for ever.
-
-    Parameters
-    ----------
-    client
-        Client of the cluster.
-    names
-        Partitions whose workers get new tasks during the run.
-    lasting
-        Partitions whose tasks last as long as the run: their workers need not take more.
-    patience_s
-        How long one may be empty, seconds.
-    tell
-        Called every few seconds with a message while it waits.
+    Dask itself would wait for ever. The workers of the partitions `names` get new tasks during the
+    run; tasks of `lasting` ones last as long as the run, so their workers need not take more. One
+    may be empty for `patience_s`; `tell` is called every few seconds with a message meanwhile.
     """
 
     def __init__(

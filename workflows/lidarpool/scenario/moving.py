@@ -11,23 +11,18 @@ from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
 from ..base.declared import Text, Triple, is_text, short
-from ..base.errors import LidarpoolError
+from ..base.errors import prefixed
 from ..sensor import Mounted, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import (
-    MeshEntry,
-    PoseSection,
-    Section,
-    SensorSection,
-)
+from .sections import MeshEntry, PoseSection, Section, SensorSection, told
 
 
 class MountSection(PoseSection):
     """Position and angles of a sensor on its carrier, in the carrier's axes."""
 
-    position: Annotated[Triple, Field(description="x, y and z, metres")] = (0, 0, 0)
+    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
 
 
 class CarriedSection(SensorSection):
@@ -35,12 +30,11 @@ class CarriedSection(SensorSection):
 
     mount: MountSection = MountSection()
     start_s: Annotated[
-        float,
-        Field(ge=0, le=1e9, description="start, in seconds after that of the survey or station"),
+        float, told("start, in seconds after that of the survey or station", ge=0, le=1e9)
     ] = 0.0
     steps: Annotated[
         Steps | None,
-        Field(description="its time steps (scans), instead of the survey's", examples=[120]),
+        told("its time steps (scans), instead of the survey's", 120),
     ] = None
 
     def mounted(self, folder: Path, name: str) -> Mounted:
@@ -52,48 +46,45 @@ class CarriedSection(SensorSection):
 class TimedPose(PoseSection):
     """A pose at a time; if no pose has an angle, the carrier faces its direction of travel."""
 
-    time_s: Annotated[Seconds, Field(description="seconds, by the clock of the trajectory")]
+    time_s: Annotated[Seconds, told("seconds, by the clock of the trajectory")]
 
 
 class TrajectorySection(Section):
     """Poses over time, from a file or from points; in YAML also just the file's name."""
 
     file: Annotated[
-        Text | None,
-        Field(description="TUM, KITTI or .csv, from the scenario's folder", examples=["drive.tum"]),
+        Text | None, told("TUM, KITTI or .csv, from the scenario's folder", "drive.tum")
     ] = None
     format: Annotated[
-        TrajectoryFormat | None,
-        Field(description="by default kitti with times, csv for a .csv, else tum"),
+        TrajectoryFormat | None, told("by default kitti with times, csv for a .csv, else tum")
     ] = None
-    times: Annotated[Text | None, Field(description="for KITTI poses: the file of times")] = None
+    times: Annotated[Text | None, told("for KITTI poses: the file of times")] = None
     columns: Annotated[
         dict[str, str] | None,
-        Field(
-            description="for a table: {time_s, x, y, z, qx, …, yaw_deg, …: name in the file}",
-            examples=[{"time_s": "stamp"}],
+        told(
+            "for a table: {time_s, x, y, z, qx, …, yaw_deg, …: name in the file}",
+            {"time_s": "stamp"},
         ),
     ] = None
     camera_axes: Annotated[
         bool | None,
-        Field(
-            description="whether poses have camera axes (z ahead); by default those of KITTI have"
-        ),
+        told("whether poses have camera axes (z ahead); by default those of KITTI have"),
     ] = None
     points: Annotated[
         tuple[TimedPose, ...],
         Strict(False),
-        Field(description="instead of a file: time_s, position and angles, world metres"),
+        told("instead of a file: time_s, position and angles, world metres"),
     ] = ()
     interpolation: Annotated[
-        Literal["linear", "smooth"], Field(description="of positions; rotations are even")
+        Literal["linear", "smooth"], told("of positions; rotations are even")
     ] = "linear"
-    offset_s: Annotated[Seconds, Field(description="added to all times")] = 0.0
+    offset_s: Annotated[Seconds, told("added to all times")] = 0.0
     start_s: Annotated[
-        Seconds | None, Field(description="start of the survey; by default the first time")
+        Seconds | None,
+        told("start of the survey; by default the first time"),
     ] = None
     duration_s: Annotated[
-        Duration | None, Field(description="duration of the survey; by default to the end")
+        Duration | None, told("duration of the survey; by default to the end")
     ] = None
 
     @model_validator(mode="after")
@@ -137,8 +128,7 @@ class TrajectorySection(Section):
 
 
 TrajectoryEntry = Annotated[
-    TrajectorySection,
-    short(is_text, lambda v: {"file": v}, Text | TrajectorySection),
+    TrajectorySection, short(is_text, lambda v: {"file": v}, Text | TrajectorySection)
 ]
 Length = Annotated[float, Field(gt=0, le=1e4)]
 
@@ -146,18 +136,15 @@ Length = Annotated[float, Field(gt=0, le=1e4)]
 class ActorSection(Section):
     """An object that moves through the scene; its axes have x ahead and z up."""
 
-    name: Annotated[Text, Field(description="name of the object")]
+    name: Annotated[Text, told("name of the object")]
     file: Annotated[
-        MeshEntry | None,
-        Field(description="its mesh in its own axes, as in scene.files", examples=["car.glb"]),
+        MeshEntry | None, told("its mesh in its own axes, as in scene.files", "car.glb")
     ] = None
     box: Annotated[
         Annotated[tuple[Length, Length, Length], Strict(False)] | None,
-        Field(description="instead of a file: length, width and height of a box, metres"),
+        told("instead of a file: length, width and height of a box, metres"),
     ] = None
-    trajectory: Annotated[
-        TrajectoryEntry, Field(description="its trajectory, by the clock of the survey's")
-    ]
+    trajectory: Annotated[TrajectoryEntry, told("its trajectory, by the clock of the survey's")]
     semantic_class: Annotated[
         SemanticClass | None,
         Field(alias="class", description="class of its points; by default that of its material"),
@@ -173,7 +160,5 @@ class ActorSection(Section):
 
     def way(self, folder: Path, origin: NDArray[np.float64], start_s: float) -> Track:
         """Return its trajectory from the survey's start on."""
-        try:
+        with prefixed(f"actor {self.name!r}"):
             return self.trajectory.track(folder, origin, start_s)
-        except LidarpoolError as error:
-            raise LidarpoolError(f"actor {self.name!r}: {error}") from error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import yaml
@@ -11,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.words import counted
 from ..scene.floor import room_at
 from ..scene.scene import Scene
-from ..scene.surroundings import Surroundings, is_open
+from ..scene.surroundings import Surroundings, Views, is_open
 from ..sensor import Mounted, Pose
 
 # Heights above a floor; and the least distance from the ceiling.
@@ -30,21 +31,11 @@ _TRIANGLES_MOST, _SHEETS_MOST = 2_000_000, 200_000
 
 @dataclass(frozen=True)
 class Placing:
-    """Poses of a sensor in a scene.
+    """Poses of a sensor in a scene."""
 
-    Parameters
-    ----------
-    poses
-        In world coordinates.
-    note
-        For users, on poses that they may not expect; empty if there is nothing to say.
-    around
-        Whether the poses are around an object.
-    """
-
-    poses: tuple[Pose, ...]
-    note: str = ""
-    around: bool = False
+    poses: tuple[Pose, ...]  # in world coordinates
+    note: str = ""  # for users, on poses that they may not expect
+    around: bool = False  # whether the poses are around an object
 
 
 def place(scene: Scene, carried: Mounted) -> Placing:
@@ -53,13 +44,6 @@ def place(scene: Scene, carried: Mounted) -> Placing:
     In a room or a landscape they are in the middle, 1, 2 and 3 m above the floor or ground, or at
     a quarter, half and three quarters of the height of a lower room. Around an object they are on
     four sides and above it.
-
-    Parameters
-    ----------
-    scene
-        The scene from mesh files.
-    carried
-        The sensor and its mount.
     """
     low, high = scene.bounds + scene.origin
     x, y = (low[:2] + high[:2]) / 2
@@ -71,11 +55,9 @@ def place(scene: Scene, carried: Mounted) -> Placing:
     looker = _looker(scene)
     if looker is None:
         return Placing(standing)
-    positions = [np.subtract(pose.position, scene.origin) for pose in standing]
-    if not looker.is_object(positions):
-        if not looker.views(positions).only_backs:
-            return Placing(standing)
-        return Placing(standing, f"{_INSIDE}; {seen_from(scene, carried)}")
+    seen = looker.views([np.subtract(pose.position, scene.origin) for pose in standing])
+    if not looker.is_object(seen):
+        return Placing(standing, _inside(seen, scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
     sides = " x ".join(f"{side:,.3g}" for side in high - low)
@@ -86,35 +68,36 @@ def place(scene: Scene, carried: Mounted) -> Placing:
     return Placing(poses, note, around=True)
 
 
-_INSIDE = "the sensor is inside a closed body, and hits only the backs of its surfaces"
-
-
 def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
     """Say that only backs of surfaces are seen from local positions (k, 3); else empty."""
     looker = _looker(scene)
-    if looker is None or not looker.views(positions).only_backs:
+    return "" if looker is None else _inside(looker.views(positions), scene, carried)
+
+
+def _inside(seen: Views, scene: Scene, carried: Mounted) -> str:
+    if not seen.only_backs:
         return ""
-    return f"{_INSIDE}; {seen_from(scene, carried)}"
+    return (
+        "the sensor is inside a closed body, and hits only the backs of its surfaces; "
+        f"{seen_from(scene, carried)}"
+    )
 
 
 def seen_from(scene: Scene, carried: Mounted) -> str:
     """Name two poses that see a scene from outside, as a scenario has them."""
-    text = yaml.safe_dump(
-        [as_entry(pose) for pose in poses_around(scene, carried)[0:4:2]],
-        default_flow_style=True,
-        sort_keys=False,
-        width=10_000,
-    )
-    return f"from outside it is seen by poses: {text.strip()}"
+    poses = [as_entry(pose) for pose in poses_around(scene, carried)[0:4:2]]
+    return f"from outside it is seen by poses: {on_one_line(poses)}"
+
+
+def on_one_line(value: Any) -> str:
+    """Return a value as YAML."""
+    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
+    return text.removesuffix("\n").removesuffix("...").removesuffix("\n")
 
 
 def as_entry(pose: Pose) -> dict[str, object]:
     """Return a pose as a scenario has it."""
-    return {
-        "position": list(pose.position),
-        "yaw_deg": pose.yaw_deg,
-        "pitch_deg": pose.pitch_deg,
-    }
+    return {"position": [*pose.position], "yaw_deg": pose.yaw_deg, "pitch_deg": pose.pitch_deg}
 
 
 def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
@@ -132,10 +115,8 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
     digits = max(0, 3 - int(np.floor(np.log10(diagonal))))
     poses = []
     for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (180, 90.0)):
-        (ca, ce), (sa, se) = (
-            np.cos(np.radians([azimuth, above])),
-            np.sin(np.radians([azimuth, above])),
-        )
+        angles = np.radians([azimuth, above])
+        (ca, ce), (sa, se) = np.cos(angles), np.sin(angles)
         at = np.round(middle + far * np.array([ca * ce, sa * ce, se]), digits) + 0.0
         x, y, z = at.tolist()
         pitch = round(above + (down + up) / 2, 1)

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, PrivateAttr, Strict, ValidationError
+from pydantic import PrivateAttr, Strict, ValidationError
 
 from ..base.declared import Text, declared
-from ..base.errors import LidarpoolError, Mistakes
+from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..plan import Planning
@@ -45,6 +44,7 @@ from .sections import (
     WeatherSection,
     may_be_empty,
     scene_in_short,
+    told,
 )
 from .validation_errors import validation_errors
 
@@ -95,67 +95,61 @@ class Scenario(Section):
     poses: Annotated[
         tuple[PoseEntry, ...] | None,
         Strict(False),
-        Field(
-            min_length=1,
-            max_length=1_000_000,
-            description="poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
+        told(
+            "poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
             "ceiling, or around an object that is no place to stand in",
-            examples=[[[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}]],
+            [[0, 0, 1], [0, 0, 2], {"position": [0, 0, 3], "yaw_deg": 90}],
+            min_length=1,
+            max_length=1_000_000,
         ),
     ] = None
     trajectory: Annotated[
         TrajectoryEntry | None,
-        Field(
-            description="instead of poses: the trajectory of a carrier, from a TUM, KITTI or "
+        told(
+            "instead of poses: the trajectory of a carrier, from a TUM, KITTI or "
             ".csv file, or points",
-            examples=["drive.tum"],
+            "drive.tum",
         ),
     ] = None
     sensors: Annotated[
         dict[Text, CarriedSection],
-        Field(
+        told(
+            "instead of sensor: several on one carrier, by name, each with its mount",
+            {"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}},
             max_length=SENSORS_MOST,
-            description="instead of sensor: several on one carrier, by name, each with its mount",
-            examples=[{"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}}],
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
         tuple[ActorSection, ...],
         Strict(False),
-        Field(
+        told(
+            "moving objects: meshes or boxes, each with a trajectory",
+            [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
             max_length=10_000,
-            description="moving objects: meshes or boxes, each with a trajectory",
-            examples=[[{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}]],
         ),
     ] = ()
     mount: Annotated[
         MountSection | None,
-        Field(
-            description="pose of the sensor on its carrier, in the carrier's axes",
-            examples=[{"position": [1, 0, 2], "pitch_deg": 10}],
+        told(
+            "pose of the sensor on its carrier, in the carrier's axes",
+            {"position": [1, 0, 2], "pitch_deg": 10},
         ),
     ] = None
     steps: Annotated[
         Steps | None,
-        Field(
-            description="time steps (scans) at each pose; by default along a trajectory as many "
-            "as fit into it",
-            examples=[36],
+        told(
+            "time steps (scans) at each pose; by default along a trajectory as many as fit into it",
+            36,
         ),
     ] = None
     materials: Annotated[
         tuple[MaterialSection, ...],
         Strict(False),
-        Field(
+        told(
+            "materials of objects, by name; the last entry for an object counts",
+            [{"objects": "*", "reflectance": 0.3}, {"objects": "Window*", "transparent": "pass"}],
             max_length=100_000,
-            description="materials of objects, by name; the last entry for an object counts",
-            examples=[
-                [
-                    {"objects": "*", "reflectance": 0.3},
-                    {"objects": "Window*", "transparent": "pass"},
-                ]
-            ],
         ),
     ] = ()
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
@@ -229,29 +223,21 @@ class Scenario(Section):
 
         If nothing else is wrong, reading them reports it.
         """
-        ends = [self.planning.start, self.planning.target].count(None)
-        checks = (
-            (
-                self.planning.enabled and not self.scene.has_seed and ends,
-                "planning is enabled: give planning.start and planning.target.",
-            ),
-            (
-                self.planning.enabled is None and not self.scene.has_seed and ends == 1,
-                "give both planning.start and planning.target, or neither.",
-            ),
-            (
-                self.trajectory is not None and self.poses is not None,
-                "give either poses or a trajectory, not both.",
-            ),
-            (
-                self.sensors and (self.sensor != SensorSection() or self.mount),
-                "give either sensor and mount, or sensors, each with a mount.",
-            ),
-        )
-        mistakes.lines += [f"{self._source}: {words}" for wrong, words in checks if wrong]
+        wrong, planning = [], self.planning
+        # The default objects have a start and a target.
+        missing = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
+        if planning.enabled and missing:
+            wrong.append("planning is enabled: give planning.start and planning.target.")
+        if planning.enabled is None and missing == 1:
+            wrong.append("give both planning.start and planning.target, or neither.")
+        if self.trajectory is not None and self.poses is not None:
+            wrong.append("give either poses or a trajectory, not both.")
+        if self.sensors and (self.sensor != SensorSection() or self.mount):
+            wrong.append("give either sensor and mount, or sensors, each with a mount.")
+        mistakes.lines += [f"{self._source}: {words}" for words in wrong]
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
-                with mistakes.noted(), self._named():
+                with mistakes.noted(), prefixed(self._source):
                     sensor = section.sensor(self._folder)
                     self.returns.of(sensor.optics)
         entries = [*self.scene.files, *(actor.file for actor in self.actors if actor.file)]
@@ -278,15 +264,12 @@ class Scenario(Section):
     def _of_size(self, scene: Scene) -> str:
         files = [entry.file for entry in self.scene.files if entry.unit is None]
         unitless = [
-            file
-            for file in files
-            if Path(file).suffix.lower() in UNITLESS and not wrote_it(self._path(file))
+            f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(self._path(f))
         ]
         side = float(np.ptp(scene.bounds, axis=0).max())
         parts = any(file.lower().endswith(".stl") for file in unitless)
         least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
-        around = self._placing is not None and self._placing.around
-        if around:
+        if around := self._placing is not None and self._placing.around:
             least, large = 0.0, LARGE_OBJECT_M if unitless else LARGE_STATED_M
         if not (unitless or (around and files)) or least <= side <= large:
             return ""
@@ -309,7 +292,7 @@ class Scenario(Section):
         else:
             positions = [pose.position for pose in self._world_poses(scene)]
             at = np.array(positions[:: -(-len(positions) // _LOOKED_FROM)]) - scene.origin
-        return inside_note(scene, at, self._carried())
+        return inside_note(scene, at, self._carried()[0])
 
     def build_scene(self) -> Scene:
         """Read the mesh files and build the scene.
@@ -341,7 +324,7 @@ class Scenario(Section):
             else box(entry.name, entry.box or (1, 1, 1))
             for entry in self.actors
         ]
-        with self._named():
+        with prefixed(self._source):
             start = 0.0
             if self.trajectory is not None:
                 start = self.trajectory.track(self._folder, origin).start_s or 0.0
@@ -366,8 +349,8 @@ class Scenario(Section):
         LidarpoolError
             If fields are valid by themselves and do not fit together.
         """
-        with self._named():
-            track, poses, sensors = None, [], self._sensors()
+        with prefixed(self._source):
+            track, poses, carried = None, [], self._carried()
             if self.trajectory is not None:
                 track = self.trajectory.track(self._folder, scene.origin)
             else:
@@ -378,10 +361,11 @@ class Scenario(Section):
             cloud = dict(self.cloud) | {"columns": (*self.cloud.columns, *self.output.needs)}
             if self.scene.has_seed and cloud["keep_every"] is None:
                 cloud["keep_every"] = SEED_KEPT
+            alone = not self.sensors and self.mount is None
             return Survey(
                 poses=poses,
                 trajectory=track,
-                **sensors,
+                **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
                 steps=self.steps,
                 materials=self._materials(),
                 returns=Returns(**dict(self.returns)),
@@ -399,14 +383,13 @@ class Scenario(Section):
             If an obstacle names no object, or an end of the path lies within an obstacle.
         """
         section = self.planning
-        ends = (section.start, section.target)
+        start, target = section.start, section.target
         if self.scene.has_seed:
-            ends = (section.start or SEED_START, section.target or SEED_TARGET)
-        start, target = ends
+            start, target = start or SEED_START, target or SEED_TARGET
         if section.enabled is False or start is None or target is None:
             return None
         x0, y0, _ = scene.origin
-        with self._named():
+        with prefixed(self._source):
             discs, labels = self._discs(scene)
             discs[:, 2] += section.clearance_m
             wide = np.flatnonzero(discs[:, 2])  # upright lines have no area
@@ -421,20 +404,15 @@ class Scenario(Section):
                 **declared(section, Search),
             )
 
-    def _sensors(self) -> dict[str, Any]:
-        """Arguments of the survey."""
-        if not self.sensors and self.mount is None:
-            return {"sensor": self.sensor.sensor(self._folder)}
-        if self.mount is not None:
-            return {"sensors": [Mounted(self.sensor.sensor(self._folder), self.mount.pose())]}
-        return {
-            "sensors": [
-                section.mounted(self._folder, name) for name, section in self.sensors.items()
-            ]
-        }
+    def _carried(self) -> list[Mounted]:
+        """Return the sensors on their carrier."""
+        if self.sensors:
+            return [section.mounted(self._folder, name) for name, section in self.sensors.items()]
+        mount = MountSection() if self.mount is None else self.mount
+        return [Mounted(self.sensor.sensor(self._folder), mount.pose())]
 
     def _read(self, entry: MeshFile) -> tuple[Mesh, ...]:
-        with self._named():
+        with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
         return load_meshes(
             path,
@@ -459,20 +437,14 @@ class Scenario(Section):
     def placing(self, scene: Scene) -> Placing:
         """Where the sensor is put in a scene from mesh files, if no poses are given."""
         if self._placing is None:
-            self._placing = place(scene, self._carried())
+            self._placing = place(scene, self._carried()[0])
         return self._placing
-
-    def _carried(self) -> Mounted:
-        """Return the first sensor."""
-        sensors = self._sensors()
-        return sensors["sensors"][0] if "sensors" in sensors else Mounted(sensors["sensor"])
 
     def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:
         """Obstacles as local x, y, radius (m, 3), and a label for each."""
-        tall = np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M
         if self.planning.obstacles is None:
-            picked = [i for i in range(len(scene.names)) if tall[i]]
-            return scene.footprints[picked], [scene.names[i] for i in picked]
+            tall = np.flatnonzero(np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M)
+            return scene.footprints[tall], [scene.names[i] for i in tall]
         rows: dict[str, list[float]] = {}  # {label: x, y, radius}
         for number, entry in enumerate(self.planning.obstacles):
             if entry.object is None:
@@ -492,19 +464,6 @@ class Scenario(Section):
                 )
             rows |= {scene.names[i]: list(scene.footprints[i]) for i in found}
         return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
-
-    @property
-    def source(self) -> Path:
-        """Name of its file, for messages."""
-        return Path(self._source)
-
-    @contextmanager
-    def _named(self) -> Iterator[None]:
-        """Name the scenario's file in errors."""
-        try:
-            yield
-        except LidarpoolError as error:
-            raise LidarpoolError(f"{self._source}: {error}") from error
 
 
 def _ground(section: Ground, scene: Scene) -> Mesh:

@@ -7,14 +7,7 @@ from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import (
-    BaseModel,
-    BeforeValidator,
-    ConfigDict,
-    Field,
-    Strict,
-    model_validator,
-)
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
 from ..base.arguments import shown
 from ..base.declared import Angle, Coordinate, Text, Triple, declared, is_text, short
@@ -36,6 +29,11 @@ Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
 Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
 
 
+def told(description: str, *examples: Any, **limits: Any) -> Any:
+    """Describe a field; one whose default is computed has examples."""
+    return Field(description=description, examples=[*examples] or None, **limits)
+
+
 class Section(BaseModel):
     """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
 
@@ -51,36 +49,32 @@ class MeshFile(Section):
 
     file: Annotated[
         str,
-        Field(
+        told(
+            ".glb .gltf .obj .stl .ply .off .dae or .3mf, from the scenario's folder",
             min_length=1,
             max_length=4096,
-            description=".glb .gltf .obj .stl .ply .off .dae or .3mf, from the scenario's folder",
         ),
     ]
     unit: Annotated[
         Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
-        Field(description="length unit of the file; by default the one it states, else metres"),
+        told("length unit of the file; by default the one it states, else metres"),
     ] = None
     up_axis: Annotated[
         Literal["x", "y", "z"] | None,
-        Field(description="axis of the file that points up; by default that of its format"),
+        told("axis of the file that points up; by default that of its format"),
     ] = None
-    translation: Annotated[Triple, Field(description="translation in metres, applied last")] = (
+    translation: Annotated[Triple, told("translation in metres, applied last")] = (0, 0, 0)
+    rotation_deg: Annotated[Angles, told("rotation about the world's x, y and z axes, degrees")] = (
         0,
         0,
         0,
     )
-    rotation_deg: Annotated[
-        Angles, Field(description="rotation about the world's x, y and z axes, degrees")
-    ] = (0, 0, 0)
     scale: Annotated[
         Factors,
         short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
-        Field(description="one factor, or one for each axis; applied first"),
+        told("one factor, or one for each axis; applied first"),
     ] = (1, 1, 1)
-    matrix: Annotated[
-        Matrix | None, Field(description="instead of the three: 4 rows of 4, metres")
-    ] = None
+    matrix: Annotated[Matrix | None, told("instead of the three: 4 rows of 4, metres")] = None
 
     @model_validator(mode="after")
     def _one_placement(self) -> MeshFile:
@@ -105,9 +99,9 @@ MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 class Ground(Section):
     """A horizontal rectangle under the scene, `margin_m` wider on each side."""
 
-    height_m: Annotated[Coordinate, Field(description="z of the rectangle, metres")] = 0.0
+    height_m: Annotated[Coordinate, told("z of the rectangle, metres")] = 0.0
     margin_m: Annotated[
-        float, Field(ge=0, le=1e6, description="how much it extends beyond the scene, metres")
+        float, told("how much it extends beyond the scene, metres", ge=0, le=1e6)
     ] = 5.0
 
 
@@ -119,27 +113,20 @@ class SceneSection(Section):
 
     preset: Annotated[
         Literal["seed", "none"] | None,
-        Field(
-            description="seed (six objects); none is the default with files",
-            examples=["seed"],
-        ),
+        told("seed (six objects); none is the default with files", "seed"),
     ] = None
     files: Annotated[
         MeshEntries,
         short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
-        Field(
+        told(
+            "mesh files, by name or with unit, up_axis, scale, rotation_deg, translation",
+            ["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}],
             max_length=10_000,
-            description="mesh files, by name or with unit, up_axis, scale, rotation_deg, "
-            "translation",
-            examples=[["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}]],
         ),
     ] = ()
     ground: Annotated[
         Ground | None,
-        Field(
-            description="a horizontal rectangle below the scene, metres",
-            examples=[{"height_m": 0, "margin_m": 5}],
-        ),
+        told("a horizontal rectangle below the scene, metres", {"height_m": 0, "margin_m": 5}),
     ] = None
 
     @model_validator(mode="after")
@@ -162,50 +149,35 @@ class SensorSection(Section):
 
     model: Annotated[
         str | None,
-        Field(
-            description="a sensor model, see `lidarpool sensors`, or your own .yaml, "
+        told(
+            "a sensor model, see `lidarpool sensors`, or your own .yaml, "
             "from the scenario's folder",
-            examples=["velodyne/vlp16"],
+            "velodyne/vlp16",
         ),
     ] = None
     calibration: Annotated[
         str | None,
-        Field(
-            description="calibration file of a Velodyne, Ouster, Hesai, RoboSense, Livox, or a "
-            "table of beams",
-            examples=["unit.json"],
+        told(
+            "calibration file of a Velodyne, Ouster, Hesai, RoboSense, Livox, or a table of beams",
+            "unit.json",
         ),
     ] = None
     columns: Annotated[
         Annotated[int, Field(ge=1, le=100_000)] | None,
-        Field(
-            description="for an Ouster or a table of beams: azimuths in one turn", examples=[512]
-        ),
+        told("for an Ouster or a table of beams: azimuths in one turn", 512),
     ] = None
     rays_per_revolution: RaysPerRevolution = 1000
     layers: Layers = 40
     vertical_fov_deg: Fov = 60.0
     step_deg: Step = 10.0
     rate_hz: Annotated[
-        Rate | None,
-        Field(
-            description="turns, lines or frames a second; by default the model's, or 10",
-            examples=[20.0],
-        ),
+        Rate | None, told("turns, lines or frames a second; by default the model's, or 10", 20.0)
     ] = None
     min_range_m: Annotated[
-        MinRange | None,
-        Field(
-            description="nearer returns are ignored; by default the model's, or 0",
-            examples=[0.5],
-        ),
+        MinRange | None, told("nearer returns are ignored; by default the model's, or 0", 0.5)
     ] = None
     max_range_m: Annotated[
-        MaxRange | None,
-        Field(
-            description="farther returns are ignored; by default the model's, or .inf",
-            examples=[100.0],
-        ),
+        MaxRange | None, told("farther returns are ignored; by default the model's, or .inf", 100.0)
     ] = None
 
     @model_validator(mode="after")
@@ -282,11 +254,11 @@ class ExportSection(Section):
 
     format: Annotated[
         Literal[tuple(FORMATS)],  # type: ignore[valid-type]
-        Field(description="; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)),
+        told("; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)),
     ]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        Field(description="layout of points in mcap and rosbag2"),
+        told("layout of points in mcap and rosbag2"),
     ] = "velodyne"
 
 
@@ -299,10 +271,7 @@ class OutputSection(Section):
             ...,
         ],
         Strict(False),
-        Field(
-            description="further formats of the cloud",
-            examples=[["laz", {"format": "mcap", "layout": "autoware"}]],
-        ),
+        told("further formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 
     @model_validator(mode="after")
@@ -344,14 +313,10 @@ class Obstacle(Section):
     `object` may have * and ?; the short form is just that name: `- Shelf*`.
     """
 
-    object: Annotated[
-        Text | None,
-        Field(description="name of objects of the scene, with * and ?"),
-    ] = None
-    centre: Annotated[Pair | None, Field(description="centre of a disc, x and y, metres")] = None
+    object: Annotated[Text | None, told("name of objects of the scene, with * and ?")] = None
+    centre: Annotated[Pair | None, told("centre of a disc, x and y, metres")] = None
     radius_m: Annotated[
-        Annotated[float, Field(gt=0, le=1e6)] | None,
-        Field(description="radius of the disc, metres"),
+        Annotated[float, Field(gt=0, le=1e6)] | None, told("radius of the disc, metres")
     ] = None
 
     @model_validator(mode="after")
@@ -375,26 +340,25 @@ class _Route:
 
     enabled: Annotated[
         bool | None,
-        Field(description="by default true if start and target are given", examples=[True]),
+        told("by default true if start and target are given", True),
     ] = None
     start: Annotated[
-        Pair | None,
-        Field(description="x and y, metres; the default objects have one", examples=[[25, 25]]),
+        Pair | None, told("x and y, metres; the default objects have one", [25, 25])
     ] = None
     target: Annotated[
-        Pair | None,
-        Field(description="x and y, metres; the default objects have one", examples=[[-30, -20]]),
+        Pair | None, told("x and y, metres; the default objects have one", [-30, -20])
     ] = None
     obstacles: Annotated[
         Obstacles | None,
         short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
-        Field(
-            description="bounding circles of all objects that are not flat (auto), or a list",
-            examples=["auto", ["Shelf*", {"centre": [-6, -1], "radius_m": 1}]],
+        told(
+            "bounding circles of all objects that are not flat (auto), or a list",
+            "auto",
+            ["Shelf*", {"centre": [-6, -1], "radius_m": 1}],
         ),
     ] = None
     clearance_m: Annotated[
-        float, Field(ge=0, le=1000, description="distance to keep from obstacles, metres")
+        float, told("distance to keep from obstacles, metres", ge=0, le=1000)
     ] = 0.0
 
 
@@ -411,13 +375,13 @@ class PlanningSection(Section, Search, _Route):
 class TaskOptions:
     """Tasks of a run, on whatever cluster."""
 
-    collectors: Annotated[int, Field(ge=1, le=64, description="tasks that write the parts")] = 2
+    collectors: Annotated[int, told("tasks that write the parts", ge=1, le=64)] = 2
     queue_capacity: Annotated[
-        int, Field(ge=1, le=100_000, description="how many items stage 1 may be ahead of stage 2")
+        int, told("how many items stage 1 may be ahead of stage 2", ge=1, le=100_000)
     ] = 10
     backend: Annotated[
         Literal[BACKENDS],  # type: ignore[valid-type]
-        Field(description="cuda, embree or numpy; auto takes the fastest available"),
+        told("cuda, embree or numpy; auto takes the fastest available"),
     ] = "auto"
 
 
@@ -426,13 +390,11 @@ class _Workers:
 
     gpu: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,
-        Field(description="workers that cast rays; by default one for each GPU", examples=[1]),
+        told("workers that cast rays; by default one for each GPU", 1),
     ] = None
     other: Annotated[
         Annotated[int, Field(ge=1, le=10_000)] | None,
-        Field(
-            description="workers that plan paths; by default by the number of cores", examples=[1]
-        ),
+        told("workers that plan paths; by default by the number of cores", 1),
     ] = None
 
 

@@ -6,11 +6,10 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-import yaml
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
-from .placing import Placing, as_entry
+from .placing import Placing, as_entry, on_one_line
 from .scenario import MESH_CLOUD, Scenario
 from .schema import SCHEMA_FILE
 
@@ -26,37 +25,30 @@ _HEAD = f"""\
 # are in metres, angles in degrees, Z is up.
 #
 #     lidarpool check {SCENARIO_FILE}
-#     lidarpool run {SCENARIO_FILE}
-"""
+#     lidarpool run {SCENARIO_FILE}"""
 
 
 def scenario_template(files: Sequence[dict[str, str]] = (), placing: Placing | None = None) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
-    Parameters
-    ----------
-    files
-        Mesh files to survey, as in `scene.files`.
-    placing
-        Where the sensor is put in them; its poses are written if they are around an object.
+    `files` are mesh files to survey, as in `scene.files`. `placing` is where the sensor is put in
+    them; its poses are written if they are around an object.
     """
     lines = [_HEAD]
-    given: dict[str, dict[str, Any]] = {}
+    given: dict[str, Any] = {}
     if files:
-        given = {"scene": {"files": list(files)}, "cloud": MESH_CLOUD}
+        given = {"scene": {"files": [*files]}, "cloud": MESH_CLOUD}
     for name, field in Scenario.model_fields.items():
-        body = [*_top(name, field, given.get(name, {}))]
+        lines.append("")
         if name == "poses" and placing is not None:
-            body = [*_placed(placing), *body] if not placing.around else [*_placed(placing)]
-        lines += ["\n", *(f"{line}\n" for line in body)]
-    return "".join(lines)
+            lines += _placed(placing)
+        if name != "poses" or placing is None or not placing.around:
+            lines += _top(name, field, given.get(name, {}))
+    return "\n".join([*lines, ""])
 
 
 def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
-    """Return the lines of a section, or of a top-level field.
-
-    `given` are values for some fields instead of their defaults.
-    """
+    """Yield the lines of a section or a top-level field, `given` in place of some defaults."""
     section = field.annotation
     if not (isinstance(section, type) and issubclass(section, BaseModel)):
         yield from _lines(name, field, "")
@@ -65,7 +57,9 @@ def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
     yield from _beside(f"{name}:", summary, "")
     for inner, content in section.model_fields.items():
         if inner in given:
-            yield from _beside(f"{inner}: {_flow(given[inner])}", content.description or "", "  ")
+            yield from _beside(
+                f"{inner}: {on_one_line(given[inner])}", content.description or "", "  "
+            )
         else:
             yield from _lines(inner, content, "  ")
 
@@ -81,19 +75,19 @@ def _placed(placing: Placing) -> Iterator[str]:
             yield f"# poses: {poses.removesuffix('.')}"
     if placing.around:
         yield "poses:"
-        yield from (f"  - {_flow(as_entry(pose))}" for pose in placing.poses)
+        yield from (f"  - {on_one_line(as_entry(pose))}" for pose in placing.poses)
 
 
 def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:
     """Return a field with its default, or with examples if the default is computed."""
     text = field.description or ""
     if not field.examples:
-        yield from _beside(f"{name}: {_flow(field.default)}", text, indent)
+        yield from _beside(f"{name}: {on_one_line(field.default)}", text, indent)
         return
     first, *others = field.examples
-    yield from _beside(f"# {name}: {_flow(first)}", text, indent)
+    yield from _beside(f"# {name}: {on_one_line(first)}", text, indent)
     for other in others:
-        yield f"{indent}# {name}: {_flow(other)}"
+        yield f"{indent}# {name}: {on_one_line(other)}"
 
 
 def _beside(code: str, comment: str, indent: str) -> Iterator[str]:
@@ -106,9 +100,3 @@ def _beside(code: str, comment: str, indent: str) -> Iterator[str]:
     sentence = f"{comment[:1].upper()}{comment[1:]}."  # prose, not a field to be uncommented
     yield from textwrap.wrap(sentence, _WIDTH, initial_indent=mark, subsequent_indent=mark)
     yield f"{indent}{code}"
-
-
-def _flow(value: Any) -> str:
-    """Value as YAML on one line."""
-    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000)
-    return text.removesuffix("\n").removesuffix("...").removesuffix("\n")

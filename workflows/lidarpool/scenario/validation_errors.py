@@ -16,14 +16,9 @@ _GIVEN_LETTERS = 160  # letters of the value given
 
 
 def validation_errors(error: ValidationError, model: type[BaseModel]) -> Iterator[str]:
-    """Yield a line for each error: field, value given, values allowed.
+    """Yield a line for each error that a model raised: field, value given, values allowed.
 
-    Parameters
-    ----------
-    error
-        What a model raised.
-    model
-        The model; a field of the same section is suggested for a misspelt name.
+    For a misspelt name, a field of the same section is suggested.
     """
     alike: dict[Any, list[ErrorDetails]] = {}  # {field and kind of mistake: where it was made}
     places = [detail["loc"] for detail in error.errors()]
@@ -90,7 +85,7 @@ def _shown(value: Any) -> str:
     if value is None:
         return "empty"
     if isinstance(value, bool):
-        return "true" if value else "false"
+        return str(value).lower()
     short = reprlib.Repr()
     short.maxstring = short.maxother = short.maxlong = 40
     short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters

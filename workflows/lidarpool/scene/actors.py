@@ -11,7 +11,7 @@ from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE
-from .mesh import Mesh
+from .mesh import Mesh, stacked
 
 _AT_ZERO = Stations((CENTRE,))
 
@@ -58,11 +58,7 @@ class Actor:
 
 def one_mesh(name: str, meshes: Iterable[Mesh]) -> Mesh:
     """Join meshes to one object."""
-    parts = list(meshes)
-    firsts = np.cumsum([0, *(len(part.vertices) for part in parts)])
-    faces = [part.faces + first for part, first in zip(parts, firsts, strict=False)]
-    vertices = np.concatenate([part.vertices for part in parts])
-    return Mesh(name, vertices, np.concatenate(faces))
+    return Mesh(name, *stacked((part.vertices, part.faces) for part in meshes))
 
 
 def box(name: str, size_m: tuple[float, float, float]) -> Mesh:

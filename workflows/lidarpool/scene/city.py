@@ -7,12 +7,14 @@ blocks at once, by arrays, so that ten million triangles take a few seconds more
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from ..base.errors import LidarpoolError
+from ..base.arguments import checked
+from ..base.declared import Seed
 from . import city_kinds
 from .city_kinds import Solid
 from .scene import Scene
@@ -22,9 +24,10 @@ Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 # One row for each thing: position and size; `block` is counted from the centre.
 Things = NDArray[Any]
-
-LEAST_TRIANGLES = 1_000
-MOST_TRIANGLES = 100_000_000
+_THING = np.dtype({
+    "names": ["kind", "owner", "block", "place", "yaw", "scale"],
+    "formats": ["i8", "i8", "i8", "3f8", "f8", "3f8"],
+})  # fmt: skip
 
 CLASSES = ("pavement", "building", "tree", "car", "lamp")
 PAVEMENT, BUILDING, TREE, CAR, LAMP = range(len(CLASSES))
@@ -38,7 +41,10 @@ _LOT_M = 16.5
 _PARKS = 0.09  # share of the blocks
 
 
-def city(triangles: int = 100_000, seed: int = 0) -> Scene:
+@checked
+def city(
+    triangles: Annotated[int, Field(ge=1_000, le=100_000_000)] = 100_000, seed: Seed = 0
+) -> Scene:
     """Make a city of a number of triangles: more triangles make it larger, not finer.
 
     There is a crossing at (0, 0), where a sensor may stand. The ground, at z = 0, is one object,
@@ -48,14 +54,14 @@ def city(triangles: int = 100_000, seed: int = 0) -> Scene:
     Parameters
     ----------
     triangles
-        At least 1000. The scene has at most one in fifty fewer.
+        The scene has at most one in fifty fewer.
     seed
         The same seed and number give the same city.
 
     Raises
     ------
     LidarpoolError
-        For a number of triangles that is out of range, or a negative seed.
+        For a number that is out of range.
 
     Examples
     --------
@@ -63,13 +69,6 @@ def city(triangles: int = 100_000, seed: int = 0) -> Scene:
     >>> scene.names[:2], 19_800 <= len(scene.faces) <= 20_000
     (('ground', 'pavement'), True)
     """
-    if not LEAST_TRIANGLES <= triangles <= MOST_TRIANGLES:
-        raise LidarpoolError(
-            f"A city of {triangles} triangles cannot be made: "
-            f"give {LEAST_TRIANGLES} to {MOST_TRIANGLES}."
-        )
-    if seed < 0:
-        raise LidarpoolError(f"seed is {seed}; it must be at least 0.")
     kinds = city_kinds.all_kinds(seed)
     solids = [solid for group in kinds.values() for solid in group]
     sizes = np.array([len(solid.faces) for solid in solids])
@@ -210,17 +209,7 @@ class _City:
         z: float = 0.15,
     ) -> Things:
         """Rows of one class, `kind` being counted within its group."""
-        out = np.empty(
-            len(block),
-            [
-                ("kind", np.int64),
-                ("owner", np.int64),
-                ("block", np.int64),
-                ("place", np.float64, 3),
-                ("yaw", np.float64),
-                ("scale", np.float64, 3),
-            ],
-        )
+        out = np.empty(len(block), _THING)
         out["kind"], out["owner"], out["block"] = self._start[group] + kind, owner, block
         out["place"][:, :2], out["place"][:, 2] = xy, z
         out["yaw"], out["scale"] = yaw, scale

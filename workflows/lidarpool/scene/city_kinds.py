@@ -9,6 +9,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from .mesh import stacked
 from .shapes import revolve
 
 
@@ -172,12 +173,7 @@ def _lamp() -> Solid:
 
 def joined(parts: Iterable[Solid]) -> Solid:
     """Join solids; where they touch or overlap, each keeps its surface."""
-    solids = list(parts)
-    starts = np.cumsum([0] + [len(solid.vertices) for solid in solids[:-1]])
-    return Solid(
-        np.concatenate([solid.vertices for solid in solids]),
-        np.concatenate([s.faces + start for s, start in zip(solids, starts, strict=True)]),
-    )
+    return Solid(*stacked(parts))
 
 
 def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:

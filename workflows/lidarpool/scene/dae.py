@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.xmlfile import xml_root
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, fanned, instances, joined, unrolled
-from .polygons import triangulated, with_holes
+from .nodes import SMALLER, Content, MeshFileError, Node, flattened, instances, joined
+from .polygons import fanned, triangulated, unrolled, with_holes
+from .transform import rotation_about
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -38,22 +39,15 @@ def read_dae(data: bytes, path: Path) -> Content:
     if root.tag != "COLLADA":
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
     document = _Document(root, Allowance(len(data), SMALLER))
-    content = instances(document.roots(), document.node, path.stem)
-    content.unit_m = _unit_m(root)
+    content = flattened(instances(document.roots(), document.node, path.stem))
+    unit = root.find("asset/unit[@meter]")
+    if unit is not None:
+        content.unit_m = float(unit.attrib["meter"])
+        if not 0 < content.unit_m < np.inf:
+            raise ValueError(f"its unit is {content.unit_m} metres")
     axis = (root.findtext("asset/up_axis") or "").strip()
     content.up_axis = axis[:1].lower() if axis in ("X_UP", "Z_UP") else "y"  # by its standard
     return content
-
-
-def _unit_m(root: Element) -> float | None:
-    unit = root.find("asset/unit")
-    stated = None if unit is None else unit.get("meter")
-    if stated is None:
-        return None
-    metres = float(stated)
-    if not 0 < metres < np.inf:
-        raise ValueError(f"its unit is {stated!r} metres")
-    return metres
 
 
 class _Document:
@@ -76,9 +70,10 @@ class _Document:
             return [self._target(shown, "visual_scene")]
         return self._root.findall("library_visual_scenes/visual_scene")[:1]
 
-    def node(self, element: Element) -> Node[Element]:
+    def node(self, element: Element) -> Node:
         """<node>, or the <visual_scene> around all."""
-        geometries, children = [], []
+        meshes: list[Mesh] = []
+        children = []
         matrix = np.eye(4)
         for child in element:
             if child.tag == "node":
@@ -86,22 +81,18 @@ class _Document:
             elif child.tag == "instance_node":
                 children.append(self._target(child, "node"))
             elif child.tag == "instance_geometry":
-                geometries.append(self._target(child, "geometry"))
+                meshes += self._geometry(self._target(child, "geometry"))
             elif child.tag == "instance_controller":
                 raise MeshFileError(
-                    f"moves vertices by a {self._controller(child)}, which is not supported: apply "
-                    "it, then export"
+                    "moves vertices by a skin (a skeleton) or a morph, which is not supported: "
+                    "apply it, then export"
                 )
             elif child.tag in _STEPS:
                 matrix = matrix @ _STEPS[child.tag](_numbers(child))
             elif child.tag == "skew":
                 raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
         name = element.get("name", "") if element.tag == "node" else ""
-        return Node(name, matrix, lambda: filter(None, map(self._geometry, geometries)), children)
-
-    def _controller(self, instance: Element) -> str:
-        morphs = self._target(instance, "controller").find("morph") is not None
-        return "morph" if morphs else "skin (a skeleton)"
+        return Node(name, matrix, meshes, children)
 
     def _target(self, element: Element, kind: str) -> Element:
         """Element of a kind that another one names."""
@@ -113,8 +104,8 @@ class _Document:
             )
         return found
 
-    def _read_geometry(self, geometry: Element) -> Mesh | None:
-        """One mesh of all primitives, which differ by material only; None without triangles."""
+    def _read_geometry(self, geometry: Element) -> list[Mesh]:
+        """One mesh of all primitives, which differ by material only; none without triangles."""
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
             if geometry.find(kind) is not None:
@@ -127,8 +118,7 @@ class _Document:
                 made = [f for f in _faces(primitive, points, offset, stride) if len(f)]
                 faces.setdefault(vertices, []).extend(made)
         parts = ((self._points(v), np.concatenate(f)) for v, f in faces.items() if f)
-        meshes = joined(name, parts, self._allowance)
-        return meshes[0] if meshes else None
+        return joined(name, parts, self._allowance)
 
     def _inputs(self, primitive: Element) -> tuple[Element, int, int]:
         """<vertices> of a primitive; place of their numbers in <p>, and numbers of each corner."""
@@ -207,14 +197,11 @@ def _translate(numbers: Float) -> Float:
 
 
 def _rotate(numbers: Float) -> Float:
-    """Rotation about an axis (Rodrigues 1840), in degrees; some programs write no axis."""
+    """Rotation about an axis, in degrees; some programs write no axis."""
     *axis, degrees = numbers
-    length = np.linalg.norm(axis)
     out = np.eye(4)
-    if length:
-        cross = np.cross(np.eye(3), np.array(axis) / length)
-        angle = np.radians(degrees)
-        out[:3, :3] += np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    if np.any(axis):
+        out[:3, :3] = rotation_about(axis, degrees)
     return out
 
 

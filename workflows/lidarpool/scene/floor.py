@@ -7,28 +7,19 @@ from numpy.typing import NDArray
 
 from .scene import Scene
 
+Float = NDArray[np.float64]
+
 # More than the thickness of floors: a sensor stands inside thicker things, such as a box hall.
 SLAB_M = 0.5
 FURNITURE_M = 1.5  # a ceiling is at least so high above the floor
 
 
 def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
-    """Heights of the floor at a position, and of the ceiling over it.
+    """Heights of the floor at a position, and of the ceiling over it, in world metres.
 
-    Parameters
-    ----------
-    scene
-        The scene from mesh files.
-    x, y
-        World coordinates, metres.
-
-    Returns
-    -------
-    floor
-        z in world metres: of the lowest triangle there if it faces up, like ground, or of the top
-        of a slab if that is lowest; else of the lowest point of the whole scene.
-    ceiling
-        z of the lowest triangle that is higher than furniture; infinite if there is none.
+    The floor is the lowest triangle there if it faces up, like ground, or the top of a slab if
+    that is lowest; else the lowest point of the whole scene. The ceiling is the lowest triangle
+    that is higher than furniture; infinite if there is none.
     """
     heights, up = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     floor = scene.bounds[0, 2]
@@ -38,15 +29,13 @@ def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
     return float(floor + scene.origin[2]), float(ceiling + scene.origin[2])
 
 
-def heights_at(scene: Scene, x: float, y: float) -> NDArray[np.float64]:
+def heights_at(scene: Scene, x: float, y: float) -> Float:
     """Heights (k,), world metres, at which a vertical line at a place crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 
 
-def _crossings(
-    scene: Scene, at: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+def _crossings(scene: Scene, at: Float) -> tuple[Float, NDArray[np.bool_]]:
     """Heights (k,) at which a vertical line crosses triangles, and which of them face up."""
     a, b, c = np.moveaxis(scene.vertices[scene.faces], 1, 0)
     # Twice the areas of the triangles that the place makes with each side, seen from above.
@@ -57,9 +46,7 @@ def _crossings(
     return (corners * parts[here]).sum(axis=1) / whole[here], whole[here] > 0
 
 
-def _areas(
-    p: NDArray[np.float64], q: NDArray[np.float64], at: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def _areas(p: Float, q: Float, at: Float) -> Float:
     """Twice the areas of p, q and a place from above, positive where they turn left: (f,)."""
     to_p, to_q = p[:, :2] - at, q[:, :2] - at
     return np.asarray(to_p[:, 0] * to_q[:, 1] - to_p[:, 1] * to_q[:, 0])

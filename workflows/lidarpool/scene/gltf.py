@@ -1,8 +1,9 @@
 """glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
 
-This is not trimesh, which keeps one of several instances of a node, refuses files without scenes
-and with sparse or normalised positions, and opens any file that a .gltf names; nor assimp, which
-skips what it cannot read. Only triangles are read, not materials and pictures.
+This is not trimesh 5.2, which puts a node of several parents into one place, loses what hangs on a
+camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
+fans nor files without scenes; nor assimp, which skips what it cannot read. Only triangles are read,
+not materials and pictures.
 """
 
 from __future__ import annotations
@@ -21,7 +22,8 @@ from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, fanned, instances, joined, unrolled
+from .nodes import SMALLER, Content, MeshFileError, Node, flattened, instances, joined
+from .polygons import fanned, unrolled
 
 # Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
@@ -41,11 +43,14 @@ def read_gltf(data: bytes, path: Path) -> Content:
     """
     header, body = _chunks(data)
     _check(header)
-    reader = _Reader(header, body, path, Allowance(len(data), SMALLER))
-    content = instances(_roots(header), reader.node, path.stem)
+    reader = _Reader(header, body, path, len(data))
+    content = flattened(instances(_roots(header), reader.node, path.stem))
     content.unit_m, content.up_axis = 1.0, "y"
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
+
+
+_OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
 
 
 def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -70,9 +75,6 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
     return header, body
 
 
-_OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
-
-
 def _check(header: dict[str, Any]) -> None:
     """Refuse other versions, and features that move vertices other than by nodes."""
     # Version 1.0 names parts, instead of numbering them.
@@ -83,9 +85,7 @@ def _check(header: dict[str, Any]) -> None:
     for name in map(str, header.get("extensionsRequired", ())):
         if not _READ.match(name) and name not in (_DRACO, _INSTANCING):
             raise MeshFileError(f"needs {name}, which cannot be read: export without it")
-    for node in header.get("nodes", ()):
-        if "mesh" not in node:
-            continue
+    for node in (node for node in header.get("nodes", ()) if "mesh" in node):
         if _INSTANCING in node.get("extensions", {}):
             raise MeshFileError(
                 f"places copies by {_INSTANCING}, which cannot be read: export them as objects of "
@@ -115,29 +115,29 @@ def _roots(header: dict[str, Any]) -> list[int]:
 class _Reader:
     """Nodes, meshes, accessors and buffers by their numbers, each read once."""
 
-    def __init__(
-        self, header: dict[str, Any], body: bytes, path: Path, allowance: Allowance
-    ) -> None:
+    def __init__(self, header: dict[str, Any], body: bytes, path: Path, size: int) -> None:
         self._header, self._body, self._path = header, body, path
-        self._allowance = allowance
-        self._mesh = cache(self._read_mesh)
-        self._accessor = cache(self._read_accessor)
-        self._beside = cache(self._read_beside)
-        self._buffer = cache(self._read_buffer)
+        self._allowance = Allowance(size, SMALLER)
+        self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
+        self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
 
-    def node(self, index: int) -> Node[int]:
+    def _part(self, kind: str, index: Any) -> dict[str, Any]:
+        """Part of the file by its number; a negative one would count from the end."""
+        part: dict[str, Any] = self._header[kind][_natural(index)]
+        return part
+
+    def node(self, index: int) -> Node:
         """Node `index`; without a name it gets that of its mesh."""
-        found = self._header["nodes"][_natural(index)]
-        name, children = str(found.get("name") or ""), found.get("children", ())
-        if "mesh" not in found:
-            return Node(name, _matrix(found), children=children)
-        mesh = found["mesh"]
-        name = name or str(self._header["meshes"][mesh].get("name") or "")
-        return Node(name, _matrix(found), lambda: self._mesh(mesh), children)
+        found = self._part("nodes", index)
+        name, meshes = str(found.get("name") or ""), []
+        if "mesh" in found:
+            name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
+            meshes = self._mesh(found["mesh"])
+        return Node(name, _matrix(found), meshes, found.get("children", ()))
 
     def _read_mesh(self, index: int) -> list[Mesh]:
         """One mesh of all primitives, which differ by material only."""
-        mesh = self._header["meshes"][_natural(index)]
+        mesh = self._part("meshes", index)
         surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
         name = str(mesh.get("name") or self._path.stem)
         return joined(name, map(self._primitive, surfaces), self._allowance)
@@ -146,10 +146,10 @@ class _Reader:
         """Vertices (v, 3) and faces (f, 3)."""
         position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")
         packed = primitive.get("extensions", {}).get(_DRACO)
-        if packed and "bufferView" not in self._header["accessors"][position]:
-            return _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
         if position is None:
             return np.empty((0, 3)), np.empty((0, 3), np.int64)
+        if packed and "bufferView" not in self._part("accessors", position):
+            return _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
         vertices = self._accessor(position)
         mode = primitive.get("mode", 4)
         # The corners, and the triangles of strips and fans, before they are checked.
@@ -158,26 +158,25 @@ class _Reader:
         corners = np.arange(count)
         if index is not None:
             corners = self._accessor(index)[:, 0].astype(np.int64)
-        if mode == 5:
-            return vertices, unrolled(corners)
-        if mode == 6:
-            return vertices, fanned(corners)
-        return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        if mode == 4:
+            return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        return vertices, unrolled(corners) if mode == 5 else fanned(corners)
 
     def _read_accessor(self, index: int) -> NDArray[Any]:
         """Numbers (count, width) of an accessor; those of a buffer are not copied."""
-        accessor = self._header["accessors"][_natural(index)]
+        accessor = self._part("accessors", index)
         count, width = _natural(accessor["count"]), _WIDTHS[accessor["type"]]
         kind = np.dtype(_TYPES[accessor["componentType"]])
+        sparse = accessor.get("sparse")
+        if sparse:
+            self._allowance.take(count * width * kind.itemsize)
         if "bufferView" in accessor:
             numbers = self._array(accessor, kind, count, width)
-        elif sparse := accessor.get("sparse"):
-            self._allowance.take(count * width * kind.itemsize)
+        elif sparse:
             numbers = np.zeros((count, width), kind)
         else:
             raise ValueError(f"accessor {index} has no content")
-        if sparse := accessor.get("sparse"):
-            self._allowance.take(numbers.size * kind.itemsize)
+        if sparse:
             changed, values = sparse["indices"], sparse["values"]
             where = np.dtype(_TYPES[changed["componentType"]])
             rows = self._array(changed, where, sparse["count"], 1)[:, 0]
@@ -192,7 +191,7 @@ class _Reader:
     def _array(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
         """Numbers (count, width) of a buffer view, from `at['byteOffset']` on."""
         row = kind.itemsize * width
-        stride = self._header["bufferViews"][_natural(at["bufferView"])].get("byteStride", row)
+        stride = self._part("bufferViews", at["bufferView"]).get("byteStride", row)
         view = self._view(at["bufferView"])[at.get("byteOffset", 0) :]
         if not count:
             return np.empty((0, width), kind)
@@ -201,12 +200,12 @@ class _Reader:
         return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
 
     def _view(self, index: int) -> memoryview:
-        view = self._header["bufferViews"][_natural(index)]
+        view = self._part("bufferViews", index)
         begin = view.get("byteOffset", 0)
         return memoryview(self._buffer(view["buffer"]))[begin : begin + view["byteLength"]]
 
     def _read_buffer(self, index: int) -> bytes:
-        buffer = self._header["buffers"][_natural(index)]
+        buffer = self._part("buffers", index)
         uri = buffer.get("uri")
         if uri is None:
             if index:
@@ -226,9 +225,23 @@ class _Reader:
         return content
 
     def _read_beside(self, uri: str) -> bytes:
-        content = _beside(uri, self._path)
-        self._allowance.grow(len(content))
-        return content
+        """Read a buffer file: names are escaped by the standard, but not by all programs."""
+        folder = self._path.parent.resolve()
+        targets = [folder / name for name in (uri.strip(), unquote(uri.strip()))]
+        if not all(target.resolve().is_relative_to(folder) for target in targets):
+            raise MeshFileError(
+                f"takes data from {uri[:80]!r}, but only files in its own folder are read: "
+                "export it as .glb, in one file"
+            )
+        for target in targets:
+            if target.is_file():  # reading a pipe would wait for ever
+                content = target.read_bytes()
+                self._allowance.grow(len(content))
+                return content
+        raise MeshFileError(
+            f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export as "
+            ".glb"
+        )
 
 
 def _natural(number: Any) -> int:
@@ -273,44 +286,17 @@ def _draco_counts(data: bytes) -> tuple[int, int]:
 
     The decoder makes them all, though a few bytes can stand for any number.
     """
-    magic, major, minor, kind, method, flags = struct.unpack_from("<5s4BH", data)
+    magic, version, kind, method, flags = struct.unpack_from("<5sHBBH", data)
     if magic != b"DRACO" or kind != 1 or method > 1:
         raise ValueError("its Draco data are not a mesh")
-    if (major, minor) != (2, 2) or flags & 0x8000:
+    if version != 0x0202 or flags & 0x8000:
         raise MeshFileError(
-            f"has Draco data of version {major}.{minor}{', with metadata' * bool(flags & 0x8000)}; "
-            "2.2 without metadata is read: export it again"
+            "has Draco data of another version than 2.2, or with metadata: export it again"
         )
-    at = 11 + method  # the second method has a byte more
-    counts = []
-    for _ in range(2):
-        count = shift = 0
-        while data[at] & 0x80:
-            count, shift, at = count | (data[at] & 0x7F) << shift, shift + 7, at + 1
-        counts.append(count | data[at] << shift)
-        at += 1
-    return counts[0], counts[1]
+    # Numbers of seven bits a byte, the least first; the second method has a byte more before them.
+    first, second = re.findall(rb"(?s)[\x80-\xff]*[\0-\x7f]", data[11 + method : 31])[:2]
+    return _varint(first), _varint(second)
 
 
-def _beside(uri: str, path: Path) -> bytes:
-    """Read a buffer file: names are escaped by the standard, but not by all programs."""
-    folder = path.parent.resolve()
-    shown = repr(uri[:80])
-    target = folder
-    for name in (uri.strip(), unquote(uri.strip())):
-        target = folder / name
-        scheme = re.match(r"[A-Za-z][A-Za-z0-9+.-]*:", name)
-        if scheme or not target.resolve().is_relative_to(folder):
-            raise MeshFileError(
-                f"takes data from {shown}, but only files in its own folder are read: "
-                "export it as .glb, in one file"
-            )
-        if target.exists():
-            break
-    if not target.exists():
-        raise MeshFileError(
-            f"takes data from {shown}, which is not there: put it beside, or export as .glb"
-        )
-    if not target.is_file():  # reading a pipe would wait for ever
-        raise MeshFileError(f"takes data from {shown}, which is not a file")
-    return target.read_bytes()
+def _varint(data: bytes) -> int:
+    return sum((byte & 0x7F) << 7 * at for at, byte in enumerate(data))

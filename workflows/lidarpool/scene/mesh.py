@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -57,6 +59,18 @@ class Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
         faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
         return Mesh(name, self.vertices @ linear.T + offset, faces)
+
+
+def stacked(
+    parts: Iterable[tuple[NDArray[Any], NDArray[Any]]],
+) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Vertices and faces of several (vertices, faces), one after the other."""
+    vertices, faces, first = [], [], 0
+    for points, corners in parts:
+        vertices.append(points)
+        faces.append(corners + first)
+        first += len(points)
+    return np.concatenate(vertices), np.concatenate(faces)
 
 
 def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:

@@ -7,11 +7,13 @@ import logging
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
 from ..base.allowance import check_fits
-from ..base.errors import LidarpoolError
+from ..base.arguments import checked
+from ..base.errors import LidarpoolError, prefixed
 from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean
 from .dae import read_dae
@@ -37,8 +39,6 @@ _READERS: dict[str, Callable[[bytes, Path], Content]] = {
 SUFFIXES = tuple(_READERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
-_Y_UP = (".glb", ".gltf")  # by their standard
-_NO_AXES = (".obj",)  # of formats without axes, the one that is Y-up as often as not
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
 OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
 
@@ -50,11 +50,12 @@ _LETTERS = 200  # of a name, or of what a reader says
 _log = logging.getLogger(__name__)
 
 
+@checked
 def load_meshes(
     path: str | Path,
     *,
-    unit: str | None = None,
-    up_axis: str | None = None,
+    unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
+    up_axis: Literal[tuple(UP_AXES)] | None = None,  # type: ignore[valid-type]
     transform: Transform | None = None,
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
@@ -69,10 +70,10 @@ def load_meshes(
     path
         One of `SUFFIXES`, in any case.
     unit
-        One of `UNITS_M`; None takes the file's own (.dae, .3mf, .glb and .gltf), else metres.
+        None takes the file's own (.dae, .3mf, .glb and .gltf), else metres.
     up_axis
-        'x', 'y' or 'z'; None takes the file's own (.dae), the standard's (Y-up for .glb and
-        .gltf, Z-up for .3mf), else Z-up.
+        None takes the file's own (.dae), the standard's (Y-up for .glb and .gltf, Z-up for .3mf),
+        else Z-up.
     transform
         Placement in the world, in metres, after unit and up axis.
     tell
@@ -92,24 +93,18 @@ def load_meshes(
         If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
-    if unit is not None and unit not in UNITS_M:
-        raise LidarpoolError(f"unit is {unit!r}; it must be one of {', '.join(UNITS_M)}.")
-    if up_axis is not None and up_axis not in UP_AXES:
-        raise LidarpoolError(f"up_axis is {up_axis!r}; it must be x, y or z.")
     data = _bytes_of(path)
-    with np.errstate(
-        all="ignore"
-    ):  # of broken numbers in files; infinite and NaN values are refused
+    # Of broken numbers in files: infinite and NaN values are refused.
+    with np.errstate(all="ignore"):
         try:
             content = _read_whole(path, data)
         except LidarpoolError as error:
             raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
-        try:
-            meshes = tuple(_placed(mesh, path.stem, upright, transform) for mesh in content.meshes)
-        except LidarpoolError as error:
-            raise LidarpoolError(f"{path}: {error}") from error
+        places = [upright] if transform is None else [upright, transform]
+        with prefixed(path):
+            meshes = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
@@ -125,17 +120,13 @@ def wrote_it(path: Path) -> bool:
 
 
 def _tell_axes(
-    path: Path,
-    content: Content,
-    meshes: Sequence[Mesh],
-    axes: Callable[[str], None] | None,
+    path: Path, content: Content, meshes: Sequence[Mesh], axes: Callable[[str], None] | None
 ) -> None:
-    suffix, why, other = path.suffix.lower(), "", "y"
-    if suffix in _Y_UP:
+    if path.suffix.lower() in (".glb", ".gltf"):
         why, other = _lies(content, meshes), "z"
         done = f"was turned from Y-up to Z-up, as glTF asks{why}"
-    elif suffix in _NO_AXES:
-        done = "states no axes and is taken as Z-up"
+    elif path.suffix.lower() == ".obj":  # the one without axes that is Y-up as often as not
+        done, why, other = "states no axes and is taken as Z-up", "", "y"
     else:
         return
     (axes or (_log.warning if why else _log.info))(
@@ -158,10 +149,18 @@ def _lies(content: Content, meshes: Sequence[Mesh]) -> str:
 def _read_whole(path: Path, data: bytes) -> Content:
     """Read any file: returns at least one mesh, or raises LidarpoolError."""
     try:
-        for beginning, what in _FOREIGN:
-            if beginning.match(data):
+        for beginning, what in _FOREIGN.items():
+            if re.match(beginning, data):
                 raise MeshFileError(what)
         content = _READERS[path.suffix.lower()](data, path)
+        if not content.meshes:
+            if content.skipped:
+                raise MeshFileError("has no triangles that are not scaled to zero")
+            raise MeshFileError(
+                "holds no triangles: it is empty, or has only points, lines or other things that "
+                "reflect no light"
+            )
+        return content
     except MemoryError:
         raise
     except MeshFileError as refused:
@@ -175,14 +174,6 @@ def _read_whole(path: Path, data: bytes) -> Content:
         raise LidarpoolError(
             f"{path} is broken or cut short ({reason}): export it again."
         ) from error
-    if not content.meshes:
-        if content.skipped:
-            raise LidarpoolError(f"{path} has no triangles that are not scaled to zero.")
-        raise LidarpoolError(
-            f"{path} holds no triangles: it is empty, or has only points, lines or other things "
-            "that reflect no light."
-        )
-    return content
 
 
 def _bytes_of(path: Path) -> bytes:
@@ -193,10 +184,9 @@ def _bytes_of(path: Path) -> bytes:
             f"can be read; these are: {' '.join(SUFFIXES)}."
         )
     try:
-        check_fits(path)
+        with prefixed(path):
+            check_fits(path)
         data = path.read_bytes()
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
     except (FileNotFoundError, NotADirectoryError) as error:
         raise LidarpoolError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"
@@ -218,28 +208,16 @@ def _like(path: Path) -> str:
     return did_you_mean(path.name, [name for name in beside if name.lower().endswith(SUFFIXES)])
 
 
-# Beginnings of files that are not meshes.
-_FOREIGN = (
-    (re.compile(rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf"), "is packed: unpack it first"),
-    (
-        re.compile(rb"(?i)\s*(<!doctype html|<html)"),
-        "is a web page: download the file itself",
-    ),
-    (
-        re.compile(rb"version https://git-lfs"),
-        "is a Git LFS pointer: get the mesh with git lfs pull",
-    ),
-)
-
-
+# Beginnings of files that are not meshes, as expressions.
+_FOREIGN = {
+    rb"\x1f\x8b|BZh|\xfd7zXZ\0|7z\xbc\xaf": "is packed: unpack it first",
+    rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
+    rb"version https://git-lfs": "is a Git LFS pointer: get the mesh with git lfs pull",
+}
 # Beginnings by which a file of the wrong ending is recognised.
 _BEGINNINGS = {
-    ".glb": b"glTF",
-    ".ply": b"ply",
-    ".off": b"OFF",
-    ".stl": b"solid ",
-    ".3mf": b"PK\x03\x04",
-}
+    ".glb": b"glTF", ".ply": b"ply", ".off": b"OFF", ".stl": b"solid ", ".3mf": b"PK\x03\x04",
+}  # fmt: skip
 
 
 def _other_format(path: Path, data: bytes) -> str:
@@ -252,12 +230,11 @@ def _other_format(path: Path, data: bytes) -> str:
     return ""
 
 
-def _placed(mesh: Mesh, stem: str, upright: Transform, transform: Transform | None) -> Mesh:
+def _placed(mesh: Mesh, stem: str, places: Sequence[Transform]) -> Mesh:
     """Mesh in the world, with a name that is safe for terminals and files."""
     name = _printable(mesh.name) or _printable(stem)
-    mesh = mesh.moved(name, upright.linear, upright.offset)
-    if transform is not None:
-        mesh = mesh.moved(name, transform.linear, transform.offset)
+    for place in places:
+        mesh = mesh.moved(name, place.linear, place.offset)
     reach = np.abs(mesh.vertices).max()
     if reach > FARTHEST_M:
         raise LidarpoolError(

@@ -2,18 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable
+from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
-from typing import Generic, TypeVar
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, bytes_of, memory_share
-from .mesh import Mesh
-
-K = TypeVar("K", bound=Hashable)
+from .mesh import Mesh, stacked
+from .polygons import check_corners
 
 SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to too much
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
@@ -38,54 +37,62 @@ class Content:
 
 
 @dataclass
-class Node(Generic[K]):
+class Node:
     """A node, which places meshes and other nodes."""
 
     name: str  # empty where the file has none
     matrix: NDArray[np.float64]  # (4, 4), from its coordinates to those of its parent
-    # Makes the node's meshes, in its coordinates; called for each instance.
-    meshes: Callable[[], Iterable[Mesh]] = list
-    children: Iterable[K] = ()  # keys of the nodes in it
+    meshes: Sequence[Mesh] = ()  # in its coordinates; the same objects wherever a mesh is used
+    children: Iterable[Hashable] = ()  # keys of the nodes in it
 
 
-def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) -> Content:
-    """Place all meshes of a scene graph.
+class Instance(NamedTuple):
+    """A mesh in its own coordinates, and where a scene graph places it."""
 
-    A node may be in several others; each instance is an object, named by the nearest node with a
-    name.
+    mesh: Mesh
+    matrix: NDArray[np.float64]  # (4, 4), to the coordinates of the file
+    name: str
 
-    Parameters
-    ----------
-    roots
-        Keys of the outermost nodes.
-    node_of
-        Returns the node of a key.
-    stem
-        Name for meshes that have none.
+
+def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[Instance]:
+    """Find all places of meshes in a scene graph; a node may be in several others.
+
+    `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. An instance is
+    named by the nearest node with a name, else by its mesh, else it gets `stem`.
 
     Raises
     ------
     MeshFileError
-        If nodes contain each other without end, or some hundred thousand times, or the placed
-        objects would take more than a quarter of the memory.
+        If nodes contain each other without end, or some hundred thousand times.
     """
-    content = Content([])
     node_of = cache(node_of)
-    places = []
+    placed, begun = [], 0
     stack = [(key, np.eye(4), "") for key in reversed(list(roots))]
     while stack:
         key, above, name = stack.pop()
+        begun += 1
         node = node_of(key)
         matrix, name = above @ node.matrix, node.name or name
-        places.append((node, matrix, name))
+        placed += [Instance(mesh, matrix, name or mesh.name or stem) for mesh in node.meshes]
         stack += [(child, matrix, name) for child in reversed(list(node.children))]
         # A few lines can make any number of nodes.
-        if len(places) + len(stack) > MOST_NODES:
+        if begun + len(stack) > MOST_NODES:
             raise MeshFileError(
                 f"has nodes that contain each other, more than {MOST_NODES:,} in all: export it "
                 "again"
             )
-    placed = [(mesh, matrix, name) for node, matrix, name in places for mesh in node.meshes()]
+    return placed
+
+
+def flattened(placed: Sequence[Instance]) -> Content:
+    """Copy each mesh to all its places.
+
+    Raises
+    ------
+    MeshFileError
+        If a matrix is none of a place, or the copies would take more than a quarter of the memory.
+    """
+    content = Content([])
     total = sum(mesh.vertices.nbytes + mesh.faces.nbytes for mesh, _, _ in placed)
     if total > memory_share():
         raise MeshFileError(
@@ -93,22 +100,19 @@ def instances(roots: Iterable[K], node_of: Callable[[K], Node[K]], stem: str) ->
             f"{bytes_of(memory_share())}, a quarter of the memory: {SMALLER}"
         )
     for mesh, matrix, name in placed:
-        named = name or mesh.name or stem
         if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
             raise MeshFileError(
-                f"places {named[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
+                f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
             )
         if np.linalg.matrix_rank(matrix[:3, :3]) < 2:
-            content.skipped.append(named)
+            content.skipped.append(name)
         else:
-            content.meshes.append(mesh.moved(named, matrix[:3, :3], matrix[:3, 3]))
+            content.meshes.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))
     return content
 
 
 def joined(
-    name: str,
-    parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]],
-    allowance: Allowance,
+    name: str, parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]], allowance: Allowance
 ) -> list[Mesh]:
     """Join several (vertices, faces) to one mesh; none without faces.
 
@@ -118,39 +122,17 @@ def joined(
         If a face refers to a missing vertex; LidarpoolError if it takes more than allowed.
     """
     kept = [_own(vertices, faces, allowance) for vertices, faces in parts if len(faces)]
-    if not kept:
-        return []
-    first = np.cumsum([0] + [len(vertices) for vertices, _ in kept[:-1]])
-    vertices = np.concatenate([vertices for vertices, _ in kept])
-    faces = [faces + at for (_, faces), at in zip(kept, first, strict=True)]
-    return [Mesh(name, vertices, np.concatenate(faces))]
+    return [Mesh(name, *stacked(kept))] if kept else []
 
 
 def _own(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], allowance: Allowance
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Vertices and faces, without unused vertices if many parts may share all of them."""
-    if not 0 <= faces.min() <= faces.max() < len(vertices):
-        raise ValueError(
-            f"faces refer to vertices {faces.min()} to {faces.max()}, counted from 0, of "
-            f"{len(vertices)}"
-        )
+    check_corners(faces, len(vertices))
     allowance.take(faces.nbytes)
     if faces.size < len(vertices):
         used, faces = np.unique(faces, return_inverse=True)
         vertices, faces = vertices[used], faces.reshape(-1, 3)
     allowance.take(24 * len(vertices))  # in double precision
     return vertices, faces
-
-
-def unrolled(strip: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles (t, 3) of a strip of corners (t + 2,), all facing the same way."""
-    faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
-    faces[1::2] = faces[1::2, [1, 0, 2]]
-    return faces
-
-
-def fanned(corners: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles (t, 3) of a fan of corners (t + 2,)."""
-    first = np.broadcast_to(corners[:1], len(corners[2:]))
-    return np.stack([first, corners[1:-1], corners[2:]], axis=1)

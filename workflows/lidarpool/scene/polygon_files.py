@@ -20,11 +20,36 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .mesh import Mesh
-from .nodes import Content, MeshFileError, unrolled
+from .nodes import Content, MeshFileError
 from .polygons import triangulated
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
+
+
+@dataclass
+class _Polygons:
+    """Polygons of one object, while they are read: their corners, from 0, and the number of each.
+
+    Lists of Python would take ten times as much.
+    """
+
+    corners: array[int] = field(default_factory=lambda: array("q"))
+    sizes: array[int] = field(default_factory=lambda: array("q"))
+
+    def add(self, corners: list[int]) -> None:
+        """Add a polygon."""
+        self.corners.extend(corners)
+        self.sizes.append(len(corners))
+
+    def mesh(self, name: str, vertices: Float) -> list[Mesh]:
+        """As `_mesh`."""
+        return _mesh(
+            name,
+            vertices,
+            np.frombuffer(self.corners, np.int64),
+            np.frombuffer(self.sizes, np.int64),
+        )
 
 
 def _mesh(name: str, vertices: Float, corners: Int, sizes: Int) -> list[Mesh]:
@@ -39,14 +64,6 @@ def _mesh(name: str, vertices: Float, corners: Int, sizes: Int) -> list[Mesh]:
 # -- .obj ----------------------------------------------------------------------------------------
 
 
-@dataclass
-class _Part:
-    """Faces of one object: all their vertices, from 0, and the corners of each."""
-
-    corners: array[int] = field(default_factory=lambda: array("q"))
-    sizes: array[int] = field(default_factory=lambda: array("q"))
-
-
 def read_obj(data: bytes, path: Path) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
@@ -56,7 +73,7 @@ def read_obj(data: bytes, path: Path) -> Content:
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     numbers = array("d")
-    parts = {path.stem: _Part()}
+    parts = {path.stem: _Polygons()}
     part = parts[path.stem]
     for line in text.split(b"\n"):
         key, _, rest = line.lstrip(b" ").partition(b" ")
@@ -66,17 +83,11 @@ def read_obj(data: bytes, path: Path) -> Content:
                 raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
             numbers.extend(map(float, words))
         elif key == b"f":
-            corners = _obj_corners(rest.partition(b"#")[0], len(numbers) // 3, line)
-            part.corners.extend(corners)
-            part.sizes.append(len(corners))
+            part.add(_obj_corners(rest.partition(b"#")[0], len(numbers) // 3, line))
         elif key == divider:
-            part = parts.setdefault(_text(rest.strip()) or path.stem, _Part())
-    vertices = np.frombuffer(numbers, np.float64).reshape(-1, 3)
-    meshes: list[Mesh] = []
-    for name, part in parts.items():
-        polygons = np.frombuffer(part.corners, np.int64), np.frombuffer(part.sizes, np.int64)
-        meshes += _mesh(name, vertices, *polygons)
-    return Content(meshes)
+            part = parts.setdefault(_text(rest.strip()) or path.stem, _Polygons())
+    vertices = np.frombuffer(numbers).reshape(-1, 3)
+    return Content([mesh for name, part in parts.items() for mesh in part.mesh(name, vertices)])
 
 
 def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
@@ -124,38 +135,21 @@ def read_off(data: bytes, path: Path) -> Content:
         raise ValueError("no OFF header with the numbers of vertices and faces")
     points, polygons = map(int, counts[:2])
     if len(lines) != points + polygons:
-        # Only colours make line ends significant; otherwise any white space separates.
-        lines = _rows([word for line in lines for word in line], points, polygons)
-    vertices, corners, sizes = array("d"), array("q"), array("q")
+        raise ValueError(
+            f"{points:,} vertices and {polygons:,} faces announced, each in a line of its own, and "
+            f"{len(lines):,} lines there"
+        )
+    numbers, polygon = array("d"), _Polygons()
     for line in lines[:points]:
         if len(line) < 3:
             raise ValueError(f"a vertex has {len(line)} numbers")
-        vertices.extend(map(float, line[:3]))
+        numbers.extend(map(float, line[:3]))  # a colour may follow
     for line in lines[points:]:
         size = int(line[0])
         if not 0 <= size < len(line):
             raise ValueError(f"a face of {size} corners has {len(line) - 1}")
-        corners.extend(map(int, line[1 : size + 1]))  # a colour may follow
-        sizes.append(size)
-    places = np.frombuffer(vertices, np.float64).reshape(-1, 3)
-    return Content(
-        _mesh(path.stem, places, np.frombuffer(corners, np.int64), np.frombuffer(sizes, np.int64))
-    )
-
-
-def _rows(words: list[bytes], points: int, polygons: int) -> list[list[bytes]]:
-    """Words of each vertex and each face."""
-    rows = [words[3 * i : 3 * i + 3] for i in range(min(points, len(words)))]
-    at = 3 * points
-    while at < len(words):
-        size = max(int(words[at]), 0) + 1
-        rows.append(words[at : at + size])
-        at += size
-    if len(rows) != points + polygons:
-        raise ValueError(
-            f"{points:,} vertices and {polygons:,} faces announced, but the content differs"
-        )
-    return rows
+        polygon.add(list(map(int, line[1 : size + 1])))
+    return Content(polygon.mesh(path.stem, np.frombuffer(numbers).reshape(-1, 3)))
 
 
 # -- .stl ----------------------------------------------------------------------------------------
@@ -216,31 +210,25 @@ class _Element:
 
 
 def read_ply_mesh(data: bytes, path: Path) -> Content:
-    """Read a Stanford polygon file: text or binary, faces of any mixture, or strips."""
+    """Read a Stanford polygon file: text or binary, faces of any mixture."""
     elements, order, body = _ply_header(data)
     counts = {element.name: element.count for element in elements}
-    if not counts.get("face") and not counts.get("tristrips"):
+    if counts.get("tristrips"):
+        raise MeshFileError("has triangle strips, which are not read: export it with faces")
+    if not counts.get("face"):
         raise MeshFileError("is a point cloud, it has no faces: make a mesh of it first")
     rows = _ply_rows(elements, order, body)
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     vertices = np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=1).astype(np.float64)
-    meshes: list[Mesh] = []
-    for kind in ("face", "tristrips"):
-        if not counts.get(kind):
-            continue
-        name = next((name for name in _PLY_LISTS if name in rows[kind]), None)
-        if name is None:
-            raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
-        numbers, sizes = rows[kind][name]
-        corners = numbers.astype(np.int64)
-        if not np.array_equal(corners, numbers):
-            raise ValueError("vertex indices of faces are not whole numbers")
-        if kind == "tristrips":
-            corners = _ply_strips(corners, sizes)
-            sizes = np.full(len(corners) // 3, 3)
-        meshes += _mesh(path.stem, vertices, corners, sizes)
-    return Content(meshes)
+    name = next((name for name in _PLY_LISTS if name in rows["face"]), None)
+    if name is None:
+        raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
+    numbers, sizes = rows["face"][name]
+    corners = numbers.astype(np.int64)
+    if not np.array_equal(corners, numbers):
+        raise ValueError("vertex indices of faces are not whole numbers")
+    return Content(_mesh(path.stem, vertices, corners, sizes))
 
 
 def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:
@@ -307,9 +295,8 @@ def _element_rows(
     first, end = (
         _ply_row(element, kinds, order, body, at) if count else ([(at, 1)] * len(names), at)
     )
-    row: list[
-        Any
-    ] = []  # dtype of a row as long as the first: usually all are, and are read at once
+    # The type of a row as long as the first: usually all are, and are read at once.
+    row: list[Any] = []
     for (name, (_, length)), (_, n) in zip(element.properties.items(), first, strict=True):
         row += [(f"{name} length", order + length, (1,))] if length else []
         row += [(name, kinds[name], (n,))]
@@ -346,7 +333,7 @@ def _ply_row(
     for name, (_, length) in element.properties.items():
         n = 1
         if length:
-            (n,) = struct.unpack_from(order + _CODES[length], body, at)
+            (n,) = struct.unpack_from(order + np.dtype(length).char, body, at)
             if n < 0 or n != int(n):
                 raise ValueError(f"a list has the length {n}")
             at, n = at + int(length[1]), int(n)
@@ -357,19 +344,3 @@ def _ply_row(
             f"{element.count:,} rows of {element.name[:20]} announced, but there are fewer"
         )
     return out, at
-
-
-_CODES = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "f4": "f", "f8": "d"}
-
-
-def _ply_strips(numbers: Int, sizes: Int) -> Int:
-    """Corners of the triangles of strips, which end with each row and at each -1 in it."""
-    ends = np.zeros(len(numbers) + 1, np.int64)
-    np.add.at(ends, np.cumsum(sizes), 1)
-    strip = np.cumsum(ends[:-1] + (numbers < 0))[numbers >= 0]
-    faces = unrolled(numbers[numbers >= 0])
-    # From the beginning of its own strip each second one is turned, not from that of all.
-    first = np.searchsorted(strip, strip)[: len(faces)]
-    odd = first % 2 == 1
-    faces[odd] = faces[odd][:, [1, 0, 2]]
-    return faces[strip[: len(faces)] == strip[2:]].reshape(-1)

@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 Float = NDArray[np.float64]
+Int = NDArray[np.int64]
 
 # For an outline that crosses itself everywhere, the clipper's time grows with their cube: 20 s for
 # so many. Larger outlines are probably broken files.
@@ -16,35 +17,27 @@ _WARPED = 1e-5  # a polygon is plane if its corners lie this near a plane, over 
 _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
 
 
-def triangulated(
-    vertices: NDArray[np.float64], corners: NDArray[np.int64], sizes: NDArray[np.int64]
-) -> NDArray[np.int64]:
+def triangulated(vertices: Float, corners: Int, sizes: Int) -> Int:
     """Cut polygons into triangles with the same corners and orientation.
 
     Convex polygons and quadrangles become fans, all of one size at once; mapbox_earcut clips the
     ears of others.
 
-    Parameters
-    ----------
-    vertices
-        float64 (v, 3).
-    corners
-        int64 (sum of sizes,): the corners of all polygons one after the other.
-    sizes
-        int64 (p,): corners of each polygon; polygons with fewer than three are dropped.
+    `vertices` are (v, 3), `corners` (sum of sizes,) those of all polygons one after the other, and
+    `sizes` (p,) how many each has; polygons with fewer than three are dropped.
 
     Returns
     -------
-    int64 (t, 3), in the order of the polygons: of each two triangles less than it has corners.
-    There are fewer if a plane outline crosses or touches itself or runs back on itself, such as
-    around a hole: the enclosed area is filled, and parts without area are left out.
+    (t, 3), in the order of the polygons: of each two triangles less than it has corners. There are
+    fewer if a plane outline crosses or touches itself or runs back on itself, such as around a
+    hole: the enclosed area is filled, and parts without area are left out.
 
     Raises
     ------
     ValueError
         If a corner refers to no vertex, or a non-convex polygon has too many corners.
     """
-    _check(vertices, corners)
+    check_corners(corners, len(vertices))
     first = np.cumsum(sizes) - sizes
     ends = np.cumsum(np.maximum(sizes - 2, 0))
     out = np.full((int(ends[-1]) if len(ends) else 0, 3), -1, dtype=np.int64)
@@ -54,9 +47,7 @@ def triangulated(
         if size == 4:
             rows = _begun_well(vertices, rows)
         places = ends[which, None] - (size - 2) + np.arange(size - 2)
-        out[places, 0] = rows[:, :1]
-        out[places, 1] = rows[:, 1:-1]
-        out[places, 2] = rows[:, 2:]
+        out[places] = fanned(rows)
         if size > 4:
             for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
                 clipped = with_holes(vertices, [rows[i]])
@@ -68,7 +59,7 @@ def triangulated(
     return out[out[:, 0] >= 0]
 
 
-def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+def _begun_well(vertices: Float, rows: Int) -> Int:
     """Rotate quadrangles (p, 4) to begin at their reflex corner, if any, so that a fan fills them.
 
     The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
@@ -78,7 +69,7 @@ def _begun_well(vertices: NDArray[np.float64], rows: NDArray[np.int64]) -> NDArr
     return np.take_along_axis(rows, (begin[:, None] + np.arange(4)) % 4, axis=1)
 
 
-def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) -> NDArray[np.int64]:
+def with_holes(vertices: Float, rings: list[Int]) -> Int:
     """Clip the ears off one polygon: an outline, and the outlines of holes in it.
 
     The triangles (t, 3) have the orientation of the outline; none if it has no area.
@@ -91,20 +82,35 @@ def with_holes(vertices: NDArray[np.float64], rings: list[NDArray[np.int64]]) ->
     corners = np.concatenate(rings)
     if len(corners) > MOST_CORNERS:
         raise ValueError(f"a face has {len(corners):,} corners and is not convex: triangulate it")
-    _check(vertices, corners)
-    points = (
-        vertices[corners] - vertices[corners[0]]
-    )  # local coordinates, so that far ones lose no digits
+    check_corners(corners, len(vertices))
+    points = vertices[corners] - vertices[corners[0]]  # so that far ones lose no digits
     outline = points[: len(rings[0])]
     normal = _newell(outline)
     drop = int(np.abs(normal).argmax())
     across, up = (drop + 1) % 3, (drop + 2) % 3
     if normal[drop] < 0:  # the clipper's triangles run anticlockwise, whatever the polygon does
         across, up = up, across
-    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
-    flat = np.ascontiguousarray(points[:, [across, up]])
-    found = mapbox_earcut.triangulate_float64(flat, ends).astype(np.int64)
-    return corners[found].reshape(-1, 3)
+    return corners[_clipped(points[:, [across, up]], [len(ring) for ring in rings])]
+
+
+def _clipped(flat: Float, sizes: list[int]) -> Int:
+    """Triangles (t, 3) of a plane outline (k, 2) and holes in it, of so many corners each."""
+    ends = np.cumsum(sizes).astype(np.uint32)
+    found = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends)
+    return np.asarray(found, np.int64).reshape(-1, 3)
+
+
+def unrolled(strip: Int) -> Int:
+    """Triangles (t, 3) of a strip of corners (t + 2,), all facing the same way."""
+    faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
+    faces[1::2] = faces[1::2, [1, 0, 2]]
+    return faces
+
+
+def fanned(corners: Int) -> Int:
+    """Triangles (…, t, 3) of fans of corners (…, t + 2)."""
+    first = np.broadcast_to(corners[..., :1], corners[..., 2:].shape)
+    return np.stack([first, corners[..., 1:-1], corners[..., 2:]], axis=-1)
 
 
 def _lost(points: Float, triangles: Float) -> bool:
@@ -125,7 +131,7 @@ def _lost(points: Float, triangles: Float) -> bool:
     )
 
 
-def _all_triangles(points: Float) -> NDArray[np.int64]:
+def _all_triangles(points: Float) -> Int:
     """Triangles (k - 2, 3) of a warped polygon (k, 3): clipped as seen along its normal, or a fan.
 
     The fan is the one with the least area, which of a polygon with one reflex corner begins there.
@@ -135,19 +141,16 @@ def _all_triangles(points: Float) -> NDArray[np.int64]:
     normal = _newell(points)
     normal = normal / np.linalg.norm(normal)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    flat = np.ascontiguousarray(points @ np.stack([across, np.cross(normal, across)], axis=1))
-    found = mapbox_earcut.triangulate_float64(flat, np.array([count], np.uint32))
-    if len(found) == 3 * (count - 2):
-        return found.astype(np.int64).reshape(-1, 3)
-    area = np.inf
-    for begin in range(count):
+    found = _clipped(points @ np.stack([across, np.cross(normal, across)], axis=1), [count])
+    if len(found) == count - 2:
+        return found
+
+    def area(begin: int) -> float:
         rest = np.roll(points, -begin, axis=0) - points[begin]
-        own = np.linalg.norm(np.cross(rest[1:-1], rest[2:]), axis=1).sum()
-        if own < area:
-            area, best = own, begin
-    corners = (best + np.arange(count)) % count
-    first = np.full(count - 2, corners[0])
-    return np.stack([first, corners[1:-1], corners[2:]], axis=1)
+        return float(np.linalg.norm(np.cross(rest[1:-1], rest[2:]), axis=1).sum())
+
+    best = min(range(count), key=area)
+    return fanned((best + np.arange(count)) % count)
 
 
 def _newell(points: Float) -> Float:
@@ -155,15 +158,16 @@ def _newell(points: Float) -> Float:
     return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))
 
 
-def _check(vertices: NDArray[np.float64], corners: NDArray[np.int64]) -> None:
-    if len(corners) and not 0 <= corners.min() <= corners.max() < len(vertices):
+def check_corners(corners: Int, vertices: int) -> None:
+    """Check that corners refer to some of so many vertices; ValueError if not."""
+    if len(corners) and not 0 <= corners.min() <= corners.max() < vertices:
         raise ValueError(
             f"faces refer to vertices {corners.min()} to {corners.max()}, counted from 0, of "
-            f"{len(vertices)}"
+            f"{vertices}"
         )
 
 
-def _turns(points: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _turns(points: Float) -> NDArray[np.bool_]:
     """Whether corners (p, k, 3) are reflex, against the sense of the polygon: (p, k)."""
     points = points - points[:, :1]
     into = points - np.roll(points, 1, axis=1)

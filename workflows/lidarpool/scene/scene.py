@@ -15,7 +15,7 @@ from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
 from .actors import Actor
-from .mesh import Mesh, points_array
+from .mesh import Mesh, points_array, stacked
 from .meshfile import load_meshes
 from .shapes import seed_objects
 from .transform import Transform
@@ -70,9 +70,7 @@ class Scene:
         vertices = points_array("the scene", self.vertices)
         faces = np.ascontiguousarray(as_array("faces", self.faces, np.int32))
         owners = np.ascontiguousarray(as_array("face_object", self.face_object, np.int32))
-        origin = points_array("the scene's origin", as_array("origin", self.origin).reshape(1, -1))[
-            0
-        ]
+        (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
             raise LidarpoolError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
         if faces.min() < 0 or faces.max() >= len(vertices):
@@ -82,17 +80,13 @@ class Scene:
                 f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
                 f"each of the {len(faces)} faces."
             )
-        object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "actors", tuple(self.actors))
-        for name, array in (
-            ("vertices", vertices),
-            ("faces", faces),
-            ("face_object", owners),
-            ("origin", origin),
-        ):
+        arrays = {"vertices": vertices, "faces": faces, "face_object": owners, "origin": origin}
+        for name, array in arrays.items():
             array = array.view()
             array.flags.writeable = False
             object.__setattr__(self, name, array)
+        object.__setattr__(self, "names", tuple(self.names))
+        object.__setattr__(self, "actors", tuple(self.actors))
 
     @classmethod
     def seed(cls) -> Scene:
@@ -106,7 +100,6 @@ class Scene:
         return cls.from_meshes(seed_objects())
 
     @classmethod
-    @checked
     def load(
         cls,
         path: str | Path,
@@ -161,21 +154,19 @@ class Scene:
                 )
         if not parts:
             raise LidarpoolError("A scene needs at least one object with triangles.")
-        vertex_counts = [len(mesh.vertices) for mesh in parts]
-        face_counts = [len(mesh.faces) for mesh in parts]
-        if max(sum(vertex_counts), sum(face_counts)) > np.iinfo(np.int32).max:
+        sizes = [len(mesh.faces) for mesh in parts]
+        points, most = sum(len(mesh.vertices) for mesh in parts), np.iinfo(np.int32).max
+        if max(points, sum(sizes)) > most:
             raise LidarpoolError(
-                f"The scene has {sum(vertex_counts)} vertices and {sum(face_counts)} triangles; "
-                f"at most {np.iinfo(np.int32).max} of each can be numbered."
+                f"The scene has {points} vertices and {sum(sizes)} triangles; at most {most} of "
+                "each can be numbered."
             )
-        first = np.concatenate([[0], np.cumsum(vertex_counts[:-1])])
-        vertices = np.concatenate([mesh.vertices for mesh in parts])
-        faces = np.concatenate([m.faces + at for m, at in zip(parts, first, strict=True)])
+        vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in parts)
         origin = local_origin(vertices)
         return cls(
             vertices=vertices - origin,
             faces=faces.astype(np.int32),
-            face_object=np.repeat(np.arange(len(parts), dtype=np.int32), face_counts),
+            face_object=np.repeat(np.arange(len(parts), dtype=np.int32), sizes),
             names=unique_names([mesh.name for mesh in parts]),
             origin=origin,
         )
@@ -219,16 +210,14 @@ class Scene:
         if not self.actors:
             return self
         meshes = [actor.mesh if time_ns is None else actor.placed(time_ns) for actor in self.actors]
-        vertices = [self.vertices, *(mesh.vertices for mesh in meshes)]
-        faces, owners, first = [self.faces], [self.face_object], 0
-        for number, mesh in enumerate(meshes, len(self.names)):
-            first += len(vertices[number - len(self.names)])
-            faces.append((mesh.faces + first).astype(np.int32))
-            owners.append(np.full(len(mesh.faces), number, np.int32))
+        moving = [(mesh.vertices, mesh.faces.astype(np.int32)) for mesh in meshes]
+        owners = np.repeat(
+            np.arange(len(self.names), len(self.all_names), dtype=np.int32),
+            [len(mesh.faces) for mesh in meshes],
+        )
         return Scene(
-            np.concatenate(vertices),
-            np.concatenate(faces),
-            np.concatenate(owners),
+            *stacked([(self.vertices, self.faces), *moving]),
+            np.append(self.face_object, owners),
             self.all_names,
             self.origin,
         )

@@ -23,19 +23,10 @@ SUFFIXES = (".ply", ".glb", ".obj")
 def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
-    Parameters
-    ----------
-    path
-        One of `SUFFIXES`. A .ply holds one object without a name; .glb and .obj keep objects
-        and names. All store metres; .glb is Y-up, by its standard, the others are Z-up.
-        Coordinates are those of the world; .ply and .glb have single precision. A comment, or the
-        generator of .glb, tells `load_meshes` who wrote it.
-    scene
-        The scene.
-
-    Returns
-    -------
-    The path. An existing file is replaced only by a complete one.
+    A .ply holds one object without a name; .glb and .obj keep objects and names. All store metres;
+    .glb is Y-up, by its standard, the others are Z-up. Coordinates are those of the world; .ply and
+    .glb have single precision. A comment, or the generator of .glb, tells `load_meshes` who wrote
+    it. An existing file is replaced only by a complete one.
 
     Raises
     ------
@@ -81,26 +72,17 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         data = bytes(export_ply(whole, vertex_normal=False))
         head, _, rest = data.partition(b"\ncomment ")
         return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
-    if suffix == ".glb":
-        # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
-        objects = _objects(scene, UP_AXES["y"].T)
-        return bytes(
-            export_glb(objects, include_normals=False, tree_postprocessor=_name_the_writer)
-        )
-    objects = _objects(scene, np.eye(3))
-    text = export_obj(objects, include_normals=False, include_texture=False)
-    return f"# {OWN}\n{text}".encode()
-
-
-def _name_the_writer(tree: dict[str, Any]) -> None:
-    """Name lidarpool as the writer of a glTF, because trimesh's files are often not Y-up."""
-    tree["asset"]["generator"] = GENERATOR
-
-
-def _objects(scene: Scene, turn: np.ndarray[Any, np.dtype[np.float64]]) -> trimesh.Scene:
-    """Each object as a geometry and node, vertices rotated by a matrix (3, 3)."""
-    out = trimesh.Scene()
+    # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
+    turn = UP_AXES["y"].T if suffix == ".glb" else np.eye(3)
+    objects = trimesh.Scene()
     for mesh in scene.meshes():
         geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
-        out.add_geometry(geometry, node_name=mesh.name, geom_name=mesh.name)
-    return out
+        objects.add_geometry(geometry, node_name=mesh.name, geom_name=mesh.name)
+    if suffix == ".obj":
+        text = export_obj(objects, include_normals=False, include_texture=False)
+        return f"# {OWN}\n{text}".encode()
+
+    def name_the_writer(tree: dict[str, Any]) -> None:  # trimesh's own files are often not Y-up
+        tree["asset"]["generator"] = GENERATOR
+
+    return bytes(export_glb(objects, include_normals=False, tree_postprocessor=name_the_writer))

@@ -71,20 +71,12 @@ def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tupl
 def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
     """Rotate a profile about the z axis to a closed surface.
 
-    Parameters
-    ----------
-    profile
-        (n, 2), n >= 3: radius and height in metres, from the lower pole on the axis round the
-        outside to the upper pole. The radii of the two ends are taken as zero, those between
-        must be positive.
-    segments
-        Steps around the axis, at least 3.
+    `profile` (n, 2), n >= 3, has radius and height in metres, from the lower pole on the axis round
+    the outside to the upper pole. The radii of the two ends are taken as zero, those between must
+    be positive. There are at least 3 `segments` around the axis.
 
-    Returns
-    -------
-    Mesh
-        `2 * (n - 2) * segments` triangles, outward normals, one vertex at each pole and none
-        doubled at the seam: watertight if the profile does not cross itself.
+    The mesh has `2 * (n - 2) * segments` triangles, outward normals, one vertex at each pole and
+    none doubled at the seam: it is watertight if the profile does not cross itself.
 
     Raises
     ------

@@ -27,27 +27,13 @@ _WIDE_M, _HIGH_M = 2.0, 15.0
 
 @dataclass(frozen=True, eq=False)
 class Views:
-    """What rays in all directions meet from some positions.
+    """What rays in all directions meet from some positions."""
 
-    Parameters
-    ----------
-    directions
-        (n, 3), unit vectors.
-    distance
-        (n,), metres; infinite where there is nothing.
-    back
-        (n,), whether the back of a triangle was hit.
-    normals
-        (n, 3), unit normals of the triangles hit; 0 where there is nothing.
-    heights
-        (n,), local z of the hits.
-    """
-
-    directions: Real
-    distance: Real
-    back: NDArray[np.bool_]
-    normals: Real
-    heights: Real
+    directions: Real  # (n, 3), unit vectors
+    distance: Real  # (n,), metres; infinite where there is nothing
+    back: NDArray[np.bool_]  # (n,), whether the back of a triangle was hit
+    normals: Real  # (n, 3), unit normals of the triangles hit; 0 where there is nothing
+    heights: Real  # (n,), local z of the hits
 
     @property
     def hit(self) -> NDArray[np.bool_]:
@@ -61,13 +47,7 @@ class Views:
 
 
 class Surroundings:
-    """Casts a few thousand rays to see what is around a position.
-
-    Parameters
-    ----------
-    scene
-        Without its actors.
-    """
+    """Casts a few thousand rays to see what is around a position in a scene without actors."""
 
     def __init__(self, scene: Scene) -> None:
         self._scene = scene
@@ -90,40 +70,35 @@ class Surroundings:
         shares = np.stack([np.arange(RAYS) * step % 1.0 for step in (0.755, 0.57, 0.431)], axis=1)
         return self._cast(low + shares * (high - low) - 2 * across * towards, towards)
 
-    def is_object(self, positions: ArrayLike) -> bool:
-        """Whether a scene is an object, judged from where a sensor would stand in it.
+    def is_object(self, seen: Views) -> bool:
+        """Whether a scene is an object, judged by the views from where a sensor would stand in it.
 
         It is one if almost nothing is seen from there, or if all sides of the scene look outward
         and the positions are within it: not on ground, and not in a room with a floor.
-
-        Parameters
-        ----------
-        positions
-            Local, (k, 3), metres.
         """
-        seen = self.views(positions)
-        down, hit, front = seen.directions[:, 2] < 0, seen.hit, seen.hit & ~seen.back
-        if float(np.mean(hit[down])) < _GROUND and float(np.mean(hit[~down])) < _GROUND:
+        down = seen.directions[:, 2] < 0
+        below, above = np.mean(seen.hit[down]), np.mean(seen.hit[~down])
+        if below < _GROUND and above < _GROUND:
             return True
         outside = self.outside()
-        if float(np.mean(outside.back[outside.hit])) > 1 - _CLOSED:
+        if np.mean(outside.back[outside.hit]) > 1 - _CLOSED:
             return False  # a terrain from below, or the walls of a room
-        if float(np.mean(np.isfinite(seen.distance))) < _ENCLOSED:
-            ground = float(np.mean(front[down])) >= _GROUND
+        if np.mean(np.isfinite(seen.distance)) < _ENCLOSED:
+            ground = np.mean((seen.hit & ~seen.back)[down]) >= _GROUND
             # Of a machine with openings there is something above the sensor, too.
-            return not (ground and (float(np.mean(hit[~down])) < _SKY or _has_floor(seen)))
+            return not (ground and (above < _SKY or _has_floor(seen)))
         return not self._is_room(seen)
 
     def _is_room(self, seen: Views) -> bool:
         """Whether what encloses some positions is a room, though all sides look outward."""
         if not _has_floor(seen):
             return False
-        if float(np.mean(seen.back)) < 1 - _CLOSED:  # walls of some thickness
+        if np.mean(seen.back) < 1 - _CLOSED:  # walls of some thickness
             return True
-        level, upright = _is_level(seen), np.abs(seen.normals[:, 2]) < 0.01
+        upright = np.abs(seen.normals[:, 2]) < 0.01
         sides = np.ptp(self._scene.bounds, axis=0)
         fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
-        return bool(fits and float(np.mean(level | upright)) >= _UPRIGHT)
+        return bool(fits and np.mean(_is_level(seen) | upright) >= _UPRIGHT)
 
     def _cast(self, origins: Real, directions: Real) -> Views:
         hits = self._caster.cast(origins, directions)

@@ -2,25 +2,32 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
-from ..base.errors import LidarpoolError
+from ..base.arguments import checked
+from ..base.declared import Seed
 from .mesh import Mesh
 from .scene import Scene
 
 Float = NDArray[np.float64]
 
-LEAST_TRIANGLES = 2
-MOST_TRIANGLES = 100_000_000
-LONGEST_M = 1e7  # files reject coordinates beyond 1e8 m
 _COARSEST = 4  # cells of the first octave along a side
 _OCTAVES = 11
 _ROUGHNESS = 0.5  # height of each octave over that of the one before
 _RELIEF = 0.16  # greatest height over the side's length
 
 
-def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -> Scene:
+@checked
+def terrain(
+    triangles: Annotated[int, Field(ge=2, le=100_000_000)] = 2_000_000,
+    seed: Seed = 0,
+    # Files reject coordinates beyond 1e8 m.
+    side_m: Annotated[float, Field(gt=0, le=1e7)] = 1000.0,
+) -> Scene:
     """Make a square of fractal terrain: ridges and valleys at every scale, flatter low down.
 
     The height is a sum of octaves of gradient noise (Perlin 1985), folded into ridges, where
@@ -30,7 +37,7 @@ def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -
     Parameters
     ----------
     triangles
-        At least 2. The scene has a full grid of them: up to one row fewer.
+        The scene has a full grid of them: up to one row fewer.
     seed
         The same numbers give the same terrain.
     side_m
@@ -46,16 +53,6 @@ def terrain(triangles: int = 2_000_000, seed: int = 0, side_m: float = 1000.0) -
     >>> len(terrain(2_000).faces)
     1984
     """
-    if not LEAST_TRIANGLES <= triangles <= MOST_TRIANGLES:
-        raise LidarpoolError(
-            f"A terrain of {triangles} triangles cannot be made: "
-            f"give {LEAST_TRIANGLES} to {MOST_TRIANGLES}."
-        )
-    if seed < 0 or not 0 < side_m <= LONGEST_M:
-        raise LidarpoolError(
-            f"seed is {seed} and side_m {side_m}; seed must be at least 0, side_m above 0 and at "
-            f"most {LONGEST_M:,.0f}."
-        )
     rows = int(np.sqrt(triangles / 2))
     columns = triangles // (2 * rows)
     x, y = np.linspace(0, 1, columns + 1), np.linspace(0, 1, rows + 1)

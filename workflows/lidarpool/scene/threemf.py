@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.xmlfile import refuse_entity
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, instances
+from .nodes import SMALLER, Content, MeshFileError, Node, flattened, instances
 
 _UNITS_M = {
     "micron": 1e-6,
@@ -72,11 +72,11 @@ def read_3mf(data: bytes, path: Path) -> Content:
         package = _Package(archive, Allowance(len(data), SMALLER))
         root = package.model(package.start())
 
-        def node(place: _Placement) -> Node[_Placement]:
+        def node(place: _Placement) -> Node:
             made = package.object(place.key)
-            return Node(place.name or made.name, place.matrix, lambda: made.meshes, made.components)
+            return Node(place.name or made.name, place.matrix, made.meshes, made.components)
 
-        content = instances(root.items, node, path.stem)
+        content = flattened(instances(root.items, node, path.stem))
     content.unit_m, content.up_axis = _UNITS_M[root.unit], "z"
     return content
 

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..base.arguments import as_array
 from ..base.errors import LidarpoolError
 from ..sensor import Pose
 
@@ -17,6 +18,14 @@ UP_AXES = {
     "y": np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0], [0.0, 1.0, 0.0]]),
     "z": np.eye(3),
 }
+
+
+def rotation_about(axis: ArrayLike, degrees: float) -> NDArray[np.float64]:
+    """Rotation (3, 3) about an axis, which has a length (Rodrigues 1840)."""
+    cross = np.cross(np.eye(3), np.array(axis) / np.linalg.norm(axis))
+    angle = np.radians(degrees)
+    turn: NDArray[np.float64] = np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    return np.eye(3) + turn
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +49,7 @@ class Transform:
     offset: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        linear = np.array(self.linear, dtype=np.float64)
-        offset = np.array(self.offset, dtype=np.float64)
+        linear, offset = as_array("linear", self.linear), as_array("offset", self.offset)
         if linear.shape != (3, 3) or offset.shape != (3,):
             raise LidarpoolError(
                 f"A transform needs a (3, 3) matrix and 3 offsets, not {linear.shape} and "
@@ -75,7 +83,7 @@ class Transform:
         roll, pitch, yaw = rotation_deg
         turn = Pose((0.0, 0.0, 0.0), yaw_deg=yaw, pitch_deg=pitch, roll_deg=roll).rotation
         turn = np.eye(3) if turn is None else turn
-        return cls(turn * np.broadcast_to(scale, 3), np.array(translation, dtype=np.float64))
+        return cls(turn * np.broadcast_to(scale, 3), np.array(translation))
 
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:

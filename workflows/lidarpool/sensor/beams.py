@@ -72,18 +72,10 @@ class Beams:
         return cls(np.linspace(-half, half, layers) if layers > 1 else np.zeros(1))
 
     def turning(self, radians_per_ns: float) -> Beams:
-        """Return the beams for a head that keeps turning within a firing.
+        """Return the beams for a head that keeps turning within a firing, counter-clockwise.
 
-        Parameters
-        ----------
-        radians_per_ns
-            Speed of the head, counter-clockwise.
-
-        Returns
-        -------
-        Beams
-            The same beams, each rotated by the head's angle at its time, so that the rotation
-            within a firing takes no time later.
+        Each is rotated by the head's angle at its time, so that the rotation within a firing takes
+        no time later.
         """
         angle = radians_per_ns * self.time_ns
         x, y, z = self.origin.T
@@ -182,11 +174,8 @@ class Spin:
     @property
     def period(self) -> int | None:
         """See `Head.period`."""
-        return (
-            int(self.firings_per_turn)
-            if self.firings_per_turn == int(self.firings_per_turn)
-            else None
-        )
+        whole = int(self.firings_per_turn)
+        return whole if whole == self.firings_per_turn else None
 
     def firings(self, step: int) -> tuple[int, int]:
         """See `Head.firings`; numbers continue after one turn."""
@@ -220,19 +209,11 @@ class Mirror(Spin):
 
     A turn is one cycle: two lines of a swinging mirror, one of a polygon's facet.
     Azimuth 0 is in the middle of a line.
-
-    Parameters
-    ----------
-    motion
-        "sine" and "triangle" swing, "sawtooth" is a polygon.
-    width_deg
-        Length of a line.
-    duty
-        Share of each cycle in which it fires: a polygon's facets cover more than is used.
     """
 
-    motion: Motion = "triangle"
-    width_deg: Width = 60.0
+    motion: Motion = "triangle"  # "sine" and "triangle" swing, "sawtooth" is a polygon
+    width_deg: Width = 60.0  # length of a line
+    # Share of each cycle in which it fires: a polygon's facets cover more than is used.
     duty: Duty = 1.0
 
     def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -18,32 +18,23 @@ from ..base.errors import LidarpoolError
 from ..base.yamlfile import load_yaml
 from .beams import Beams
 
+# Errors of files that users write.
+UNUSABLE = (
+    OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
+    yaml.YAMLError, LidarpoolError,
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Calibration:
-    """Content of a calibration file.
+    """Content of a calibration file."""
 
-    Parameters
-    ----------
-    file
-        Its name.
-    maker
-        Maker of the format; None for a plain table of beams.
-    beams
-        Beams in the maker's order, with the file's times, if any.
-    rays, shot_ns
-        Instead, unit directions (n, 3) in the order of firing, and their times (n,), if the file
-        has them.
-    head
-        Fields of `SensorModel` for the head.
-    """
-
-    file: str
-    maker: str | None
-    beams: Beams | None = None
-    rays: NDArray[np.float64] | None = None
-    shot_ns: NDArray[np.float64] | None = None
-    head: dict[str, Any] = field(default_factory=dict)
+    file: str  # its name
+    maker: str | None  # of the format; None for a plain table of beams
+    beams: Beams | None = None  # in the maker's order, with the file's times, if any
+    rays: NDArray[np.float64] | None = None  # instead, unit directions (n, 3) as they are fired
+    shot_ns: NDArray[np.float64] | None = None  # their times (n,), if the file has them
+    head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
 
 
 def read_calibration(path: Path) -> Calibration:
@@ -73,10 +64,7 @@ def read_calibration(path: Path) -> Calibration:
         if path.suffix.lower() == ".json":
             return _ouster(path.name, json.loads(text))
         return _table(path.name, text)
-    except (
-        OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
-        yaml.YAMLError, LidarpoolError,
-    ) as error:  # fmt: skip
+    except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
 
 

@@ -68,17 +68,8 @@ def _places(count: int) -> NDArray[np.float64]:
 def disc(count: int, divergence: float) -> NDArray[np.float64]:
     """Places of sub-rays in an evenly bright cone, each with the same share of the light.
 
-    Parameters
-    ----------
-    count
-        One of `SUBRAYS`.
-    divergence
-        Full angle of the cone, radians.
-
-    Returns
-    -------
-    ndarray
-        float64 (count, 2): angles off the axis, radians, the middle first.
+    `divergence` is the full angle of the cone, radians. Returns float64 (count, 2): angles off the
+    axis, radians, the middle first; the count is one of `SUBRAYS`.
     """
     return divergence / 2 * _places(count)
 

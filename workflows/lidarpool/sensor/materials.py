@@ -76,17 +76,7 @@ class Material:
 
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
-    """Materials of objects, one row each.
-
-    Attributes
-    ----------
-    reflectance
-        float64 (objects,).
-    retro, passes, mirrors
-        bool (objects,).
-    semantic_class
-        uint16 (objects,).
-    """
+    """Materials of objects: each array has one value for each."""
 
     reflectance: NDArray[np.float64]
     retro: NDArray[np.bool_]
@@ -168,13 +158,8 @@ def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
 def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
     """Extinction of the air, 1/m (Kruse, McGlauchlin and McQuistan 1962).
 
-    Parameters
-    ----------
-    visibility_km
-        Meteorological visibility, where a contrast has fallen to 2 %; None for clear air
-        without extinction.
-    wavelength_nm
-        Of the laser.
+    At the meteorological visibility, a contrast has fallen to 2 %; None is clear air without
+    extinction. The wavelength is that of the laser.
 
     Examples
     --------

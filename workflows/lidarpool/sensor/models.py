@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-import yaml
 from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
@@ -20,7 +19,7 @@ from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
-from .calibrations import Calibration, read_calibration, said
+from .calibrations import UNUSABLE, Calibration, read_calibration, said
 from .optics import Optics
 from .rays import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
@@ -63,11 +62,11 @@ class BeamTable(_Part):
     time_us: Numbers = ()
     origin_m: Place | tuple[Place, ...] = ()
 
-    def beams(self) -> Beams | None:
-        """Make them; None if a calibration has to give the elevations."""
+    def beams(self) -> Beams:
+        """Make them; one straight ahead if there are no elevations."""
         count = len(self.elevation_deg)
         if not count:
-            return None
+            return Beams(np.zeros(1))
         return Beams(
             np.radians(self.elevation_deg),
             np.radians(self.azimuth_deg),
@@ -207,10 +206,7 @@ def _read(path: Path | Traversable) -> SensorModel:
             fields = {field for part in _Part.__subclasses__() for field in part.model_fields}
             said_of_it = f"this is not a field.{did_you_mean(str(first['loc'][-1]), fields)}"
         raise LidarpoolError(f"{path}, {place}: {said_of_it}") from error
-    except (
-        OSError, ValueError, TypeError, KeyError, ArithmeticError, MemoryError, RecursionError,
-        yaml.YAMLError, LidarpoolError,
-    ) as error:  # fmt: skip
+    except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
 
 
@@ -285,13 +281,11 @@ def load_sensor(
     beams = described.beams.beams() if unit is None else _calibrated(described, unit)
     if described.prisms:
         prisms = tuple(Prism(**prism.model_dump()) for prism in described.prisms)
-        return PrismSensor(beams or Beams(np.zeros(1)), head, prisms=prisms, **common)
+        return PrismSensor(beams, head, prisms=prisms, **common)
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)
-        beams = beams or Beams(np.zeros(1))
     else:
-        assert beams is not None  # of the model, else of the unit
         beams = beams.turning(head.radians_per_ns)
     kind = LineSensor if described.axis == "x" else Sensor
     return kind(beams.lowest_first(), head, **common)

@@ -1,17 +1,22 @@
-"""Noise of ranges and angles, and lost returns."""
+"""Noise of ranges and angles, and lost returns; their random numbers.
+
+A random number is a hash of (seed, purpose, scan, ray, number): the same on every worker and in
+every batch, whatever the order of drawing.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
+from statistics import NormalDist
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from ..base.arguments import checked_fields
 from ..base.declared import Seed, Share
-from .counted import normal, uniform
 from .materials import at_right_angles
 
 # Detection threshold for signal plus noise, in standard deviations.
@@ -19,6 +24,9 @@ THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 
 _RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
+
+_GAMMA = 0x9E3779B97F4A7C15
+_NUMBERS = 256  # of one ray
 
 Whole = NDArray[np.integer[Any]]
 Real = NDArray[np.float64]
@@ -94,3 +102,57 @@ class Noise:
             above = THRESHOLD_SIGMAS * (energy / threshold - 1)
             seen &= above + normal(self.seed, _DETECTION, scan, ray, number) > 0
         return seen
+
+
+def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
+    """Last step of SplitMix64 (Steele, Lea and Flood 2014), in place."""
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        x ^= x >> np.uint64(shift)
+        x *= np.uint64(factor)
+    x ^= x >> np.uint64(31)
+    return x
+
+
+def raw(
+    seed: int, purpose: int, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
+) -> NDArray[np.uint64]:
+    """64 random bits for each ray: uint64 (n,).
+
+    Seed and purpose are below 2**63. The others are (n,) or one for all: the ray within its scan,
+    below 2**32, and the number, below 256.
+    """
+    start = np.array([int(seed) * _GAMMA % 2**64], np.uint64)
+    start = _mixed(_mixed(start) + np.uint64(purpose * _GAMMA % 2**64))
+    # A stream of SplitMix64 for each scan, of which a ray has 256 numbers.
+    begins = _mixed(start + np.asarray(scan).astype(np.uint64) * np.uint64(_GAMMA))
+    steps = np.asarray(ray).astype(np.uint64) * np.uint64(_NUMBERS)
+    steps = steps + np.asarray(number).astype(np.uint64) + np.uint64(1)
+    return _mixed(begins + steps * np.uint64(_GAMMA))
+
+
+def uniform(
+    seed: int, purpose: int, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
+) -> NDArray[np.float64]:
+    """Numbers uniform in [0, 1), multiples of 2**-53: (n,); arguments as of `raw`."""
+    bits = raw(seed, purpose, scan, ray, number) >> np.uint64(11)
+    return bits.astype(np.float64) * 2.0**-53
+
+
+def normal(
+    seed: int, purpose: int, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
+) -> NDArray[np.float64]:
+    """Numbers of mean 0 and variance 1, normally distributed: (n,); arguments as of `raw`.
+
+    They are quantiles of 65,536 equal shares of the distribution, so none is beyond 4.3.
+    Logarithms and cosines of random numbers would not have the same bits on every machine.
+    """
+    return _quantiles()[raw(seed, purpose, scan, ray, number) >> np.uint64(48)]
+
+
+@cache
+def _quantiles() -> NDArray[np.float64]:
+    shares = (np.arange(2**15) + 0.5) / 2**16
+    low = np.array([NormalDist().inv_cdf(share) for share in shares])
+    table = np.concatenate([low, -low[::-1]])
+    # To single precision, in which logarithms are the same on every machine.
+    return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

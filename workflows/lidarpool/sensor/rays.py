@@ -16,27 +16,13 @@ from .sensor import Sensor
 
 @dataclass(frozen=True)
 class Prism:
-    """A wedge prism that turns about x.
+    """A wedge prism that turns about x."""
 
-    Parameters
-    ----------
-    wedge_deg
-        Angle between its two faces.
-    index
-        Refractive index.
-    rpm
-        Turns a minute about x, from y to z.
-    phase_deg
-        Angle of its thin edge at time 0, likewise.
-    inclined_first
-        Whether light enters through the inclined face; else through the flat one.
-    """
-
-    wedge_deg: float
-    index: Annotated[float, Field(gt=0)]
-    rpm: float
-    phase_deg: float = 0.0
-    inclined_first: bool = False
+    wedge_deg: float  # angle between its two faces
+    index: Annotated[float, Field(gt=0)]  # refractive
+    rpm: float  # turns a minute about x, from y to z
+    phase_deg: float = 0.0  # angle of its thin edge at time 0, likewise
+    inclined_first: bool = False  # light enters through the inclined face; else the flat one
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,16 +31,11 @@ class PrismSensor(Sensor):
 
     The head is only the clock. Directions are exact by Snell's law at each face. Prisms are
     thin: all rays start at the sensor's centre. The pattern has no useful period.
-
-    Parameters
-    ----------
-    beams
-        One along x by default; others enter the first prism at an angle.
-    prisms
-        In the order in which light passes them.
     """
 
+    # One along x by default; others enter the first prism at an angle.
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
+    # In the order in which light passes them.
     prisms: tuple[Prism, ...] = (Prism(18, 1.5, 7294), Prism(18, 1.5, -4664, 0, True))
     cycle: ClassVar[str] = "frame"
 
@@ -112,21 +93,13 @@ class ListedSensor(Sensor):
 
     The list repeats. The head's time steps are parts of the list; its times and azimuths are
     not used.
-
-    Parameters
-    ----------
-    rays
-        float64 (n, 3): unit directions in the order of firing.
-    shot_ns
-        float64 (n,): firing times from 0 on, in order.
-    cycle_ns
-        Duration of the list.
     """
 
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
+    # (n, 3): unit directions in the order of firing, and (n,): firing times from 0 on.
     rays: NDArray[np.float64] = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
     shot_ns: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
-    cycle_ns: float = 1e8
+    cycle_ns: float = 1e8  # duration of the list
     cycle: ClassVar[str] = "frame"
 
     @property

@@ -195,7 +195,7 @@ class Sensor:
 
     def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""
-        return self._turned(firings, self._ahead)
+        return self._turned(firings, self.ahead)
 
     def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
         """Return starts of the rays of firings (k,), sensor axes: (k, channels, 3), metres.
@@ -206,10 +206,13 @@ class Sensor:
             return None
         return self._turned(firings, self.beams.origin)
 
-    @property
+    @cached_property
     def ahead(self) -> NDArray[np.float64]:
-        """Unit directions of the beams in the head's axes: (channels, 3)."""
-        return self._ahead
+        """Unit directions of the beams in the head's axes, at azimuth 0: (channels, 3)."""
+        beams = self.beams
+        level = np.cos(beams.elevation)
+        x, y = level * np.cos(beams.azimuth), level * np.sin(beams.azimuth)
+        return np.column_stack([x, y, np.sin(beams.elevation)])
 
     @cached_property
     def centre(self) -> NDArray[np.float64] | None:
@@ -263,14 +266,6 @@ class Sensor:
     def lead_ns(self) -> float:
         """Time of the first beam within a firing."""
         return float(self.beams.time_ns.min())
-
-    @cached_property
-    def _ahead(self) -> NDArray[np.float64]:
-        """Unit direction of each beam with the head at azimuth 0, (c, 3)."""
-        beams = self.beams
-        level = np.cos(beams.elevation)
-        x, y = level * np.cos(beams.azimuth), level * np.sin(beams.azimuth)
-        return np.column_stack([x, y, np.sin(beams.elevation)])
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_right
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
@@ -21,7 +21,7 @@ from .materials import Material, extinction
 from .noise import Noise
 from .optics import Precision, Returns
 from .sensor import Sensor
-from .trajectory import CENTRE, Pose, Stations, Trajectory
+from .trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
 
 STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
@@ -305,11 +305,6 @@ class Survey(CloudOptions, Weather):
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
     @cached_property
-    def channels(self) -> int:
-        """Most beams of a sensor."""
-        return max(carried.sensor.channels for carried in self.carried)
-
-    @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
         """All columns of a part."""
         return stored(chosen(self.columns))
@@ -405,11 +400,6 @@ def _end_ns(sensor: Sensor, steps: int) -> float:
 
 
 def _poses(given: Sequence[Any]) -> tuple[Pose, ...]:
-    try:
-        poses = [p if isinstance(p, Pose) else tuple(map(float, p)) for p in given]
-    except (TypeError, ValueError) as error:
-        raise LidarpoolError(
-            f"poses is {shown(given)}; it must be a list of Pose, or of x, y and z in metres, such "
-            "as [(0, 0, 1)]."
-        ) from error
-    return tuple(p if isinstance(p, Pose) else Pose(p) for p in poses)  # type: ignore[arg-type]
+    if isinstance(given, str) or not isinstance(given, Iterable):
+        raise LidarpoolError(f"poses is {shown(given)}; it must be a list of poses: [(0, 0, 1)].")
+    return tuple(pose_of("poses", pose) for pose in given)

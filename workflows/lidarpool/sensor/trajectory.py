@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, ClassVar, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from ..base.arguments import as_array, checked_fields
+from ..base.arguments import as_array, checked_fields, shown
 from ..base.declared import Angle, Triple, written_as
 from ..base.errors import LidarpoolError
 
@@ -80,6 +80,19 @@ class Pose:
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
+def pose_of(name: str, given: Any) -> Pose:
+    """Return a pose as given, or of x, y and z; LidarpoolError with its name if it is neither."""
+    if isinstance(given, Pose):
+        return given
+    try:
+        return Pose(tuple(map(float, given)))  # type: ignore[arg-type]  # it counts them
+    except (TypeError, ValueError) as error:
+        raise LidarpoolError(
+            f"{name} is {shown(given)}; it must be a Pose, or x, y and z in metres, such as "
+            "(0, 0, 1)."
+        ) from error
+
+
 CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a carrier
 
 
@@ -118,21 +131,13 @@ class Stations:
     """The simplest trajectory: the sensor stands at one pose after the other."""
 
     at: tuple[Pose, ...]
+    moves: ClassVar[bool] = False
+    duration_ns: ClassVar[float] = np.inf
 
     @property
     def stations(self) -> int:
         """See `Trajectory.stations`."""
         return len(self.at)
-
-    @property
-    def moves(self) -> bool:
-        """See `Trajectory.moves`."""
-        return False
-
-    @property
-    def duration_ns(self) -> float:
-        """See `Trajectory.duration_ns`."""
-        return np.inf
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """See `Trajectory.pose`."""
@@ -190,6 +195,8 @@ class Track:
     smooth: bool = False
     start_s: float | None = None
     duration_s: float | None = None
+    stations: ClassVar[int] = 1
+    moves: ClassVar[bool] = True
 
     def __post_init__(self) -> None:
         times = as_array("times_s", self.times_s).copy()
@@ -234,16 +241,6 @@ class Track:
             raise LidarpoolError(f"A trajectory from {start:.9g} to {last:.9g} s has no duration.")
         object.__setattr__(self, "start_s", float(start))
         object.__setattr__(self, "duration_s", float(last - start))
-
-    @property
-    def stations(self) -> int:
-        """See `Trajectory.stations`."""
-        return 1
-
-    @property
-    def moves(self) -> bool:
-        """See `Trajectory.moves`."""
-        return True
 
     @property
     def duration_ns(self) -> float:
@@ -292,17 +289,11 @@ class Track:
 
     @cached_property
     def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
-        """Coefficients of poses between two given ones, one column for each segment.
+        """Coefficients of poses between two given ones, one column for each of s segments.
 
-        Returns
-        -------
-        way
-            Coefficients (3, s) of the position's polynomial in seconds, the constant first.
-        turn
-            (3, 9, s): the rotation is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues,
-            1840), a the angle since the segment began.
-        rates
-            (s,) radians a second.
+        Of the position's polynomial in seconds (3, s), the constant first; of the rotation
+        (3, 9, s), which is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the
+        angle since the segment began; and the rates of that angle (s,), radians a second.
         """
         steps = np.diff(self.times_s)[:, None]
         speeds = np.diff(self.positions, axis=0) / steps

@@ -1,13 +1,11 @@
 """Returns of a pulse: sub-rays, materials, and noise.
 
-Replaces the ray caster's `scan` if a survey has any of these. Random numbers depend only on scan,
-ray and return, so the batches do not matter.
+Random numbers depend only on scan, ray and return, so the batches do not matter.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from copy import copy
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -20,8 +18,8 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.disc import disc, neighbours
 from ..sensor.optics import Mode, spread
-from .motion import Clock, Poses
-from .surfaces import Surfaces, products
+from .motion import Clock, Poses, products
+from .surfaces import Surfaces
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
@@ -60,38 +58,21 @@ def joined(parts: list[Hits]) -> Hits:
 
 @dataclass(frozen=True)
 class Echoes(ScanReturns):
-    """Returns in the order of rays and distances, possibly several for a ray.
+    """Returns in the order of rays and distances, possibly several for a ray."""
 
-    Attributes
-    ----------
-    energy
-        float64 (k,): received, see `Surfaces.energy`; None if it is that of the rays as reported.
-    number, returns
-        uint8 (k,): number among the reported returns of its pulse, from 1, and their count.
-    reported
-        float64 (k,): distance with noise; `distance` has none.
-    """
-
+    # (k,): received, see `Surfaces.energy`; None if it is that of the rays as reported.
     energy: Real | None
-    number: NDArray[np.uint8]
-    returns: NDArray[np.uint8]
-    reported: Real
+    number: NDArray[np.uint8]  # (k,): among the reported returns of its pulse, from 1
+    returns: NDArray[np.uint8]  # (k,): how many these are
+    reported: Real  # (k,): distance with noise; `distance` has none
 
 
 @dataclass(frozen=True)
 class Keys:
-    """Keys of the random numbers of rays.
+    """Keys of the random numbers of rays."""
 
-    Parameters
-    ----------
-    scan
-        Number of the first scan.
-    begins
-        Rays at which scans begin.
-    """
-
-    scan: int
-    begins: Whole
+    scan: int  # number of the first scan
+    begins: Whole  # rays at which scans begin
 
     def of(self, ray: Rays) -> tuple[Whole, Whole]:
         """Return the scans of rays, and their numbers within them."""
@@ -100,36 +81,18 @@ class Keys:
 
 
 class EchoCaster:
-    """A ray caster with sub-rays, materials and noise.
-
-    Parameters
-    ----------
-    caster
-        Casts single rays.
-    scene, survey, surfaces
-        The scene, the survey, and the scene's surfaces.
-    """
+    """Casts the scans of a survey: each ray by itself, or with sub-rays, materials and noise."""
 
     def __init__(self, caster: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
         self._caster, self._survey, self._surfaces = caster, survey, surfaces
-        self._noise, self._one_each = survey.noise, _one_each(survey, surfaces)
+        self._noise = survey.noise
+        # Whether each ray that hits something has one return.
+        several = survey.returns.subrays > 1 or survey.noise.loses
+        self._one_each = surfaces.materials.plain and not several
         self._faces = surfaces.triangles
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.vertices).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
-
-    def within(self, caster: World, surfaces: Surfaces) -> EchoCaster:
-        """Return the same caster with actors elsewhere."""
-        echoes = copy(self)
-        echoes._caster, echoes._surfaces = caster, surfaces
-        return echoes
-
-    @staticmethod
-    def needed(survey: Survey, surfaces: Surfaces) -> bool:
-        """Whether a survey needs more than plain casting."""
-        noise = survey.noise
-        noisy = max(noise.range_m, noise.range_per_m, noise.angle_deg) > 0
-        return noisy or not _one_each(survey, surfaces)
 
     def divided(self, sensor: Sensor, pattern: Pattern) -> Pattern | None:
         """Make the sub-rays of a repeated pattern, if they are few and always the same."""
@@ -154,19 +117,13 @@ class EchoCaster:
         poses: Poses,
         window: tuple[int, int],
         groups: Whole,
+        *,
+        tally: bool = True,
     ) -> Echoes:
-        """Cast consecutive scans.
+        """Cast scans from number `scan` on: hits in the sensor's range, counted and thinned out.
 
-        Parameters
-        ----------
-        sensor
-            Sensor of the beams.
-        scan
-            Number of the first scan.
-        pattern, poses, window, groups
-            As of `RayCaster.scan`; each group is a scan.
-        divided
-            Sub-rays of the pattern, if they were made before.
+        `divided` are sub-rays of the pattern, if they were made before; the others are arguments
+        of `RayCaster.scan`, where each group is a scan.
         """
         noise, first, rays = self._noise, window[0], window[1] - window[0]
         keys = Keys(scan, groups)
@@ -174,7 +131,7 @@ class EchoCaster:
             if noise.angle_deg:
                 beams = self._beams(np.zeros((1, 2)), pattern, first, keys, 0, rays)
                 pattern, first = beams, 0
-            found = self._once(sensor, pattern, poses, (first, first + rays), groups)
+            found = self._once(sensor, pattern, poses, (first, first + rays), groups, tally)
         else:
             _, gap_m = self._survey.returns.of(sensor.optics)
             beam = self._beam(sensor)
@@ -196,7 +153,7 @@ class EchoCaster:
                 returns = separated(hits, gap_m, len(beam), planes)
                 returns = returns._replace(ray=start + returns.ray)
                 chunks.append(self._reported(returns, keys))
-            found = self._kept(joined(chunks), groups)
+            found = self._kept(joined(chunks), groups, tally)
         if noise.range_m or noise.range_per_m:
             reported = noise.ranges(found.distance, *keys.of(found.ray), found.number)
             found = replace(found, reported=reported)
@@ -228,16 +185,24 @@ class EchoCaster:
         poses: Poses,
         window: tuple[int, int],
         groups: Whole,
+        tally: bool,
     ) -> Echoes:
         """Cast rays with one return each; compute energies only for kept ones, and if needed."""
-        found = self._caster.returns(
-            sensor, self._survey.keep_every, pattern, poses, window, groups
+        found = self._caster.scan(
+            pattern,
+            poses,
+            window=window,
+            t_min=sensor.min_range_m,
+            t_max=sensor.max_range_m,
+            keep_every=self._survey.keep_every,
+            groups=groups,
+            tally=tally,
         )
         energy = None
         if self._noise.angle_deg:
             _, directions = poses.rays(pattern, found.ray, window[0])
-            times = poses.times(found.ray)
-            along = self._surfaces.along_normal(found.triangle, directions, times)
+            normals = self._surfaces.normals(found.triangle, poses.times(found.ray), poses.ways)
+            along = products(normals.T, directions.T)
             energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
         one = np.ones(len(found), np.uint8)
         return Echoes(
@@ -257,11 +222,7 @@ class EchoCaster:
         surfaces, materials = self._surfaces, self._surfaces.materials
         farthest = sensor.max_range_m
         found = self._caster.scan(
-            beams,
-            poses,
-            window=window,
-            t_min=sensor.min_range_m,
-            t_max=farthest,
+            beams, poses, window=window, t_min=sensor.min_range_m, t_max=farthest
         )
         ray, step, triangle = found.ray.astype(np.int64), found.distance, found.triangle
         origins, directions = poses.rays(beams, ray, window[0])
@@ -273,8 +234,8 @@ class EchoCaster:
         parts: list[Hits] = []
         seen: list[Real] = []  # normals as the sensor sees them
         for _ in range(PASSES_MOST):
-            normals = surfaces.normals(triangle, times)
-            along = products(normals, directions)
+            normals = surfaces.normals(triangle, times, poses.ways)
+            along = products(normals.T, directions.T)
             distance = before + step
             energy = share * self._energy(sensor, triangle, np.abs(along), distance)
             parts.append(Hits(ray, distance, triangle, energy))
@@ -295,7 +256,7 @@ class EchoCaster:
             away = self._clear_m / np.maximum(np.abs(along), 1e-3)
             light = Pattern(ahead, ends + away[:, None] * ahead)
             # Light takes no time: it travels 300 m in a microsecond.
-            now = Poses(np.zeros(3), clock=Clock(times[on], np.zeros(1)))
+            now = Poses(np.zeros(3), clock=Clock(times[on], np.zeros(1), poses.ways))
             found = self._caster.scan(light, now, t_max=farthest)
             before = distance + away
             near = before[found.ray] + found.distance <= farthest
@@ -322,7 +283,7 @@ class EchoCaster:
             returns = returns.take(seen)
         return returns.take(chosen(returns, self._survey.returns.mode))
 
-    def _kept(self, returns: Hits, groups: Whole) -> Echoes:
+    def _kept(self, returns: Hits, groups: Whole, tally: bool) -> Echoes:
         """Count the returns of each scan and thin them out."""
         ray = returns.ray
         cuts = np.searchsorted(ray, np.append(groups, np.iinfo(np.int64).max))
@@ -336,18 +297,13 @@ class EchoCaster:
             distance=thinned.distance,
             triangle=thinned.triangle,
             hits=np.diff(cuts),
-            tally=np.bincount(returns.triangle, minlength=self._faces),
+            tally=np.bincount(returns.triangle, minlength=self._faces) if tally else None,
+            instance=np.zeros(len(thinned.ray), np.int32),
             energy=thinned.energy,
             number=np.minimum(number[kept] + 1, 255).astype(np.uint8),
             returns=np.minimum(each[kept], 255).astype(np.uint8),
             reported=thinned.distance,
         )
-
-
-def _one_each(survey: Survey, surfaces: Surfaces) -> bool:
-    """Whether each ray that hits something has one return."""
-    several = survey.returns.subrays > 1 or survey.noise.loses
-    return surfaces.materials.plain and not several
 
 
 def numbers(ray: Whole) -> Whole:
@@ -369,21 +325,8 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     hits, its distance their mean weighted by energy, its triangle that of the strongest. Hits
     without energy are dropped.
 
-    Parameters
-    ----------
-    hits
-        Of all sub-rays, in the order of rays.
-    gap_m
-        Half of the pulse's length in metres.
-    each
-        Sub-rays of a beam; they follow one another, and have the same share of the beam.
-    planes
-        Of the hits, where there are sub-rays.
-
-    Returns
-    -------
-    Hits
-        In the order of beams and distances; `ray` is the number of the beam.
+    The hits of all sub-rays, `each` of a beam, are in the order of rays; `gap_m` is half of the
+    pulse's length. Returns are in the order of beams and distances; their `ray` is the beam.
     """
     rows = np.arange(len(hits.ray))
     some = hits.energy > 0
@@ -431,13 +374,7 @@ def _continued(
     plane is linear in the ray's direction, so two hits on one plane always meet, whatever the
     angle; half of the distance allows for rough ground.
 
-    Parameters
-    ----------
-    hits, new, gap_m, each
-        As of `separated`; the hits of each beam are sorted by distance. `new` are the returns by
-        distances alone.
-    normal, direction
-        The planes of the hits.
+    The hits of each beam are sorted by distance; `new` are the returns by distances alone.
     """
     beam = hits.ray // each
     # The hit of each sub-ray, after so many panes of glass: a row for each beam and number of them.
@@ -456,7 +393,8 @@ def _continued(
 
     def half_way(this: Whole, that: Whole) -> Real:
         """Ranges half-way to another hit, on the plane of the first."""
-        slope = products(normal[this], direction[that]) / products(normal[this], direction[this])
+        plane, looks = normal[this].T, direction.T
+        slope = products(plane, looks[:, that]) / products(plane, looks[:, this])
         return np.asarray(2 / (near[this] * np.maximum(1 + slope, 1e-9)))
 
     step = np.abs(half_way(one, other) - half_way(other, one))

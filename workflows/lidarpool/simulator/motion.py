@@ -19,22 +19,13 @@ Float = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Clock:
-    """Firing times of rays, in nanoseconds since the survey's start.
+    """Firing times of rays, in nanoseconds since the survey's start, and actors that move then."""
 
-    Parameters
-    ----------
-    begins
-        (f,): of each firing.
-    delays
-        (m,): of each ray of a firing.
-    start, subrays
-        First ray, and the number of sub-rays of each.
-    """
-
-    begins: Float
-    delays: Float
-    start: int = 0
-    subrays: int = 1
+    begins: Float  # (f,): of each firing
+    delays: Float  # (m,): of each ray of a firing
+    ways: tuple[Trajectory, ...]  # of the actors
+    start: int = 0  # first ray
+    subrays: int = 1  # of each ray
 
     def of(self, ray: NDArray[np.integer[Any]]) -> Float:
         """Return the firing times of rays (n,): (n,)."""
@@ -65,6 +56,11 @@ class Poses:
                 self.positions, self.rotations, self.rays_per_pose, self.motion
             )
         }
+
+    @property
+    def ways(self) -> tuple[Trajectory, ...]:
+        """Trajectories of the actors."""
+        return () if self.clock is None else self.clock.ways
 
     def times(self, ray: NDArray[np.integer[Any]]) -> Float:
         """Return firing times of rays, nanoseconds since the survey's start; for actors."""
@@ -188,14 +184,20 @@ def spun(rotations: Float, spins: Float) -> Float:
     return out
 
 
+def products(one: Float, other: Float) -> Float:
+    """Scalar products of vectors (3, ...): (...), in one order of rounding."""
+    (x, y, z), (a, b, c) = one, other
+    product = x * a
+    product += y * b
+    product += z * c
+    return np.asarray(product)
+
+
 def _product(matrices: Float, matrix: Float) -> Float:
     """Products of matrices (k, 3, 3) and one (3, 3), in one order of rounding, however many."""
     out = np.empty((3, 3, len(matrices))).transpose(2, 0, 1)
     for row in range(3):
-        a, b, c = matrices[:, row].T
-        for column in range(3):
-            x, y, z = matrix[:, column]
-            out[:, row, column] = (a * x + b * y) + c * z
+        out[:, row] = turned(matrices[:, row], matrix.T)
     return out
 
 

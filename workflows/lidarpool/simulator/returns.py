@@ -7,14 +7,14 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern, ScanReturns
+from raybeam import Pattern
 
 from ..columns.parts import PartColumns
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from .echoes import Echoes
-from .motion import Poses, turned
+from .motion import Poses, products, turned
 from .surfaces import Surfaces
 
 
@@ -23,19 +23,6 @@ class BatchReturns:
 
     Its attributes are arrays (n,) with a value for each return, computed on first use: the
     sources of columns (`lidarpool.columns.table`).
-
-    Parameters
-    ----------
-    scene, survey, surfaces
-        The scene, the survey, and the scene's surfaces.
-    specs
-        The scans; the firings of each follow those of the one before.
-    found
-        Result of the cast: rays numbered from 0 at the first firing.
-    pattern, start
-        The pattern that was cast, and the number of ray 0 within it.
-    poses
-        Poses of the cast.
     """
 
     def __init__(
@@ -43,17 +30,16 @@ class BatchReturns:
         scene: Scene,
         survey: Survey,
         surfaces: Surfaces,
-        specs: list[ScanSpec],
-        found: ScanReturns,
+        specs: list[ScanSpec],  # the firings of each follow those of the one before
+        found: Echoes,  # rays are numbered from 0 at the first firing
         pattern: Pattern,
-        start: int,
+        start: int,  # number of ray 0 within the pattern
         poses: Poses,
     ) -> None:
         self.scene, self.survey = scene, survey
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
         self.specs, self.found = specs, found
-        self.echoes = found if isinstance(found, Echoes) else None
         self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
@@ -138,7 +124,7 @@ class BatchReturns:
     @property
     def range(self) -> NDArray[np.float64]:
         """Distance from the start of the ray, metres, with noise."""
-        return self.found.distance if self.echoes is None else self.echoes.reported
+        return self.found.reported
 
     @cached_property
     def positions(self) -> NDArray[np.float64]:
@@ -230,20 +216,16 @@ class BatchReturns:
     @cached_property
     def cosine(self) -> NDArray[np.float64]:
         """Cosine of the angle between the ray and the normal of its triangle, 0 to 1."""
-        return np.abs(
-            self._surfaces.along_normal(self.found.triangle, self.directions, self._times)
-        )
-
-    @property
-    def _times(self) -> NDArray[np.int64]:
-        """Of the rays, where there are actors."""
-        return self.time if self.scene.actors else np.zeros(len(self), np.int64)
+        ways = self._poses.ways
+        times = self.time if ways else np.zeros(len(self), np.int64)
+        normals = self._surfaces.normals(self.found.triangle, times, ways)
+        return np.abs(products(normals.T, self.directions.T))
 
     @cached_property
     def intensity(self) -> NDArray[np.float64]:
         """Received energy, see `Surfaces.energy`."""
-        if self.echoes is not None and self.echoes.energy is not None:
-            return self.echoes.energy
+        if self.found.energy is not None:
+            return self.found.energy
         extinction = self.survey.extinction(self.sensor)
         return self._surfaces.energy(
             self.found.triangle, self.cosine, self.found.distance, extinction
@@ -258,12 +240,12 @@ class BatchReturns:
     @property
     def return_number(self) -> NDArray[np.uint8]:
         """Number among the reported returns of its pulse."""
-        return np.ones(len(self), np.uint8) if self.echoes is None else self.echoes.number
+        return self.found.number
 
     @property
     def returns(self) -> NDArray[np.uint8]:
         """Number of reported returns of its pulse."""
-        return np.ones(len(self), np.uint8) if self.echoes is None else self.echoes.returns
+        return self.found.returns
 
     @property
     def semantic_class(self) -> NDArray[np.uint16]:

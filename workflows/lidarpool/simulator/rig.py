@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern, ScanReturns
+from raybeam import Pattern
 
 from ..scene.actors import Actor
 from ..scene.scene import Scene
@@ -25,39 +25,18 @@ IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
 KEPT = 8  # turns whose rays are kept for the next images
 
 
-class _Repeated(NamedTuple):
-    """Rays of a sensor that are made once.
+class _Rays(NamedTuple):
+    """Rays of a sensor that are made once."""
 
-    Parameters
-    ----------
-    by_head
-        Whether they are one firing in the axes of the head, each firing with a pose of its own;
-        else they are in the axes of the carrier.
-    pattern
-        One firing, or one period of the head; None if that is too long.
-    subrays
-        Sub-rays of the pattern, if they are few.
-    """
-
-    by_head: bool
-    pattern: Pattern | None
-    subrays: Pattern | None
+    pattern: Pattern | None  # some firings, or one period of the head; None if that is too long
+    subrays: Pattern | None  # of the pattern, if they are few
+    # Whether they are one firing in the axes of the head, each firing with a pose of its own; else
+    # they are in the axes of the carrier.
+    by_head: bool = False
 
 
 class Rig:
-    """Scene, survey and a ray caster that is ready.
-
-    Parameters
-    ----------
-    scene, survey
-        What is scanned, and how.
-    backend
-        Name of the ray-casting backend.
-    threads
-        CPU threads to cast with; None for all cores.
-    device
-        Number of the CUDA device; None for the current one.
-    """
+    """Scene, survey and a ray caster that is ready; `backend` and the like as of `RayCaster`."""
 
     def __init__(
         self,
@@ -68,19 +47,16 @@ class Rig:
         device: int | None = None,
     ) -> None:
         self.scene, self.survey = scene, survey
-        self._world = World(scene, backend, threads, device)
+        self._world = World(scene, backend=backend, threads=threads, device=device)
         self._surfaces = Surfaces(scene, tuple(survey.materials))
-        self._echoes: EchoCaster | None = None  # if plain casting is enough
-        if EchoCaster.needed(survey, self._surfaces):
-            self._echoes = EchoCaster(self._world, scene, survey, self._surfaces)
+        self._echoes = EchoCaster(self._world, scene, survey, self._surfaces)
         check_trajectory(survey.path)
-        self._made: dict[tuple[int, bool], _Repeated] = {}  # {(sensor, whether it moves): rays}
-        # {(sensor, first firing, one past the last): rays and sub-rays}
-        self._firings: dict[tuple[int, int, int], tuple[Pattern, Pattern | None]] = {}
+        self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
+        self._firings: dict[tuple[int, int, int], _Rays] = {}  # {(sensor, first, stop): rays}
         for number in range(len(survey.carried)):
             self._repeated(number, survey.path.moves)
 
-    def _repeated(self, number: int, moves: bool) -> _Repeated:
+    def _repeated(self, number: int, moves: bool) -> _Rays:
         """Rays of a sensor that are cast again and again, made on first use."""
         made = self._made.get((number, moves))
         if made is None:
@@ -88,26 +64,20 @@ class Rig:
             period = sensor.period or 0
             fits = 0 < period * sensor.channels <= PATTERN_RAYS
             heads = sensor.spins(np.zeros(1, np.int64)) is not None
-            by_head = heads and (moves or not fits)
-            pattern = subrays = None
-            if by_head:
+            made = _Rays(None, None)
+            if heads and (moves or not fits):
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
+                made = _Rays(pattern, self._echoes.divided(sensor, pattern), by_head=True)
             elif fits:
-                pattern = self.pattern(number, 0, period)
-            if self._echoes is not None and pattern is not None:
-                subrays = self._echoes.divided(sensor, pattern)
-            made = self._made[number, moves] = _Repeated(by_head, pattern, subrays)
+                made = self._rays_of(number, 0, period)
+            self._made[number, moves] = made
         return made
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
-        rig._world = self._world.with_actors(actors)
-        rig._surfaces = self._surfaces.with_actors(actors)
-        if self._echoes is not None:
-            rig._echoes = self._echoes.within(rig._world, rig._surfaces)
         return rig
 
     @property
@@ -145,17 +115,10 @@ class Rig:
     ) -> BatchReturns:
         """Cast scans of one station, the firings of each following those of the one before.
 
-        Parameters
-        ----------
-        specs
-            The scans.
-        path
-            Where the carrier is.
-        late_ns
-            How long after the firings' own times, nanoseconds.
+        The carrier is `late_ns` further on its path than the firings' own times say.
         """
         number, survey = specs[0].sensor, self.survey
-        by_head, whole, subrays = self._repeated(number, path.moves)
+        whole, subrays, by_head = self._repeated(number, path.moves)
         carried = survey.carried[number]
         sensor, channels = carried.sensor, carried.sensor.channels
         first, stop = specs[0].firings[0], specs[-1].firings[1]
@@ -164,23 +127,25 @@ class Rig:
         else:
             pose = path.pose(specs[0].station)
             poses = Poses(np.array(pose.position), pose.rotation)
-        if self.scene.actors:
-            begins = sensor.begins_ns(np.arange(first, stop, dtype=np.int64)) + specs[0].start_ns
-            poses = replace(poses, clock=Clock(begins, sensor.beams.time_ns))
+        poses = self._timed(poses, specs)
         if whole is not None:
             pattern, start = whole, first * channels % len(whole)
         else:
             pattern, start = self.pattern(number, first, stop), 0
         window = (start, start + (stop - first) * channels)
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
-        found: ScanReturns
-        if self._echoes is not None:
-            found = self._echoes.scan(
-                sensor, specs[0].scan, pattern, subrays, poses, window, groups
-            )
-        else:
-            found = self._world.returns(sensor, survey.keep_every, pattern, poses, window, groups)
+        found = self._echoes.scan(sensor, specs[0].scan, pattern, subrays, poses, window, groups)
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
+
+    def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
+        """Return poses of scans, so many times in turn, with the times that actors need."""
+        if not self.scene.actors:
+            return poses
+        sensor = self.survey.carried[specs[0].sensor].sensor
+        firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
+        begins = np.tile(sensor.begins_ns(firings) + specs[0].start_ns, times)
+        ways = tuple(actor.trajectory for actor in self.scene.actors)
+        return replace(poses, clock=Clock(begins, sensor.beams.time_ns, ways))
 
     def ranges(
         self,
@@ -190,23 +155,15 @@ class Rig:
     ) -> NDArray[np.float32]:
         """Cast the same firings from many poses of a carrier that stands.
 
-        Parameters
-        ----------
-        specs
-            Scans of one station; the next pose has the numbers that follow theirs.
-        positions, rotations
-            (k, 3), metres, and (k, 3, 3): checked poses of the carrier.
-
-        Returns
-        -------
-        float32 (k, firings, channels)
-            Ranges of the nearest reported returns, metres; inf where there are none.
+        `specs` are scans of one station; the next pose has the numbers that follow theirs. The
+        poses, (k, 3) and (k, 3, 3), have been checked. Returns float32 (k, firings, channels):
+        ranges of the nearest reported returns, metres; inf where there are none.
         """
         number = specs[0].sensor
         sensor = self.survey.carried[number].sensor
         first, stop = specs[0].firings[0], specs[-1].firings[1]
-        pattern, subrays = self._rays_of(number, first, stop)
-        begins = sensor.begins_ns(np.arange(first, stop, dtype=np.int64)) + specs[0].start_ns
+        pattern, subrays, _ = self._rays_of(number, first, stop)
+        assert pattern is not None  # however long it is
         begin_rays = np.array([spec.firings[0] - first for spec in specs]) * sensor.channels
         rays = len(pattern)
         out = np.full((len(positions), rays), np.inf, np.float32)
@@ -216,33 +173,26 @@ class Rig:
             image = out[block].reshape(-1)
             count = len(image) // rays
             poses = Poses(positions[block], None if rotations is None else rotations[block], rays)
-            if self.scene.actors:
-                clock = Clock(np.tile(begins, count), sensor.beams.time_ns)
-                poses = replace(poses, clock=clock)
-            window = (0, len(image))
-            if self._echoes is None:
-                low, high = sensor.min_range_m, sensor.max_range_m
-                found = self._world.scan(pattern, poses, window=window, t_min=low, t_max=high)
-                image[found.ray] = found.distance
-                continue
+            poses = self._timed(poses, specs, count)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
-            scan = specs[0].scan + begin * len(specs)
-            echoes = self._echoes.scan(sensor, scan, pattern, subrays, poses, window, groups)
-            nearest = echoes.number == 1
-            image[echoes.ray[nearest]] = echoes.reported[nearest]
+            scan, window = specs[0].scan + begin * len(specs), (0, len(image))
+            found = self._echoes.scan(
+                sensor, scan, pattern, subrays, poses, window, groups, tally=False
+            )
+            nearest = found.number == 1
+            image[found.ray[nearest]] = found.reported[nearest]
         return out.reshape(len(positions), -1, sensor.channels)
 
-    def _rays_of(self, number: int, first: int, stop: int) -> tuple[Pattern, Pattern | None]:
+    def _rays_of(self, number: int, first: int, stop: int) -> _Rays:
         """Rays of some firings in the axes of the carrier, and their sub-rays, if they are few."""
         sensor = self.survey.carried[number].sensor
         if sensor.period:
             first, stop = first % sensor.period, first % sensor.period + stop - first
         made = self._firings.get((number, first, stop))
         if made is None:
-            pattern, subrays = self.pattern(number, first, stop), None
-            if self._echoes is not None:
-                subrays = self._echoes.divided(sensor, pattern)
+            pattern = self.pattern(number, first, stop)
             if len(self._firings) >= KEPT:
                 self._firings.clear()
-            made = self._firings[number, first, stop] = (pattern, subrays)
+            rays = _Rays(pattern, self._echoes.divided(sensor, pattern))
+            made = self._firings[number, first, stop] = rays
         return made

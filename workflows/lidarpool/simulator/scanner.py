@@ -5,10 +5,11 @@ from __future__ import annotations
 import threading
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from raybeam.poses import check_poses
 
@@ -30,14 +31,15 @@ from ..sensor import (
     Survey,
     Trajectory,
 )
-from ..sensor.trajectory import CENTRE
+from ..sensor.trajectory import CENTRE, pose_of
 from .motion import check_trajectory
 from .returns import columns_of
 from .rig import Rig
 from .world import check_backend_here
 
 SCANS_MOST = 1 << 31  # the type of the column `scan`
-_ONE_POSE = "a Pose, or x, y and z in metres, such as (0, 0, 1)"
+Number = Annotated[int, Field(ge=0)]
+Start = Annotated[float | None, Field(ge=0, lt=float("inf"))]
 
 
 class Scanner:
@@ -128,8 +130,8 @@ class Scanner:
         self,
         pose: Pose | Trajectory | Sequence[float],
         *,
-        number: int = 0,
-        start_s: float | None = None,
+        number: Number = 0,
+        start_s: Start = None,
     ) -> Cloud:
         """Scan once around.
 
@@ -157,8 +159,13 @@ class Scanner:
         """
         path = _path(pose)
         rig, specs, late_ns = self._specs(number, start_s)
-        if path.moves:
-            _check_lasts(path, *_span_ns(rig, specs))
+        begin_ns, end_ns = _span_ns(rig, specs)
+        if end_ns > path.duration_ns:
+            raise LidarpoolError(
+                f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and the "
+                f"trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier (start_s), or "
+                "take a longer one."
+            )
         check_trajectory(path)
         returns = rig.returns(specs, path, late_ns)
         survey = rig.survey
@@ -168,11 +175,7 @@ class Scanner:
 
     @checked
     def ranges(
-        self,
-        poses: Pose | ArrayLike,
-        *,
-        number: int = 0,
-        start_s: float | None = None,
+        self, poses: Pose | ArrayLike, *, number: Number = 0, start_s: Start = None
     ) -> NDArray[np.float32]:
         """Ranges that the sensor measures from many poses at one time, as images.
 
@@ -245,10 +248,6 @@ class Scanner:
         """Rig as it is now, scans of a turn, and how late it is, nanoseconds."""
         rig = self._rig
         sensor = rig.survey.sensor
-        if number < 0:
-            raise LidarpoolError(f"number is {number}; it must be at least 0.")
-        if start_s is not None and not 0 <= start_s < float("inf"):
-            raise LidarpoolError(f"start_s is {start_s}; it must be at least 0.")
         steps = sensor.steps_of_turn(number)
         if steps.stop > SCANS_MOST:
             raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
@@ -273,27 +272,9 @@ def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:
     return begin, end
 
 
-def _check_lasts(path: Trajectory, begin_ns: float, end_ns: float) -> None:
-    if end_ns > path.duration_ns:
-        raise LidarpoolError(
-            f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and the "
-            f"trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier (start_s), or take a "
-            "longer one."
-        )
-
-
 def _path(given: Any) -> Trajectory:
-    path: Trajectory = given if hasattr(given, "poses") else Stations((_pose("pose", given),))
+    path: Trajectory = given if hasattr(given, "poses") else Stations((pose_of("pose", given),))
     return path
-
-
-def _pose(name: str, given: Any) -> Pose:
-    if isinstance(given, Pose):
-        return given
-    try:
-        return Pose(tuple(map(float, given)))  # type: ignore[arg-type]  # it counts them
-    except (TypeError, ValueError) as error:
-        raise LidarpoolError(f"{name} is {shown(given)}; it must be {_ONE_POSE}.") from error
 
 
 def _placed(poses: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
@@ -301,7 +282,7 @@ def _placed(poses: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None
     if isinstance(poses, Pose):
         poses = [poses]
     if isinstance(poses, Sequence) and any(isinstance(pose, Pose) for pose in poses):
-        made = [_pose("a pose", pose) for pose in poses]
+        made = [pose_of("a pose", pose) for pose in poses]
         turns = [np.eye(3) if pose.rotation is None else pose.rotation for pose in made]
         return np.array([pose.position for pose in made]), np.array(turns)
     try:

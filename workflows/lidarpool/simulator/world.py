@@ -7,7 +7,6 @@ axes of each pose selects them.
 
 from __future__ import annotations
 
-from copy import copy
 from typing import Any
 
 import numpy as np
@@ -20,8 +19,8 @@ from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import Sensor, Trajectory
-from .motion import Poses, into_axes
+from ..sensor import Trajectory
+from .motion import Poses, into_axes, products
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 CELL_RAYS = 1 << 10  # rays in a cell of a still sensor, which are fired at nearly one time
@@ -50,20 +49,11 @@ class World:
     """Casts scans like `RayCaster.scan`, including hits on actors.
 
     Triangles of actors are numbered after those of the scene, see `Scene.solid`. Rays that touch
-    no actor give the same bits as without actors.
-
-    Parameters
-    ----------
-    scene
-        The scene with its actors.
-    backend, threads, device
-        As of `RayCaster`.
+    no actor give the same bits as without actors. Where the actors are, the poses of a scan say.
+    `options` are those of `RayCaster`.
     """
 
-    def __init__(
-        self, scene: Scene, backend: str, threads: int | None = None, device: int | None = None
-    ) -> None:
-        options: dict[str, Any] = {"backend": backend, "threads": threads, "device": device}
+    def __init__(self, scene: Scene, **options: Any) -> None:
         self._caster = RayCaster(scene.vertices, scene.faces, **options)
         self._actors, faces = [], len(scene.faces)
         for actor in scene.actors:
@@ -75,14 +65,6 @@ class World:
     def backend(self) -> str:
         """Name of the backend in use."""
         return self._caster.backend
-
-    def with_actors(self, actors: tuple[Actor, ...]) -> World:
-        """Return the same world with other trajectories of the actors; the trees are shared."""
-        world = copy(self)
-        world._actors = [
-            cast.on(actor.trajectory) for cast, actor in zip(self._actors, actors, strict=True)
-        ]
-        return world
 
     def scan(
         self,
@@ -98,8 +80,9 @@ class World:
     ) -> ScanReturns:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
-        limits = {"t_min": t_min, "t_max": t_max}
-        common: dict[str, Any] = {**poses.given, "window": (start, stop), **limits}
+        common: dict[str, Any] = {
+            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
+        }  # fmt: skip
         if not self._actors:
             return self._caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
@@ -109,12 +92,13 @@ class World:
         triangle = np.full(stop - start, -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
         cells = _Cells(pattern, poses, start, stop)
-        for actor in self._actors:
-            ray = cells.near(actor, t_max)
+        for actor, way in zip(self._actors, poses.ways, strict=True):
+            ray = cells.near(actor, way, t_max)
             if not len(ray):
                 continue
             origins, directions = poses.rays(pattern, ray, start)
-            rows, t, face = actor.hits(origins, directions, poses.times(ray), **limits)
+            moved = way.poses(0, poses.times(ray))
+            rows, t, face = actor.hits(origins, directions, moved, t_min, t_max)
             nearer = t < distance[ray[rows]]
             distance[ray[rows[nearer]]], triangle[ray[rows[nearer]]] = t[nearer], face[nearer]
         ray = np.flatnonzero(triangle >= 0)
@@ -124,40 +108,18 @@ class World:
         kept = (np.arange(len(ray)) - np.repeat(cuts[:-1], counts)) % keep_every == 0
         counted = np.bincount(triangle[ray], minlength=self._faces) if tally else None
         ray = ray[kept]
-        return ScanReturns(ray.astype(np.uint32), distance[ray], triangle[ray], counts, counted)
-
-    def returns(
-        self,
-        sensor: Sensor,
-        keep_every: int,
-        pattern: Pattern,
-        poses: Poses,
-        window: tuple[int, int],
-        groups: NDArray[np.int64],
-    ) -> ScanReturns:
-        """Cast a sensor's rays, each group a scan: hits in its range, counted and thinned out."""
-        return self.scan(
-            pattern,
-            poses,
-            window=window,
-            t_min=sensor.min_range_m,
-            t_max=sensor.max_range_m,
-            keep_every=keep_every,
-            groups=groups,
-            tally=True,
+        return ScanReturns(
+            ray.astype(np.uint32),
+            distance[ray],
+            triangle[ray],
+            counts,
+            counted,
+            np.zeros(len(ray), np.int32),
         )
 
 
 class _Cells:
-    """Cells of a scan's rays, which start and are fired nearly together.
-
-    Parameters
-    ----------
-    pattern, poses
-        Of the scan.
-    start, stop
-        Its window.
-    """
+    """Cells of the rays of a scan's window, which start and are fired nearly together."""
 
     def __init__(self, pattern: Pattern, poses: Poses, start: int, stop: int) -> None:
         self._rays, each, places = stop - start, poses.rays_per_pose, poses.positions
@@ -180,7 +142,7 @@ class _Cells:
         # A cone around the rays of a cell.
         middle = self._directions.mean(axis=2)
         self._axes = middle / np.maximum(np.linalg.norm(middle, axis=0), 1e-9)
-        cosines = _along(self._axes[:, :, None], self._directions)
+        cosines = products(self._axes[:, :, None], self._directions)
         self._opening = np.arccos(np.clip(cosines.min(axis=1, initial=1), -1, 1))
         first = np.arange(0, self._rays, each)
         last = np.minimum(first + each, self._rays) - 1
@@ -188,71 +150,59 @@ class _Cells:
         ends = poses.times(last)
         self._lasts, self._end = (ends - self._begins).max(initial=0), ends.max(initial=0)
 
-    def near(self, actor: _Cast, t_max: float) -> NDArray[np.intp]:
+    def near(self, actor: _Cast, way: Trajectory, t_max: float) -> NDArray[np.intp]:
         """Numbers of the rays that come near an actor; no other ray hits it."""
         if not self._rays:
             return np.zeros(0, np.intp)
         low, high = self._begins.min(), self._begins.max()
         step = max((high - low) * CELLS / len(self._begins), self._lasts, 1.0)
         times = low + step * np.arange((high - low) // step + 1)
-        way = actor.centre(np.append(times, self._end))
-        between = np.linalg.norm(np.diff(way, axis=0), axis=1).max()
+        places, rotations = way.poses(0, np.append(times, self._end))
+        places = places + (actor.middle if rotations is None else rotations @ actor.middle)
+        between = np.linalg.norm(np.diff(places, axis=0), axis=1).max()
         radius = actor.radius + 2 * between + self._reach + 1e-3
         number = ((self._begins - low) // step).astype(np.intp)
-        centre = into_axes(way[number] - self._places, self._rotations).T
-        far = np.sqrt(_along(centre, centre))
+        centre = into_axes(places[number] - self._places, self._rotations).T
+        far = np.sqrt(products(centre, centre))
         with np.errstate(invalid="ignore", divide="ignore"):
             seen = np.where(far > radius, np.arcsin(radius / far), np.pi) + TURN
-            off = np.arccos(np.clip(_along(self._axes, centre) / far, -1, 1))
+            off = np.arccos(np.clip(products(self._axes, centre) / far, -1, 1))
         cell = np.flatnonzero((far <= t_max + radius) & ~(off > self._opening + seen))
         directions = self._directions
         if directions.shape[1] > 1:
             directions = directions[:, cell]
-        along = _along(centre[:, cell, None], directions)
+        along = products(centre[:, cell, None], directions)
         least = far[cell] * np.cos(np.minimum(seen[cell], np.pi))
         found = np.flatnonzero(along >= least[:, None])
         ray = cell[found // self._each] * self._each + found % self._each
         return ray[ray < self._rays]
 
 
-def _along(one: Float, other: Float) -> Float:
-    """Scalar products of vectors (3, ...)."""
-    (x, y, z), (a, b, c) = one, other
-    return np.asarray(x * a + y * b + z * c)
-
-
 class _Cast:
-    """An actor with its ray caster."""
+    """An actor with its ray caster, and the bounding sphere of its vertices."""
 
     def __init__(self, actor: Actor, first: int, options: dict[str, Any]) -> None:
-        self._way, vertices = actor.trajectory, actor.mesh.vertices
+        vertices = actor.mesh.vertices
         self._first = first  # number of its first triangle
         self._caster = RayCaster(vertices, actor.mesh.faces, **options)
-        self._centre = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-        self.radius = float(np.linalg.norm(vertices - self._centre, axis=1).max())
-
-    def on(self, way: Trajectory) -> _Cast:
-        """Return the same actor on another trajectory."""
-        other = copy(self)
-        other._way = way
-        return other
-
-    def centre(self, times: Float) -> Float:
-        """Centre of its bounding sphere, of `radius`, at times (m,): (m, 3)."""
-        positions, rotations = self._way.poses(0, times)
-        turned = self._centre if rotations is None else rotations @ self._centre
-        return np.asarray(positions + turned)
+        self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
+        self.radius = float(np.linalg.norm(vertices - self.middle, axis=1).max())
 
     def hits(
-        self, origins: Float, directions: Float, times: Float, *, t_min: float, t_max: float
+        self,
+        origins: Float,
+        directions: Float,
+        poses: tuple[Float, Float | None],
+        t_min: float,
+        t_max: float,
     ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
-        """Hits on it of rays (m, 3) fired at times (m,), nanoseconds.
+        """Hits on it of rays (m, 3), each with the actor's pose at its time.
 
         Returns
         -------
         Numbers of the rays that hit (h,), distances in lengths of their directions, and triangles.
         """
-        positions, rotations = self._way.poses(0, times)
+        positions, rotations = poses
         starts = into_axes(origins - positions, rotations)
         hits = self._caster.cast(starts, into_axes(directions, rotations), t_min, t_max)
         on = np.flatnonzero(hits.hit)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import suppress
 from functools import cache
 from pathlib import Path
 from typing import NamedTuple
@@ -13,9 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ...base.allowance import check_fits
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarpoolError, explained, prefixed
 from ...base.words import did_you_mean
 from ...base.xmlfile import xml_root
+from ...scene.transform import rotation_about
 
 Float = NDArray[np.float64]
 
@@ -77,9 +79,8 @@ class Assets:
 def _root(path: Path) -> Element:
     """Return the <document> of a file; LidarpoolError if it is none."""
     try:
-        root = xml_root(read(path))
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror}.") from error
+        with explained(f"{path} cannot be read"):
+            root = xml_root(read(path))
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise LidarpoolError(f"{path} is not readable XML: {error}.") from error
     if root.tag != "document":
@@ -91,10 +92,8 @@ def _root(path: Path) -> Element:
 
 def read(path: Path) -> bytes:
     """Content of a file; LidarpoolError if it is larger than the memory."""
-    try:
+    with prefixed(path):
         check_fits(path)
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
     return path.read_bytes()
 
 
@@ -103,13 +102,10 @@ def number(values: Element | dict[str, str], name: str, default: float) -> float
     text = values.get(name)
     if text is None:
         return default
-    try:
-        value = float(text)
-    except ValueError:
-        value = np.nan
-    if not np.isfinite(value):
-        raise LidarpoolError(f"{name} is {text!r}; it must be a number.")
-    return value
+    with suppress(ValueError):
+        if np.isfinite(value := float(text)):
+            return value
+    raise LidarpoolError(f"{name} is {text!r}; it must be a number.")
 
 
 def flag(values: dict[str, str], name: str, default: bool) -> bool:
@@ -134,17 +130,9 @@ def rotation(element: Element | None) -> Float:
         axis = step.get("axis", "").lower()
         if axis not in ("x", "y", "z"):
             raise LidarpoolError(f"<rot> has the axis {axis!r}; it must be x, y or z.")
-        turn = about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
+        turn = rotation_about(np.eye(3)["xyz".index(axis)], number(step, "angle_deg", 0.0))
         local = element is not None and element.get("rotations") == "local"
         out = out @ turn if local else turn @ out
-    return out
-
-
-def about(axis: Float, degrees: float) -> Float:
-    """Rotation (3, 3) about an axis (Rodrigues, 1840)."""
-    cross = np.cross(np.eye(3), axis / np.linalg.norm(axis))
-    angle = np.radians(degrees)
-    out: Float = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     return out
 
 

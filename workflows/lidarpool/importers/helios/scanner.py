@@ -16,7 +16,8 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ...base.errors import LidarpoolError
-from .files import Float, about, clean, number, rotation, vector
+from ...scene.transform import rotation_about as about
+from .files import Float, clean, number, rotation, vector
 
 _Z = np.array([0.0, 0.0, 1.0])
 # From the axes of our sensors to those of HELIOS++: of a line to both sides, of a cone about the
@@ -44,8 +45,8 @@ class Device:
     turn, place
         Rotation (3, 3) from the sensor's axes to those of the platform's mount, and where the
         light leaves, metres beside the mount.
-    rate_hz, head_s
-        Cycles a second; how long its head takes from start to stop, None where it does not turn.
+    head_s
+        How long its head takes from start to stop, seconds; None where it does not turn.
     range_m
         The nearest and the farthest that it sees.
     """
@@ -53,13 +54,12 @@ class Device:
     data: dict[str, Any]
     turn: Float
     place: Float
-    rate_hz: float
     head_s: float | None
     range_m: tuple[float, float]
 
     def steps(self, seconds: float) -> tuple[float, int]:
         """Degrees and number of the time steps that so many seconds are whole multiples of."""
-        turned = 360 * self.rate_hz * seconds
+        turned = 360 * self.data["rate_hz"] * seconds
         count = max(ceil(turned / (360 if self.head_s is None else _HEAD_STEP_DEG) - _SLACK), 1)
         return turned / count, count
 
@@ -119,9 +119,9 @@ def device(scanner: Scanner, settings: dict[str, str]) -> Device:
     if pulses <= 0:
         raise LidarpoolError(f"{scanner.name} has no pulseFreq_hz above 0.")
     optics = scanner.values.get("optics", "")
-    if optics not in _OPTICS:
+    if optics not in ("rotating", *_OPTICS):
         raise LidarpoolError(
-            f"{scanner.name} has the optics {optics!r}; there are {', '.join(_OPTICS)}."
+            f"{scanner.name} has the optics {optics!r}; there are rotating, {', '.join(_OPTICS)}."
         )
     axis = vector(scanner.child("headRotateAxis"))
     axis = axis if np.linalg.norm(axis) > 0.1 else _Z
@@ -131,7 +131,9 @@ def device(scanner: Scanner, settings: dict[str, str]) -> Device:
     line = _Line.of(scanner, settings, pulses) if optics == "rotating" else None
     most = scanner.number("headRotatePerSecMax_deg")
     wished = number(settings, "headRotatePerSec_deg", 0)
-    head = float(np.clip(wished if line is None else line.head(settings, wished), -most, most))
+    if line is not None:  # by the distance of its lines, where that is given
+        wished = number(settings, "horizontalResolution_deg", 0) * line.scan_hz or wished
+    head = float(np.clip(wished, -most, most))
     if head:
         tilt = _tilt(rotation(emitter))
         if line is None or tilt is None or abs(axis[2]) < (1 - 1e-12) * np.linalg.norm(axis):
@@ -147,26 +149,24 @@ def device(scanner: Scanner, settings: dict[str, str]) -> Device:
         head = head if axis[2] > 0 else -head
         data, turn = line.turning(head, tilt), _HEAD
     else:
-        data, turn = _OPTICS[optics](scanner, settings, pulses)
+        data, turn = line.standing() if line else _OPTICS[optics](scanner, settings, pulses)
         turn = rotation(emitter) @ turn
+    divergence = number(settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4))
     light = {
         "wavelength_nm": scanner.number("wavelength_nm", 1064),
-        "divergence_mrad": 1e3
-        * number(settings, "beamDivergence_rad", scanner.number("beamDivergence_rad", 3e-4)),
+        "divergence_mrad": 1e3 * divergence,
         "pulse_ns": scanner.number("pulseLength_ns", 4),
         "resolution_m": 0.001,
     }
-    sources = {"all": "a HELIOS++ survey and what it names"}
     return Device(
         {
             "name": scanner.name,
-            "sources": sources,
+            "sources": {"all": "a HELIOS++ survey and what it names"},
             **data,
             "optics": {name: clean(value) for name, value in light.items()},
         },
         about(axis, start) @ turn,
         vector(emitter),
-        data["rate_hz"],
         abs(range_deg / head) if head else None,
         (scanner.number("rangeMin_m"), number(scanner.values, "rangeMax_m", np.inf)),
     )
@@ -200,11 +200,9 @@ class _Line:
     def of(cls, scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> _Line:
         most = scanner.number("scanAngleMax_deg")
         wide = scanner.number("scanAngleEffectiveMax_deg")
-        fine, least = (
-            number(settings, "verticalResolution_deg", 0),
-            scanner.number("scanFreqMin_Hz"),
-        )
-        if not fine and not number(settings, "scanFreq_hz", 0) and not least:
+        fine = number(settings, "verticalResolution_deg", 0)
+        least = scanner.number("scanFreqMin_Hz")
+        if not (fine or least or number(settings, "scanFreq_hz", 0)):
             return cls(0.0, 0.0, 1, 1, pulse_hz, 0.0)  # the mirror stands
         scan_hz = _scan_hz(scanner, settings, pulse_hz * fine / (2 * most) if fine else None)
         half = min(wide, _half(scanner, settings))
@@ -225,10 +223,6 @@ class _Line:
             )
         return cls(first * step - most, step, last - first + 1, of_all, pulse_hz, scan_hz)
 
-    def head(self, settings: dict[str, str], wished: float) -> float:
-        """Degrees a second that the head turns, by the distance of lines where that is given."""
-        return number(settings, "horizontalResolution_deg", 0) * self.scan_hz or wished
-
     def standing(self) -> Made:
         """Return a mirror whose firings are pulses."""
         if not self.scan_hz:
@@ -245,17 +239,12 @@ class _Line:
     def turning(self, head: float, tilt: float) -> dict[str, Any]:
         """Return a head whose firings are lines."""
         between_us = 1e6 / self.pulse_hz
+        last = clean((self.count - 1) * between_us)
+        times = {"time_us": {"first": 0, "last": last, "count": self.count}}
         data = {
             "firing_us": _us(self.of_all, self.pulse_hz),
             "rate_hz": abs(head) / 360,
-            "beams": {
-                **self._elevations(tilt),
-                "time_us": {
-                    "first": 0,
-                    "last": clean((self.count - 1) * between_us),
-                    "count": self.count,
-                },
-            },
+            "beams": self._elevations(tilt) | times,
         }
         return data if head > 0 else {"clockwise": True, **data}
 
@@ -279,11 +268,6 @@ def _mirror(
 ) -> dict[str, Any]:
     data: dict[str, Any] = {"axis": "x", "firings_per_turn": firings, "rate_hz": rate_hz}
     return data | ({"zero_deg": clean(middle)} if clean(middle) else {}) | {"mirror": mirror}
-
-
-def _rotating(scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> Made:
-    """Make a polygon, whose head does not turn."""
-    return _Line.of(scanner, settings, pulse_hz).standing()
 
 
 def _oscillating(scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> Made:
@@ -329,11 +313,7 @@ def _prisms(scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> Made
     ]
     if not prisms:
         raise LidarpoolError(f"{scanner.name} has no prisms.")
-    made: dict[str, Any] = {
-        "firing_us": _us(1, pulse_hz),
-        "rate_hz": _FRAME_HZ,
-        "prisms": prisms,
-    }
+    made: dict[str, Any] = {"firing_us": _us(1, pulse_hz), "rate_hz": _FRAME_HZ, "prisms": prisms}
     if (incident := scanner.child("incidentBeam")) is not None:
         x, y, z = _PRISM.T @ vector(incident)
         elevation, azimuth = np.arctan2(z, np.hypot(x, y)), np.arctan2(y, x)
@@ -345,7 +325,6 @@ def _prisms(scanner: Scanner, settings: dict[str, str], pulse_hz: float) -> Made
 
 
 _OPTICS: dict[str, Callable[[Scanner, dict[str, str], float], Made]] = {
-    "rotating": _rotating,
     "oscillating": _oscillating,
     "conic": _cone,
     "line": _fibers,

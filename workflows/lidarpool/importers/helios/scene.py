@@ -12,7 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarpoolError, prefixed
 from ...scene.floor import heights_at
 from ...scene.mesh import Mesh
 from ...scene.meshfile import load_meshes
@@ -39,16 +39,12 @@ class Part:
     @cached_property
     def materials(self) -> list[dict[str, str]]:
         """Material values that HELIOS++ reads for its faces."""
-        text = self.file.read_text("utf-8", "replace")
+        text = _text(self.file)
         used = set(re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE))
         found: dict[str, dict[str, str]] = {}
         for name in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE):
-            try:
-                lines = (self.file.parent / name).read_text("utf-8", "replace").splitlines()
-            except (OSError, ValueError):  # a zero in the name
-                continue
             values: dict[str, str] = {}
-            for words in (line.split() for line in lines):
+            for words in (line.split() for line in _text(self.file.parent / name).splitlines()):
                 if words[:1] == ["newmtl"] and len(words) > 1:
                     values = found.setdefault(words[1], {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
@@ -108,10 +104,8 @@ class Surroundings:
         self.parts: list[Part] = []
         name = f"scene {element.get('id')!r}"
         for index, part in enumerate(element.findall("part")):
-            try:
+            with prefixed(f"{name}, part {index}"):
                 self.parts += self._read(part, f"part {index}", assets)
-            except LidarpoolError as error:
-                raise LidarpoolError(f"{name}, part {index}: {error}") from error
         if not self.parts:
             raise LidarpoolError(
                 f"{name} has no part that can be read: only those of the filter objloader are."
@@ -178,23 +172,20 @@ class Surroundings:
         kinds = [part.kind(partial(self._reflectance, wavelength_nm)) for part in self.parts]
         if not any(kinds):
             return []
-        named = [
-            (mesh.name, kind)
-            for part, kind in zip(self.parts, kinds, strict=True)
-            for mesh in part.meshes()
+        meshes = [part.meshes() for part in self.parts]
+        names = iter(unique_names([mesh.name for of in meshes for mesh in of]))
+        own = [
+            {"objects": next(names), **kind}
+            for of, kind in zip(meshes, kinds, strict=True)
+            for _ in of
         ]
-        names = unique_names([name for name, _ in named])
-        own = zip(names, (kind for _, kind in named), strict=True)
-        return [{"objects": "*"}, *({"objects": name, **kind} for name, kind in own if kind)]
+        return [{"objects": "*"}, *(entry for entry in own if len(entry) > 1)]
 
     def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
         """Reflectance at a wavelength, by the spectrum of a name; None where there is none."""
         for place in self._assets.places:
             for folder in (place / "spectra", place / "data" / "spectra"):
-                try:
-                    text = (folder / f"{name}.txt").read_text("utf-8", "replace")
-                except (OSError, ValueError):  # a zero in the name
-                    continue
+                text = _text(folder / f"{name}.txt")
                 rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
                 if rows:  # micrometres and per cent
                     lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
@@ -204,17 +195,18 @@ class Surroundings:
 
     def left_out(self) -> list[str]:
         """List the unsupported features, after everything was read."""
-        missing = "; ".join(sorted(self._missing))
-        ground = [f"onGround at {missing}: no ground there, so z is 0"] if missing else []
-        return [*self._standing(), *self.unread, *ground]
-
-    def _standing(self) -> Iterator[str]:
+        out = []
         for tag, parts in self._moving.items():
             if len(parts) == 1:
-                yield f"<{tag}> of {parts[0]}: it stands as it is at first"
+                out.append(f"<{tag}> of {parts[0]}: it stands as it is at first")
             elif parts:
                 several = f"{len(parts)} parts, {parts[0]} to {parts[-1]}"
-                yield f"<{tag}> of {several}: they stand as they are at first"
+                out.append(f"<{tag}> of {several}: they stand as they are at first")
+        out += self.unread
+        if self._missing:
+            places = "; ".join(sorted(self._missing))
+            out.append(f"onGround at {places}: no ground there, so z is 0")
+        return out
 
 
 def _files(text: dict[str, str], assets: Assets) -> list[Path]:
@@ -232,6 +224,14 @@ def _files(text: dict[str, str], assets: Assets) -> list[Path]:
             if found:
                 return found
     raise LidarpoolError(f"no file fits the efilepath {text['efilepath']!r}.")
+
+
+def _text(path: Path) -> str:
+    """Content of a file that may be missing; then empty."""
+    try:
+        return path.read_text("utf-8", "replace")
+    except (OSError, ValueError):  # a zero in the name
+        return ""
 
 
 def _numbers(text: str, count: int) -> Float:

@@ -6,8 +6,8 @@ import os
 import re
 import shutil
 import tempfile
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -15,19 +15,20 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarpoolError, prefixed
 from ...scenario.scenario import Scenario
+from ...scene.transform import rotation_about
 from ...sensor import Pose
 from ...sensor.disc import SUBRAYS
 from ...sensor.survey import SENSORS_MOST
-from .files import Assets, Float, about, clean, number, rotation, vector
-from .scanner import Device, Scanner, channels, device, unread
+from .files import Assets, Float, clean, number, rotation, vector
+from .scanner import Device, channels, device, unread
 from .scene import Surroundings
-from .way import Legs, Stretch, Way, flown, read_way, stood
+from .way import Stretch, Way, flown, read_legs, read_way, stood
 
 SCENARIO_FILE = "scenario.yaml"
 # Carriers look along x, the platforms of HELIOS++ along y.
-_AHEAD = about(np.array([0.0, 0, 1]), -90)
+_AHEAD = rotation_about((0, 0, 1), -90)
 
 
 @dataclass
@@ -88,97 +89,90 @@ def import_survey(
     return Imported(out / SCENARIO_FILE, Scenario.load(out / SCENARIO_FILE), made.left_out)
 
 
-@dataclass
 class _Import:
-    survey: Path
-    folders: list[Path]
-    left_out: list[str] = field(default_factory=list)
+    """A survey that was read whole."""
 
-    def __post_init__(self) -> None:
-        self.assets = Assets(self.survey, self.folders)
-        root = self.assets.root(self.survey)
-        element = root.find("survey")
+    def __init__(self, survey: Path, folders: Sequence[Path]) -> None:
+        self._home, self._assets = survey, Assets(survey, folders)
+        element = self._assets.root(survey).find("survey")
         if element is None:
             raise LidarpoolError("it has no <survey>.")
-        self.element, self.name = element, element.get("name") or self.survey.stem
-        reference = self._reference("scanner")
-        self.scanners = channels(self.assets.asset(reference, "scanner", self.survey).element)
-        scene = self.assets.asset(self._reference("scene"), "scene", self.survey)
-        self.scene = Surroundings(scene.element, self.assets)
-        self.data: dict[str, dict[str, Any]] = {}  # {file: of a sensor}
-        self.way, self.sensors = self._carried(*self._legs())
-        if not self.sensors:
+        self._element, self._name = element, element.get("name") or survey.stem
+        self._scanners = channels(self._asset("scanner"))
+        self._first = next(iter(self._scanners.values()))
+        self._scene = Surroundings(self._asset("scene"), self._assets)
+        self._notes: list[str] = []
+        self._files: dict[str, dict[str, Any]] = {}  # {name: data of a sensor}
+        self._sensors: dict[str, dict[str, Any]] = {}
+        self._way = self._carry()
+        if not self._sensors:
             raise LidarpoolError("no leg scans anything.")
-        if len(self.sensors) > SENSORS_MOST:
+        if len(self._sensors) > SENSORS_MOST:
             raise LidarpoolError(
-                f"{len(self.sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
+                f"{len(self._sensors)} legs and channels scan; a scenario has {SENSORS_MOST} "
                 "sensors at most."
             )
-        first = next(iter(self.scanners.values()))
-        self.materials = self.scene.materials(first.number("wavelength_nm", 1064))
-        self.left_out = list(
-            dict.fromkeys([*self.left_out, *self._unread(), *self.scene.left_out()])
-        )
+        self._materials = self._scene.materials(self._first.number("wavelength_nm", 1064))
+        if element.get("legRandomOffset", "false") in ("true", "1"):
+            self._notes.append("legRandomOffset: legs are where they say")
+        if number(element, "numRuns", 1) > 1:
+            self._notes.append("numRuns: it is one run")
+        unsupported = (line for scanner in self._scanners.values() for line in unread(scanner))
+        self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self._scene.left_out()]))
 
-    def _reference(self, kind: str) -> str:
-        if not (found := self.element.get(kind)):
+    def _asset(self, kind: str) -> Element:
+        if not (reference := self._element.get(kind)):
             raise LidarpoolError(f"its <survey> names no {kind}.")
-        return found
+        return self._assets.asset(reference, kind, self._home).element
 
-    def _legs(self) -> tuple[Legs, Element | None]:
-        """Read the legs, and the mount of their platform."""
-        legs = Legs.of(self.element, self.assets, self.survey, self.scene.height)
-        reference = self._reference("platform")
-        if reference == "interpolated":
-            base = self.element.get("basePlatform")
-            platform = base and self.assets.asset(base, "platform", self.survey).element
-            mount = platform.find("scannerMount") if isinstance(platform, Element) else None
-            own = self.element.find("scannerMount")
-            legs.moves = True
-            legs.way = read_way(self.element, legs, self.assets)
-            return legs, mount if own is None else own
-        platform = self.assets.asset(reference, "platform", self.survey).element
-        kind = platform.get("type", "").lower()
-        if kind in ("groundvehicle", "multicopter"):
-            self.left_out.append(
-                f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
-            )
-        legs.moves = kind in ("linearpath", "groundvehicle", "multicopter")
-        noisy = [e.tag for parent in (platform, self.element) for e in parent if "Noise" in e.tag]
-        if noisy:
-            self.left_out.append(f"noise of the platform: {', '.join(noisy)}")
-        return legs, platform.find("scannerMount")
-
-    def _carried(self, legs: Legs, mount: Element | None) -> tuple[Way, dict[str, dict[str, Any]]]:
-        """Trajectory of the carrier, and its sensors by name."""
+    def _carry(self) -> Way:
+        """Read the legs and the platform; make the trajectory, and sensors on it."""
+        survey, assets = self._element, self._assets
+        legs = read_legs(survey, assets, self._home, self._scene.height)
+        mount, kind, way = survey.find("scannerMount"), "interpolated", None
+        if survey.get("platform") == kind:
+            base = survey.get("basePlatform")
+            if mount is None and base:
+                mount = assets.asset(base, "platform", self._home).element.find("scannerMount")
+            way = read_way(survey, legs, assets)
+        else:
+            platform = self._asset("platform")
+            mount, kind = platform.find("scannerMount"), platform.get("type", "").lower()
+            if kind in ("groundvehicle", "multicopter"):
+                self._notes.append(
+                    f"how a {kind} drives: it keeps its speed and goes straight from leg to leg"
+                )
+            noisy = [e.tag for parent in (platform, survey) for e in parent if "Noise" in e.tag]
+            if noisy:
+                self._notes.append(f"noise of the platform: {', '.join(noisy)}")
+        moves = kind in ("linearpath", "groundvehicle", "multicopter")
+        devices: dict[int, dict[str, Device]] = {}  # {leg: {channel: …}}
+        for leg in legs[:-1] if moves else legs:  # the last one is only where a way ends
+            with prefixed(f"leg {leg.number}"):
+                if leg.active:
+                    devices[leg.number] = {
+                        channel: device(scanner, leg.scanner)
+                        for channel, scanner in self._scanners.items()
+                    }
+        if way is None and moves:
+            way = flown(legs)
+        elif way is None:
+            heads = {leg: max(d.head_s or 0.0 for d in of.values()) for leg, of in devices.items()}
+            way = stood(legs, heads)
         turn, place = rotation(mount), vector(mount)
-        devices = {
-            (leg.number, channel): self._device(leg.number, scanner, leg.settings)
-            for leg in legs.active
-            for channel, scanner in self.scanners.items()
+        places = {
+            tuple(clean(place + one.place))  # type: ignore[arg-type]
+            for of in devices.values()
+            for one in of.values()
         }
-        heads = {
-            number: max((d.head_s or 0.0 for (leg, _), d in devices.items() if leg == number))
-            for number in {leg.number for leg in legs.active}
-        }
-        way = legs.way or (flown(legs) if legs.moves else stood(legs, heads))
-        sensors: dict[str, dict[str, Any]] = {}
-        places = {tuple(clean(place + one.place)) for one in devices.values()}  # type: ignore[arg-type]
         if len(places) > 1:
-            self.left_out.append("places of channels beside each other: all leave from the first's")
-        way.move(np.array(min(places, default=(0, 0, 0))))
+            self._notes.append("places of channels beside each other: all leave from the first's")
+        way.rows[:, 1:4] += min(places, default=(0, 0, 0))
         for stretch in way.stretches:
-            for channel in self.scanners if stretch.active else ():
-                one = devices[stretch.leg, channel]
+            for channel, one in devices[stretch.leg].items() if stretch.active else ():
                 name = f"leg{stretch.leg}" + (f"-{channel}" if channel else "")
-                sensors[name] = self._sensor(one, stretch, turn)
-        return way, sensors
-
-    def _device(self, leg: int, scanner: Scanner, settings: dict[str, str]) -> Device:
-        try:
-            return device(scanner, settings)
-        except LidarpoolError as error:
-            raise LidarpoolError(f"leg {leg}: {error}") from error
+                self._sensors[name] = self._sensor(one, stretch, turn)
+        return way
 
     def _sensor(self, one: Device, stretch: Stretch, mount: Float) -> dict[str, Any]:
         """Entry of `sensors`."""
@@ -200,36 +194,23 @@ class _Import:
         """Name of the file of a sensor; those that are alike share one."""
         stem = re.sub(r"[^\w.-]+", "_", str(data["name"])).strip("._").lower() or "sensor"
         name, number = f"{stem}.yaml", 1
-        while self.data.setdefault(name, data) != data:
+        while self._files.setdefault(name, data) != data:
             number += 1
             name = f"{stem}-{number}.yaml"
         return name
 
-    def _unread(self) -> Iterator[str]:
-        for scanner in self.scanners.values():
-            yield from unread(scanner)
-        if self.element.get("legRandomOffset", "false") in ("true", "1"):
-            yield "legRandomOffset: legs are where they say"
-        if number(self.element, "numRuns", 1) > 1:
-            yield "numRuns: it is one run"
-
-    # -- what is written ---------------------------------------------------------------------
-
     def files(self, out: Path) -> dict[str, str]:
         """Return what goes into the folder `out`: {name: text}."""
-        trajectory, files = self.way.written()
-        light = Light.of(self.element, next(iter(self.scanners.values())))
+        trajectory, files = self._way.written()
+        light, range_m = self._light()
+        names = [os.path.relpath(part.file.resolve(), out.resolve()) for part in self._scene.parts]
+        entries = zip(self._scene.parts, names, strict=True)
         data = {
-            "scene": {
-                "files": [
-                    part.entry(Path(os.path.relpath(part.file.resolve(), out.resolve())).as_posix())
-                    for part in self.scene.parts
-                ]
-            },
+            "scene": {"files": [part.entry(Path(name).as_posix()) for part, name in entries]},
             "trajectory": trajectory,
-            "sensors": {name: {**sensor, **light.range_m} for name, sensor in self.sensors.items()},
-            **({"materials": self.materials} if self.materials else {}),
-            **light.sections,
+            "sensors": {name: sensor | range_m for name, sensor in self._sensors.items()},
+            **({"materials": self._materials} if self._materials else {}),
+            **light,
             "cloud": {
                 "keep_every": 1,
                 "precision_m": 0.001,
@@ -238,41 +219,31 @@ class _Import:
             "planning": {"enabled": False},
         }
         head = [
-            f"From the HELIOS++ survey {self.name!r} by lidarpool import.",
+            f"From the HELIOS++ survey {self._name!r} by lidarpool import.",
             *(f"Not supported: {line}." for line in self.left_out),
         ]
         text = "".join(f"# {line}\n" for line in head) + _dumped(data)
-        sensors = {name: _dumped(sensor) for name, sensor in self.data.items()}
+        sensors = {name: _dumped(sensor) for name, sensor in self._files.items()}
         return {**files, **sensors, SCENARIO_FILE: text}
 
-
-@dataclass(frozen=True)
-class Light:
-    """Sections on light, and ranges that the survey sets for its scanner."""
-
-    sections: dict[str, Any]
-    range_m: dict[str, float]
-
-    @classmethod
-    def of(cls, survey: Element, scanner: Scanner) -> Light:
-        """Take them from a survey, else from its scanner."""
-        detector = survey.find("detectorSettings")
+    def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
+        """Return sections on light, and ranges that the survey sets for its scanner."""
+        scanner, detector = self._first, self._element.find("detectorSettings")
         own = {} if detector is None else detector.attrib
         quality = 3.0
-        for settings in (scanner.child("FWFSettings"), survey.find("FWFSettings")):
+        for settings in (scanner.child("FWFSettings"), self._element.find("FWFSettings")):
             if settings is not None:
                 quality = number(settings, "beamSampleQuality", quality)
-        rings = int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))
         sections = {
             "returns": {
                 "mode": "first" if scanner.number("maxNOR") == 1 else "all",
-                "subrays": SUBRAYS[rings],
+                "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
             },
             "noise": {"range_m": clean(number(own, "accuracy_m", scanner.number("accuracy_m")))},
             "weather": {"visibility_km": clean(scanner.number("atmosphericVisibility_km", 23))},
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
-        return cls(sections, {ours: number(own, n, 0) for ours, n in ranges.items() if n in own})
+        return sections, {ours: number(own, n, 0) for ours, n in ranges.items() if n in own}
 
 
 def _dumped(data: dict[str, Any]) -> str:

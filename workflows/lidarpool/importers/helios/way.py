@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import io
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from ...base.errors import LidarpoolError
+from ...base.errors import LidarpoolError, prefixed
+from ...scene.transform import rotation_about as about
 from ...sensor.trajectory import quaternions_of
-from .files import Assets, Float, about, clean, flag, number, read
+from .files import Assets, Float, clean, flag, number, read
 
 _SPEED = 70.0  # metres a second, where nothing is said
 _BETWEEN_S = 0.001  # of legs, in which the carrier turns on the spot or goes to its next one
@@ -29,11 +31,14 @@ class Leg:
 
     number: int
     place: Float
-    speed: float
-    settings: dict[str, str]
-    active: bool
-    most_s: float | None
+    scanner: dict[str, str]
     platform: dict[str, str]
+    longest_s: float  # infinite where there is no limit
+
+    @property
+    def active(self) -> bool:
+        """Whether it scans."""
+        return flag(self.scanner, "active", True)
 
 
 @dataclass
@@ -56,10 +61,6 @@ class Way:
     rows: Float
     stretches: list[Stretch]
 
-    def move(self, by: Float) -> None:
-        """Move all of it, in the axes of the world."""
-        self.rows[:, 1:4] += by
-
     def written(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
         """Return the section `trajectory`, and the files that it names."""
         if self.rows.shape[1] == 5:
@@ -72,59 +73,40 @@ class Way:
         return WAY_FILE, {WAY_FILE: text.getvalue()}
 
 
-@dataclass
-class Legs:
-    """The legs of a survey."""
-
-    all: list[Leg]
-    moves: bool = False
-    way: Way | None = None  # where it is from a file
-
-    @property
-    def active(self) -> list[Leg]:
-        """Those that scan; where a platform moves, the last leg is only where it ends."""
-        legs = self.all[:-1] if self.moves and self.way is None else self.all
-        return [leg for leg in legs if leg.active]
-
-    @classmethod
-    def of(
-        cls, survey: Element, assets: Assets, home: Any, height: Callable[[float, float], float]
-    ) -> Legs:
-        """Read them; `height` tells where the ground is."""
-        legs = []
-        for index, element in enumerate(survey.findall("leg")):
-            try:
-                platform = assets.settings(element.find("platformSettings"), home)
-                scanner = assets.settings(element.find("scannerSettings"), home)
-                place = np.array([number(platform, axis, 0.0) for axis in "xyz"])
-                if flag(platform, "onGround", False) and "trajectory" not in platform:
-                    place[2] = height(place[0], place[1])
-                most = number(element, "maxDuration_s", number(scanner, "maxDuration_s", -1))
-                speed = number(platform, "movePerSec_m", _SPEED)
-            except LidarpoolError as error:
-                raise LidarpoolError(f"leg {index}: {error}") from error
-            active = flag(scanner, "active", True)
-            most_s = most if most > 0 else None
-            legs.append(Leg(index, place, speed, scanner, active, most_s, platform))
-        if not legs:
-            raise LidarpoolError("its <survey> has no <leg>.")
-        return cls(legs)
+def read_legs(
+    survey: Element, assets: Assets, home: Any, height: Callable[[float, float], float]
+) -> list[Leg]:
+    """Read the legs of a survey; `height` tells where the ground is."""
+    legs = []
+    for index, element in enumerate(survey.findall("leg")):
+        with prefixed(f"leg {index}"):
+            platform = assets.settings(element.find("platformSettings"), home)
+            scanner = assets.settings(element.find("scannerSettings"), home)
+            place = np.array([number(platform, axis, 0.0) for axis in "xyz"])
+            if flag(platform, "onGround", False) and "trajectory" not in platform:
+                place[2] = height(place[0], place[1])
+            longest = number(element, "maxDuration_s", number(scanner, "maxDuration_s", -1))
+        legs.append(Leg(index, place, scanner, platform, longest if longest > 0 else np.inf))
+    if not legs:
+        raise LidarpoolError("its <survey> has no <leg>.")
+    return legs
 
 
-def flown(legs: Legs) -> Way:
+def flown(legs: Sequence[Leg]) -> Way:
     """Go straight from each leg to the next, each at its speed, and turn on the spot."""
-    rows, stretches, clock, here, yaw = [], [], 0.0, legs.all[0].place, _FACING_Y_DEG
-    for leg, after in zip(legs.all, legs.all[1:], strict=False):
+    rows, stretches, clock, here, yaw = [], [], 0.0, legs[0].place, _FACING_Y_DEG
+    for leg, after in pairwise(legs):
         way = after.place - here
         length = float(np.linalg.norm(way))
         if not length:
             continue
-        if leg.speed <= 0:
-            raise LidarpoolError(f"leg {leg.number}: movePerSec_m is {leg.speed:g}; it never ends.")
-        seconds = min(length / leg.speed, leg.most_s or np.inf)
+        speed = number(leg.platform, "movePerSec_m", _SPEED)
+        if speed <= 0:
+            raise LidarpoolError(f"leg {leg.number}: movePerSec_m is {speed:g}; it never ends.")
+        seconds = min(length / speed, leg.longest_s)
         if way[:2].any():
             yaw = float(np.degrees(np.arctan2(way[1], way[0])))
-        there = here + way * (seconds * leg.speed / length)
+        there = here + way * (seconds * speed / length)
         rows += [[clock, *here, yaw], [clock + seconds, *there, yaw]]
         stretches.append(Stretch(leg.number, leg.active, clock, seconds))
         clock, here = clock + seconds + _BETWEEN_S, there
@@ -134,22 +116,21 @@ def flown(legs: Legs) -> Way:
     return Way(np.array(rows), stretches)
 
 
-def stood(legs: Legs, heads: dict[int, float]) -> Way:
+def stood(legs: Sequence[Leg], heads: dict[int, float]) -> Way:
     """Stand at each leg until its head has turned: {number of a leg: seconds}."""
     rows, stretches, clock = [], [], 0.0
-    for leg in legs.all:
-        turning = heads.get(leg.number) or np.inf
-        seconds = min(turning, leg.most_s or np.inf)
-        if leg.active and seconds == np.inf:
+    for leg in legs:
+        if not leg.active:
+            continue
+        seconds = min(heads[leg.number] or np.inf, leg.longest_s)
+        if seconds == np.inf:
             raise LidarpoolError(
                 f"leg {leg.number}: nothing moves, neither platform nor head, and there is no "
                 "maxDuration_s; it never ends."
             )
-        if not leg.active:
-            continue
         pose = [*leg.place, _FACING_Y_DEG]
         rows += [[clock, *pose], [clock + seconds, *pose]]
-        stretches.append(Stretch(leg.number, leg.active, clock, seconds))
+        stretches.append(Stretch(leg.number, True, clock, seconds))
         clock += seconds + _BETWEEN_S
     if not rows:
         raise LidarpoolError("no leg scans anything.")
@@ -157,41 +138,38 @@ def stood(legs: Legs, heads: dict[int, float]) -> Way:
     return Way(np.array(rows), stretches)
 
 
-def read_way(survey: Element, legs: Legs, assets: Assets) -> Way:
+def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
     """Read the file of an interpolated platform; each leg is a stretch of it."""
-    files = {leg.platform.get("trajectory", "") for leg in legs.all}
+    files = {leg.platform.get("trajectory", "") for leg in legs}
     if len(files) != 1 or "" in files:
         raise LidarpoolError("an interpolated platform needs one trajectory, the same in all legs.")
     path = assets.file(files.pop())
     settings: dict[str, str] = {}
-    for leg in reversed(legs.all):
+    for leg in reversed(legs):
         settings |= leg.platform
-    table, names = _table(read(path).decode("utf-8", "replace"), settings)
-    if "t" not in names or len(table) < 2:
-        raise LidarpoolError(f"{path} is no trajectory: it has no column t, or one row.")
-    table = table[np.unique(table[:, names.index("t")], return_index=True)[1]]
-    times = table[:, names.index("t")]
-    places = np.stack([table[:, names.index(axis)] for axis in "xyz"], axis=1)
-    turns = np.broadcast_to(np.eye(3), (len(table), 3, 3))
-    if settings.get("interpolationDomain") != "position" and "yaw" in names:
+    columns = _columns(read(path).decode("utf-8", "replace"), settings)
+    times, first = np.unique(columns["t"], return_index=True)
+    if len(times) < 2:
+        raise LidarpoolError(f"{path} is no trajectory: all its rows have one time.")
+    columns = {name: column[first] for name, column in columns.items()}
+    turns = np.broadcast_to(np.eye(3), (len(times), 3, 3))
+    if settings.get("interpolationDomain") != "position" and "yaw" in columns:
         scale = 1.0 if flag(settings, "toRadians", True) else 180 / np.pi
-        angles = scale * np.stack([table[:, names.index(n)] for n in ("roll", "pitch", "yaw")], 1)
+        angles = scale * np.stack([columns[name] for name in ("roll", "pitch", "yaw")], axis=1)
         kind = survey.get("rotationSpec", "ARINC 705")
         turns = np.array([_turned(kind, *row) for row in angles.tolist()])
-    start = times[0]
     stretches = []
-    for leg in legs.all:
-        begin = max(number(leg.platform, "tStart", start), start)
-        end = min(
-            number(leg.platform, "tEnd", times[-1]), times[-1], begin + (leg.most_s or np.inf)
-        )
+    for leg in legs:
+        begin = max(number(leg.platform, "tStart", times[0]), times[0])
+        end = min(number(leg.platform, "tEnd", times[-1]), times[-1], begin + leg.longest_s)
         if end <= begin:
             raise LidarpoolError(f"leg {leg.number}: tStart and tEnd lie outside the trajectory.")
-        stretches.append(Stretch(leg.number, leg.active, float(begin - start), float(end - begin)))
+        start_s = float(begin - times[0])
+        stretches.append(Stretch(leg.number, leg.active, start_s, float(end - begin)))
+    places = [columns[axis] for axis in "xyz"]
     quaternions = quaternions_of(turns @ about(_Z, _FACING_Y_DEG))
-    rows = np.column_stack([times - start, places, quaternions])
-    after = rows[-1] + np.array([_AFTER_S, *7 * [0]])
-    return Way(np.vstack([rows, after]), stretches)
+    rows = np.column_stack([times - times[0], *places, quaternions])
+    return Way(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), stretches)
 
 
 def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Float:
@@ -203,8 +181,8 @@ def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Float:
     raise LidarpoolError(f"rotationSpec is {kind!r}; there are ARINC 705 and CANONICAL.")
 
 
-def _table(text: str, settings: dict[str, str]) -> tuple[Float, list[str]]:
-    """Numbers of a trajectory, and what its columns are: by indices, its header, or as usual."""
+def _columns(text: str, settings: dict[str, str]) -> dict[str, Float]:
+    """Columns of a trajectory by name: by indices, its header, or as usual."""
     usual = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     separator = settings.get("trajectory_seperator", ",")
@@ -214,22 +192,17 @@ def _table(text: str, settings: dict[str, str]) -> tuple[Float, list[str]]:
         raise LidarpoolError(f"its trajectory has rows that are not alike: {error}.") from error
     if rows.ndim != 2 or not np.isfinite(rows).all():
         raise LidarpoolError("its trajectory is not a table of numbers.")
-    names = [""] * rows.shape[1]
+    width = rows.shape[1]
     header = re.search(r"^#\s*HEADER:(.*)$", text, re.MULTILINE)
     if any(f"{name}Index" in settings for name in usual):
-        for index, name in enumerate(usual):
-            at = int(number(settings, f"{name}Index", index))
-            if 0 <= at < len(names):
-                names[at] = name
+        places = {int(number(settings, f"{name}Index", i)): name for i, name in enumerate(usual)}
+        names = [places.get(at, "") for at in range(width)]
     elif header is not None:
         names = [word.strip(" \"'") for word in header[1].split(",")]
-    elif len(names) == 4:
-        names = ["t", "x", "y", "z"]
     else:
-        names = usual
-    if len(names) != rows.shape[1] or not {"t", "x", "y", "z"} <= {*names}:
+        names = ["t", "x", "y", "z"] if width == 4 else usual
+    if len(names) != width or not {"t", "x", "y", "z"} <= {*names}:
         raise LidarpoolError(
-            f"its trajectory has {rows.shape[1]} columns, named {', '.join(names)}; it needs t, x, "
-            "y and z."
+            f"its trajectory has {width} columns, named {', '.join(names)}; it needs t, x, y and z."
         )
-    return rows, names
+    return dict(zip(names, rows.T, strict=True))

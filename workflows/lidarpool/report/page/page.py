@@ -41,20 +41,6 @@ STAGES = {
 }
 
 
-class Fact(NamedTuple):
-    """A number at the head of the page."""
-
-    value: str
-    what: str
-
-
-class Picture(NamedTuple):
-    """A picture within the page: an element of HTML."""
-
-    image: Markup
-    caption: str
-
-
 class Bar(NamedTuple):
     """A row of a bar chart: full and short name, number, share, length in per cent."""
 
@@ -75,18 +61,7 @@ def write_page(
 ) -> None:
     """Write a report as one HTML file that needs no other files and no network.
 
-    Parameters
-    ----------
-    path
-        The file.
-    report
-        From `make_report`; most numbers of the page come from it.
-    result, cloud
-        The result, and the statistics of its cloud.
-    pictures
-        Pictures of the result by name, each an SVG element.
-    scenario
-        The scenario of the run, if there is one.
+    Most numbers are those of `report`, from `make_report`; `pictures` are SVG elements by name.
 
     Raises
     ------
@@ -153,7 +128,10 @@ def _environment() -> Environment:
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
-        finalize=_presentable,
+        # In every value on the page: characters that HTML cannot hold.
+        finalize=lambda value: (
+            words.printable(value) if type(value) is str else value  # not of Markup
+        ),
     )
     for filter_ in (
         words.duration, words.rate, words.large, words.share, words.excess, words.metres,
@@ -164,18 +142,11 @@ def _environment() -> Environment:
     return environment
 
 
-def _presentable(value: object) -> object:
-    """Replace characters that HTML cannot hold, in every value on the page."""
-    if isinstance(value, str) and not isinstance(value, Markup):
-        return words.printable(value)
-    return value
-
-
 def _summary(report: Report) -> str:
     """Return a sentence on the run and its result."""
     parameters, planning = report["parameters"], report["planning"]
     where = f"from {counted(parameters['poses'], 'position')}"
-    if seconds := parameters.get("trajectory_s"):
+    if seconds := parameters["trajectory_s"]:
         where = f"along a trajectory of {seconds:,.3g} s"
     text = (
         f"{counted(report['scans'], 'scan')} {where} sent "
@@ -206,34 +177,32 @@ def _title(parameters: Mapping[str, Any]) -> str:
     return f"{' and '.join(', '.join(names).rsplit(', ', 1))} {where}"
 
 
-def _facts(report: Report, cloud: CountedCloud) -> Iterator[Fact]:
-    """Return the numbers for the head of the page."""
-    yield Fact(large(report["points"]), "points in the cloud")
+def _facts(report: Report, cloud: CountedCloud) -> Iterator[tuple[str, str]]:
+    """Return the numbers for the head of the page, and what each is."""
+    yield large(report["points"]), "points in the cloud"
     if report["points_per_m2"] is not None:
-        each = "points per m² of surface, the median"
-        yield Fact(large(report["points_per_m2"]), each)
+        yield large(report["points_per_m2"]), "points per m² of surface, the median"
     if "range" in cloud.limits:
         low, high = cloud.limits["range"]
-        yield Fact(f"{low:.3g} to {high:.3g} m", "ranges of the points")
+        yield f"{low:.3g} to {high:.3g} m", "ranges of the points"
     elif report["points"]:
         sides = " × ".join(f"{side:.3g}" for side in np.ptp(cloud.bounds, axis=0))
-        yield Fact(f"{sides} m", "size of the cloud")
-    yield Fact(duration(report["parameters"]["duration_s"]), "of scanning")
-    yield Fact(large(report["rays"]), f"rays, cast by {report['backend']}")
+        yield f"{sides} m", "size of the cloud"
+    yield duration(report["parameters"]["duration_s"]), "of scanning"
+    yield large(report["rays"]), f"rays, cast by {report['backend']}"
     if report["stages"]:
-        yield Fact(duration(report["seconds"]["total"]), "for the run")
+        yield duration(report["seconds"]["total"]), "for the run"
 
 
-def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[Picture]:
-    """Return the pictures of the result, with captions."""
+def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[tuple[Markup, str]]:
+    """Return the pictures of the result, each an element of HTML, with captions."""
     parameters = report["parameters"]
     objects = counted(parameters["objects"], "object")
-    poses = counted(parameters["poses"], "sensor position")
-    if parameters.get("trajectory_s"):
+    poses, halfway = counted(parameters["poses"], "sensor position"), ""
+    if parameters["trajectory_s"]:
         poses = "the trajectories of the sensors"
-    actors = parameters["actors"]
-    halfway = ", and moving objects at half time"
-    halfway = halfway if actors or parameters.get("trajectory_s") else ""
+    if parameters["actors"] or parameters["trajectory_s"]:
+        halfway = ", and moving objects at half time"
     every = parameters["keep_every"]
     kept = "one for each hit" if every == 1 else f"one for every {every:,} hits of a scan"
     captions = {
@@ -246,4 +215,4 @@ def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[Picture]:
     }
     for name, caption in captions.items():
         if name in images:
-            yield Picture(Markup(images[name]), caption)
+            yield Markup(images[name]), caption

@@ -11,8 +11,8 @@ import numpy as np
 
 from poolpart import TaskRecord
 
-from ...base.task_book import StageTotals, union
 from ...base.words import counted
+from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
 from .words import duration
 
@@ -52,26 +52,6 @@ class Timeline(NamedTuple):
     row: int = ROW  # height of a row
 
 
-class _Axis:
-    """Convert a time to units."""
-
-    def __init__(self, stages: Sequence[StageTotals]) -> None:
-        self.begin = min(stage.start for stage in stages)
-        self.seconds = max(1e-6, max(stage.stop for stage in stages) - self.begin)
-
-    def spans(self, times: Iterable[Span]) -> list[Span]:
-        """Spans in units, each wide enough to see, near ones joined."""
-        scale = WIDTH / self.seconds
-        wide = []
-        for start, stop in times:
-            low = min((start - self.begin) * scale, WIDTH - _THIN)
-            wide.append((low, max((stop - self.begin) * scale, low + _THIN)))
-        return union(wide, _GAP)
-
-    def bars(self, times: Iterable[Span]) -> str:
-        return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in self.spans(times))
-
-
 def make_timeline(
     stages: Sequence[StageTotals], records: Sequence[TaskRecord], names: dict[str, str]
 ) -> Timeline | None:
@@ -82,66 +62,57 @@ def make_timeline(
     """
     if not stages:
         return None
-    axis = _Axis(stages)
-    step = nice_step(axis.seconds / 6)
+    begin = min(stage.start for stage in stages)
+    seconds = max(1e-6, max(stage.stop for stage in stages) - begin)
+
+    def bars(times: Iterable[Span]) -> str:
+        """Draw spans of time, each wide enough to see, near ones joined."""
+        wide = []
+        for start, stop in times:
+            low = min((start - begin) * WIDTH / seconds, WIDTH - _THIN)
+            wide.append((low, max((stop - begin) * WIDTH / seconds, low + _THIN)))
+        return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in union(wide, _GAP))
+
     overview = [
         Row(
             names[stage.stage],
             f"{names[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
             f"work within {duration(stage.stop - stage.start)}",
             stage.stage,
-            axis.bars(stage.busy),
+            bars(stage.busy),
         )
         for stage in stages
     ]
     groups = [Group("Stages", "while at least one task ran", overview)]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    for partition, tasks in sorted(_by_partition(records).items()):
-        workers = {task.worker for task in tasks}  # tasks that have a record
-        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
-        groups.append(_group(axis, partition, len(workers), ran[partition], tasks, names))
-    ticks = [(100 * t / axis.seconds, f"{t:.6g} s") for t in np.arange(0, axis.seconds, step)]
-    return Timeline(axis.seconds, ticks, groups, sum(stage.tasks for stage in stages))
-
-
-def _by_partition(records: Iterable[TaskRecord]) -> dict[str, list[TaskRecord]]:
-    """Tasks by the partition of their worker."""
-    found: dict[str, list[TaskRecord]] = defaultdict(list)
+    by_partition: dict[str, list[TaskRecord]] = defaultdict(list)
     for record in records:
         where = record.partition if not record.misplaced else " + ".join(record.resources)
-        found[where or "no partition"].append(record)
-    return found
-
-
-def _group(
-    axis: _Axis,
-    partition: str,
-    workers: int,
-    ran: int,
-    tasks: Sequence[TaskRecord],
-    names: dict[str, str],
-) -> Group:
-    """Rows of a partition: one for each worker and stage, the busiest of them."""
-    rows: dict[tuple[str, str], list[TaskRecord]] = defaultdict(list)
-    for task in tasks:
-        rows[task.worker, task.stage].append(task)
-    busiest = sorted(rows.items(), key=lambda row: -sum(task.seconds for task in row[1]))
-    detail = f"{counted(workers, 'worker')}, {counted(max(ran, len(tasks)), 'task')}"
-    if ran > len(tasks):  # else gaps would look like idle time
-        detail += f", of which {len(tasks):,} are drawn: gaps are not all idle time"
-    if len(rows) > ROWS_MOST:
-        detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
-    drawn = []
-    order = list(names)
-    shown = sorted(
-        busiest[:ROWS_MOST], key=lambda row: (_natural(row[0][0]), order.index(row[0][1]))
-    )
-    for (worker, stage), those in shown:
-        busy = duration(sum(task.seconds for task in those))
-        said = f"{worker}: {names[stage]}, {counted(len(those), 'task')}, {busy}"
-        bars = axis.bars((task.start, task.stop) for task in those)
-        drawn.append(Row(worker, said, stage, bars))
-    return Group(partition, detail, drawn)
+        by_partition[where or "no partition"].append(record)
+    for partition, tasks in sorted(by_partition.items()):
+        workers = {task.worker for task in tasks}  # tasks that have a record
+        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
+        detail = f"{counted(len(workers), 'worker')}, "
+        detail += counted(max(ran[partition], len(tasks)), "task")
+        if ran[partition] > len(tasks):  # else gaps would look like idle time
+            detail += f", of which {len(tasks):,} are drawn: gaps are not all idle time"
+        rows: dict[tuple[str, str], list[TaskRecord]] = defaultdict(list)
+        for task in tasks:
+            rows[task.worker, task.stage].append(task)
+        busiest = sorted(rows, key=lambda row: -sum(task.seconds for task in rows[row]))
+        if len(rows) > ROWS_MOST:
+            detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
+        order = list(names)
+        drawn = []
+        for row in sorted(busiest[:ROWS_MOST], key=lambda r: (_natural(r[0]), order.index(r[1]))):
+            (worker, stage), those = row, rows[row]
+            busy = duration(sum(task.seconds for task in those))
+            told = f"{worker}: {names[stage]}, {counted(len(those), 'task')}, {busy}"
+            drawn.append(Row(worker, told, stage, bars((t.start, t.stop) for t in those)))
+        groups.append(Group(partition, detail, drawn))
+    marks = np.arange(0, seconds, nice_step(seconds / 6))
+    ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
+    return Timeline(seconds, ticks, groups, sum(stage.tasks for stage in stages))
 
 
 def _natural(worker: str) -> list[tuple[int, str]]:

@@ -15,37 +15,21 @@ SPANS_MOST = 2048
 
 @dataclass(eq=False)
 class StageTotals:
-    """All tasks of one stage together.
-
-    Parameters
-    ----------
-    stage, partition
-        Name and partition.
-    tasks, items, seconds
-        Number of tasks, their items, and their total time.
-    start, stop
-        First start and last stop, seconds since the epoch.
-    workers
-        Names of the workers that ran some.
-    resources
-        {resource: tasks that ran on workers with it}; "none" for workers without.
-    violations, misplaced
-        Number of tasks outside their partition, and the first of these.
-    busy
-        Times when at least one was running, as far as known: (start, stop), in order.
-    """
+    """All tasks of one stage together."""
 
     stage: str
     partition: str
     tasks: int = 0
     items: int = 0
-    seconds: float = 0.0
-    start: float = float("inf")
+    seconds: float = 0.0  # of all tasks
+    start: float = float("inf")  # of the first, seconds since the epoch
     stop: float = float("-inf")
-    workers: set[str] = field(default_factory=set)
+    workers: set[str] = field(default_factory=set)  # names
+    # {resource: tasks that ran on workers with it}; "none" for workers without.
     resources: Counter[str] = field(default_factory=Counter)
-    violations: int = 0
-    misplaced: list[TaskRecord] = field(default_factory=list)
+    violations: int = 0  # tasks outside their partition
+    misplaced: list[TaskRecord] = field(default_factory=list)  # the first of these
+    # Times when at least one was running, as far as known: (start, stop), in order.
     busy: list[tuple[float, float]] = field(default_factory=list)
     _records: list[TaskRecord] = field(default_factory=list, repr=False)
     _every: int = 1  # which records are kept

@@ -1,0 +1,125 @@
+"""Forests of equal trees: `python -m benchmarks.instances`.
+
+A tree is 50,000 leaf triangles of 4 cm. A thousand instances of it, and a smaller forest of which
+every tree is in one mesh, are scanned by a 64-beam lidar that moves between them, with Embree on
+one thread. Each forest is made in a process of its own, which says how much memory the caster took
+(growth of VmHWM) and how many rays it casts in a second of processor time.
+"""
+
+from __future__ import annotations
+
+import argparse
+import multiprocessing
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Instance, Mesh, Pattern, RayCaster, available_backends
+
+from .raycast_moving import beam_directions
+
+Float = NDArray[np.float64]
+
+_BEAMS, _POSES, _APART = 64, 8, 8.0
+_GROUND = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
+
+
+def tree(leaves: int) -> tuple[Float, NDArray[np.int64]]:
+    """Make a crown of triangles around a point 6 m above the ground."""
+    rng = np.random.default_rng(1)
+    middle = rng.normal(size=(leaves, 1, 3)) * [1.5, 1.5, 2] + [0, 0, 6]
+    corners = middle + 0.04 * rng.normal(size=(leaves, 3, 3))
+    return corners.reshape(-1, 3), np.arange(3 * leaves).reshape(-1, 3)
+
+
+def places(trees: int) -> Float:
+    """Make transforms (trees, 3, 4): a square grid, each tree turned and of its own size."""
+    rng = np.random.default_rng(2)
+    side = int(np.ceil(np.sqrt(trees)))
+    angle, size = rng.uniform(0, 2 * np.pi, trees), rng.uniform(0.8, 1.2, trees)
+    number = np.arange(trees)
+    out = np.zeros((trees, 3, 4))
+    out[:, 0, 0] = out[:, 1, 1] = size * np.cos(angle)
+    out[:, 1, 0] = size * np.sin(angle)
+    out[:, 0, 1], out[:, 2, 2] = -out[:, 1, 0], size
+    out[:, 0, 3], out[:, 1, 3] = _APART * (number % side), _APART * (number // side)
+    out[:, :2, 3] -= _APART * (side - 1) / 2
+    return out
+
+
+def peak() -> float:
+    """Most memory that this process has had, MB; 0 where /proc does not tell."""
+    status = Path("/proc/self/status")
+    lines = status.read_text().splitlines() if status.exists() else []
+    return sum(int(line.split()[1]) for line in lines if line.startswith("VmHWM")) / 1e3
+
+
+def measure(trees: int, leaves: int, shared: bool, rays: int, backend: str) -> dict[str, Any]:
+    """Build a forest and scan it; call this in a new process."""
+    one, matrices = tree(leaves), places(trees)
+    reach = _APART * np.sqrt(trees) + 50
+    ground = np.diag([reach, reach, 1.0, 1.0])
+    RayCaster(*_GROUND, backend, threads=1)  # loads the backend
+    before, start = peak(), time.process_time()
+    if shared:
+        mesh = Mesh(*one)
+        instances = [Instance(mesh, matrix) for matrix in matrices]
+        given = [Instance(Mesh(*_GROUND), ground), *instances]
+        caster = RayCaster.of(given, backend, threads=1)
+    else:
+        points = [one[0] @ m[:, :3].T + m[:, 3] for m in matrices]
+        faces = [one[1] + k * len(one[0]) for k in range(trees)]
+        low = [_GROUND[0] * [reach, reach, 1], np.array(_GROUND[1]) + trees * len(one[0])]
+        whole = np.concatenate([*points, low[0]]), np.concatenate([*faces, low[1]])
+        del points, faces
+        caster = RayCaster(*whole, backend, threads=1)
+        del whole
+    built, memory = time.process_time() - start, peak() - before
+    pattern = Pattern(beam_directions(_BEAMS, rays))
+    rng = np.random.default_rng(3)
+    spots = np.column_stack([rng.uniform(-30, 30, (_POSES, 2)), np.full(_POSES, 2.0)])
+    taken, hits = [], 0
+    for spot in (spots[0], *spots):  # the first one twice: to warm up
+        start = time.process_time()
+        hits += int(caster.scan(pattern, spot).hits.sum())
+        taken.append(time.process_time() - start)
+    return {
+        "triangles": trees * leaves + 2,
+        "memory_mb": memory,
+        "build_s": built,
+        "mrays_s": len(pattern) / float(np.median(taken[1:])) / 1e6,
+        "hit_share": hits / len(pattern) / (_POSES + 1),
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run from the command line; 2 where the backend is not there."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--quick", action="store_true", help="toy sizes")
+    parser.add_argument("--backend", default="embree")
+    chosen = parser.parse_args(arguments)
+    if reason := available_backends()[chosen.backend]:
+        print(f"Nothing was measured: {reason}", file=sys.stderr)
+        return 2
+    many, few, leaves, rays = (20, 4, 500, 2_000) if chosen.quick else (1000, 32, 50_000, 115_200)
+    context = multiprocessing.get_context("spawn")
+    print("| trees | as | triangles | memory, MB | build, s | Mrays/s | hits |")
+    for trees, shared in ((many, True), (few, True), (few, False)):
+        with context.Pool(1) as pool:
+            given = (trees, leaves, shared, rays, chosen.backend)
+            row = pool.apply(measure, given)
+        print(
+            f"| {trees:,} | {'instances' if shared else 'one mesh'} | {row['triangles']:,} | "
+            f"{row['memory_mb']:,.0f} | {row['build_s']:.2f} | {row['mrays_s']:.2f} | "
+            f"{100 * row['hit_share']:.0f} % |",
+            flush=True,
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,180 @@
+"""The copy of Embree that embreex ships, through its C API."""
+
+from __future__ import annotations
+
+import ctypes
+import os
+from functools import cache
+from importlib.metadata import PackageNotFoundError, files, version
+from pathlib import Path
+from weakref import finalize
+
+import numpy as np
+
+from .instances import Scene
+from .mesh import Float, LocalMesh
+
+# Constants of rtcore.h.
+_TRIANGLES, _INSTANCE = 0, 121
+_FLOAT3, _FLOAT3X4_ROWS, _UINT3 = 0x9003, 0x9134, 0x5003
+_INDEX, _VERTEX = 0, 1
+_HIGH_QUALITY = 2
+_ROBUST = 1 << 2  # rays between two triangles hit one of them
+_FILTER_IN_ARGUMENTS = 1 << 3
+# RTC_DEVICE_PROPERTY_NATIVE_RAY…_SUPPORTED, and the rays of a packet.
+_WIDTHS = ((34, 16), (33, 8), (32, 4))
+
+# What embreex names the library on Linux, macOS and Windows.
+_ENDINGS = (".dylib", ".dll")
+
+
+def find() -> Path:
+    """Path of the library; ImportError if there is none."""
+    try:
+        shipped = files("embreex") or []
+    except PackageNotFoundError:
+        raise ImportError("embreex is not installed") from None
+    for file in shipped:
+        if "embree4" in file.name and (file.name.endswith(_ENDINGS) or ".so" in file.suffixes):
+            return Path(str(file.locate()))
+    raise ImportError("embreex has no libembree4")
+
+
+@cache
+def library() -> ctypes.CDLL:
+    """Load the library."""
+    loaded = ctypes.CDLL(str(find()))
+    pointer, number = ctypes.c_void_p, ctypes.c_uint
+    signatures: dict[str, tuple[object, list[object]]] = {
+        "rtcNewDevice": (pointer, [ctypes.c_char_p]),
+        "rtcGetDeviceProperty": (ctypes.c_ssize_t, [pointer, ctypes.c_int]),
+        "rtcGetDeviceError": (ctypes.c_int, [pointer]),
+        "rtcGetDeviceLastErrorMessage": (ctypes.c_char_p, [pointer]),
+        "rtcNewScene": (pointer, [pointer]),
+        "rtcSetSceneFlags": (None, [pointer, ctypes.c_int]),
+        "rtcSetSceneBuildQuality": (None, [pointer, ctypes.c_int]),
+        "rtcNewGeometry": (pointer, [pointer, ctypes.c_int]),
+        "rtcSetNewGeometryBuffer": (
+            pointer,
+            [pointer, ctypes.c_int, number, ctypes.c_int, ctypes.c_size_t, ctypes.c_size_t],
+        ),
+        "rtcSetGeometryInstancedScene": (None, [pointer, pointer]),
+        "rtcSetGeometryTransform": (None, [pointer, number, ctypes.c_int, pointer]),
+        "rtcCommitGeometry": (None, [pointer]),
+        "rtcAttachGeometry": (number, [pointer, pointer]),
+        "rtcAttachGeometryByID": (None, [pointer, pointer, number]),
+        "rtcGetGeometry": (pointer, [pointer, number]),
+        "rtcReleaseGeometry": (None, [pointer]),
+        "rtcCommitScene": (None, [pointer]),
+        "rtcReleaseScene": (None, [pointer]),
+    }
+    for name, (result, arguments) in signatures.items():
+        function = getattr(loaded, name)
+        function.restype, function.argtypes = result, arguments
+    return loaded
+
+
+def device(threads: int | None = None) -> int:
+    """Device of this process that builds trees with so many threads.
+
+    A forked process makes its own, since threads do not survive a fork.
+    """
+    return _device(os.getpid(), threads, os.environ.get("RAYBEAM_EMBREE_ISA", ""))
+
+
+@cache
+def _device(process: int, threads: int | None, isa: str) -> int:
+    options = [f"threads={threads}"] if threads else []
+    options += [f"isa={isa}"] if isa else []
+    made: int | None = library().rtcNewDevice(",".join(options).encode())
+    if made is None:
+        raise RuntimeError(f"Embree makes no device ({','.join(options) or 'default'}).")
+    return made
+
+
+def packet_width() -> int:
+    """Rays of the widest packets that the processor casts at once; 1 for none."""
+    ask = library().rtcGetDeviceProperty
+    return next((width for number, width in _WIDTHS if ask(device(), number)), 1)
+
+
+def build() -> str:
+    """Version of embreex, the hash of its copy of Embree, and the width of its vectors.
+
+    With vectors of 4, SSE without fused multiply-add, Embree proposes others at a triangle's rim.
+    """
+    [shipped] = [file for file in files("embreex") or () if file.name == find().name]
+    digest = shipped.hash.value[:8] if shipped.hash else ""
+    return f"{version('embreex')} ({digest}, vectors of {packet_width()})"
+
+
+class EmbreeScene:
+    """A tree of Embree.
+
+    Attributes
+    ----------
+    address
+        Of the RTCScene, for compiled code.
+    """
+
+    def __init__(self, threads: int | None) -> None:
+        self._device = device(threads)
+        self.address: int = library().rtcNewScene(self._device)
+        finalize(self, library().rtcReleaseScene, self.address)
+        library().rtcSetSceneFlags(self.address, _ROBUST | _FILTER_IN_ARGUMENTS)
+        library().rtcSetSceneBuildQuality(self.address, _HIGH_QUALITY)
+
+    def _commit(self, what: str) -> None:
+        embree = library()
+        embree.rtcCommitScene(self.address)
+        if embree.rtcGetDeviceError(self._device):
+            message = embree.rtcGetDeviceLastErrorMessage(self._device) or b""
+            raise MemoryError(f"Embree cannot build the tree of {what}: {message.decode()}")
+
+
+class EmbreeMesh(EmbreeScene):
+    """Embree's tree over a mesh; MemoryError if Embree cannot build it."""
+
+    def __init__(self, mesh: LocalMesh, threads: int | None) -> None:
+        super().__init__(threads)
+        embree = library()
+        geometry = embree.rtcNewGeometry(self._device, _TRIANGLES)
+        for kind, form, rows in (
+            (_VERTEX, _FLOAT3, np.ascontiguousarray(mesh.points, np.float32)),
+            (_INDEX, _UINT3, np.ascontiguousarray(mesh.rows, np.uint32)),
+        ):
+            room = embree.rtcSetNewGeometryBuffer(geometry, kind, 0, form, 12, len(rows))
+            if room:
+                ctypes.memmove(room, rows.ctypes.data, rows.nbytes)
+        embree.rtcCommitGeometry(geometry)
+        embree.rtcAttachGeometry(self.address, geometry)
+        embree.rtcReleaseGeometry(geometry)
+        self._commit(f"{len(mesh.rows):,} triangles")
+
+
+class EmbreeInstances(EmbreeScene):
+    """Embree's tree over instances of meshes; MemoryError if Embree cannot build it.
+
+    The instances are those of a scene, and not in their places before `place`.
+    """
+
+    def __init__(self, scene: Scene, meshes: list[EmbreeMesh], threads: int | None) -> None:
+        super().__init__(threads)
+        embree, self._meshes = library(), meshes
+        self._transforms: Float = np.full((len(scene.mesh), 3, 4), np.nan)
+        for number, mesh in enumerate(scene.mesh.tolist()):
+            geometry = embree.rtcNewGeometry(self._device, _INSTANCE)
+            embree.rtcSetGeometryInstancedScene(geometry, meshes[mesh].address)
+            embree.rtcAttachGeometryByID(self.address, geometry, number)
+            embree.rtcReleaseGeometry(geometry)
+
+    def place(self, scene: Scene) -> None:
+        """Move the instances to their places in a scene."""
+        embree, transforms = library(), scene.to_scene()
+        for number in np.flatnonzero((transforms != self._transforms).any(axis=(1, 2))).tolist():
+            geometry = embree.rtcGetGeometry(self.address, number)
+            matrix = np.ascontiguousarray(transforms[number], np.float32)
+            embree.rtcSetGeometryTransform(geometry, 0, _FLOAT3X4_ROWS, matrix.ctypes.data)
+            embree.rtcCommitGeometry(geometry)
+        self._transforms = transforms
+        self._commit(f"{len(transforms):,} instances")

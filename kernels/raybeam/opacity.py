@@ -1,0 +1,137 @@
+"""Masks that make parts of triangles transparent: leaves, fences, nets.
+
+A triangle that a ray passes inside counts only where the mask is true. All backends compute the
+place in the mask in float64 with the operations of `Masks.opaque`, in that order.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Float = NDArray[np.float64]
+
+_FARTHEST = 2.0**31  # of texture coordinates, so that none is infinite at a ray
+
+
+@dataclass(frozen=True, eq=False)
+class Opacity:
+    """Where the triangles of a mesh are opaque.
+
+    Attributes
+    ----------
+    mask
+        bool (h, w): True where a ray is stopped.
+    uv
+        (f, 3, 2) real numbers within 2**31: texture coordinates of each triangle's corners; kept in
+        single precision. As in glTF, (0, 0) is the outer corner of the mask's first element, u
+        grows to (1, 0) along its first row, v to (0, 1) along its first column, and the mask
+        repeats beyond.
+    """
+
+    mask: ArrayLike
+    uv: ArrayLike
+
+
+@dataclass(frozen=True, eq=False)
+class LocalOpacity:
+    """A checked `Opacity`.
+
+    Attributes
+    ----------
+    mask
+        uint8 (h, w): 1 where a ray is stopped.
+    uv
+        float32 (k, 6): of each triangle of a `LocalMesh`, u and v of the three corners.
+    """
+
+    mask: NDArray[np.uint8]
+    uv: NDArray[np.float32]
+
+
+def check_opacity(opacity: Opacity, face_count: int, index: NDArray[np.int32]) -> LocalOpacity:
+    """Check an opacity and select the triangles `index`; ValueError if it is invalid."""
+    mask, uv = np.asarray(opacity.mask), np.asarray(opacity.uv)
+    if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
+        raise ValueError(
+            f"mask must be bool of shape (h, w), at least one element, not {mask.dtype} "
+            f"{mask.shape}."
+        )
+    if uv.dtype.kind not in "fiu" or uv.shape != (face_count, 3, 2):
+        raise ValueError(
+            f"uv must be real numbers of shape ({face_count}, 3, 2), three corners for each face, "
+            f"not {uv.dtype} {uv.shape}."
+        )
+    bad = np.flatnonzero(~(np.abs(uv) < _FARTHEST).all(axis=(1, 2)))
+    if len(bad):
+        raise ValueError(
+            f"uv of face {bad[0]} is {uv[bad[0]].tolist()}: expected finite numbers within 2**31."
+        )
+    single = uv[index].astype(np.float32).reshape(-1, 6)
+    # Devices may flush what is not normal.
+    single[np.abs(single) < np.finfo(np.float32).tiny] = 0
+    return LocalOpacity(np.ascontiguousarray(mask).view(np.uint8), single)
+
+
+@dataclass(frozen=True, eq=False)
+class Masks:
+    """Opacities of several meshes as tables.
+
+    Attributes
+    ----------
+    uv
+        float32 (q, 6), of the triangles of meshes that have an opacity.
+    mask
+        uint8 (e,): all masks, by rows.
+    records
+        int64 (meshes, 4): what to add to a triangle's place for its row of `uv`, the mask's first
+        element, height and width; height 0 for a mesh that is opaque everywhere.
+    """
+
+    uv: NDArray[np.float32]
+    mask: NDArray[np.uint8]
+    records: NDArray[np.int64]
+
+    def opaque(
+        self, mesh: NDArray[np.intp], place: NDArray[np.intp], a: Float, b: Float, c: Float,
+        det: Float,
+    ) -> NDArray[np.bool_]:  # fmt: skip
+        """Whether rays that pass inside triangles are stopped there: (m,).
+
+        Parameters
+        ----------
+        mesh, place
+            (m,): number of the mesh, place of the triangle among those of all meshes.
+        a, b, c, det
+            (m,): as `triangle.intersect` returns them.
+        """
+        shift, first, height, width = self.records[mesh].T
+        stopped = height == 0
+        (k,) = np.nonzero(height)
+        uv = self.uv[place[k] + shift[k]].astype(np.float64)
+        p, q, r = a[k] / det[k], b[k] / det[k], c[k] / det[k]
+        u = (p * uv[:, 0] + q * uv[:, 2]) + r * uv[:, 4]
+        v = (p * uv[:, 1] + q * uv[:, 3]) + r * uv[:, 5]
+        column = np.minimum(((u - np.floor(u)) * width[k]).astype(np.int64), width[k] - 1)
+        row = np.minimum(((v - np.floor(v)) * height[k]).astype(np.int64), height[k] - 1)
+        stopped[k] = self.mask[first[k] + row * width[k] + column] != 0
+        return stopped
+
+
+def join_masks(
+    opacities: list[LocalOpacity | None], orders: list[NDArray[np.int32]]
+) -> Masks | None:
+    """Join the opacities of meshes, whose triangles have these orders; None if there is none."""
+    uv, mask = [np.zeros((0, 6), np.float32)], [np.zeros(0, np.uint8)]
+    records = np.zeros((len(orders), 4), np.int64)
+    triangles = rows = elements = 0
+    for record, one, order in zip(records, opacities, orders, strict=True):
+        if one is not None:
+            record[:] = rows - triangles, elements, *one.mask.shape
+            uv.append(one.uv[order])
+            mask.append(one.mask.reshape(-1))
+            rows, elements = rows + len(order), elements + one.mask.size
+        triangles += len(order)
+    return Masks(np.concatenate(uv), np.concatenate(mask), records) if rows else None
