@@ -89,9 +89,10 @@ def check_interrupted(run: Any, code: int) -> None:
 
 
 def said_besides_progress(run: Any) -> list[str]:
-    """What it said but for lines with a time stamp, and where there is a page."""
+    """What it said but for lines with a time stamp, and notes of a page and of compiling."""
     lines = [line for line in run.said.splitlines() if line.strip()]
-    return [line for line in lines if not re.match(r"\d\d:\d\d:\d\d  |note: partitions", line)]
+    usual = r"\d\d:\d\d:\d\d  |note: (partitions|compiled)"
+    return [line for line in lines if not re.match(usual, line)]
 
 
 # Under nohup the tests ignore hangups, and what they start inherits that.
@@ -211,6 +212,19 @@ SIGNALLED = {
         "    signal.raise_signal(signal.SIGINT)\n"
         "    print('still here')\n",
         (130, "", "lidarpool: stopped at once"),
+    ),
+    "where Python drops what is raised, of a weak reference": (
+        "import weakref\n"
+        "class Task: pass\n"
+        "def gone(): signal.raise_signal(signal.SIGINT)\n"
+        "interrupt_on_signals()\n"
+        "try:\n"
+        "    task = Task()\n"
+        "    weakref.finalize(task, gone)\n"
+        "    del task\n"
+        "    time.sleep(50)\n"
+        "except KeyboardInterrupt: print('interrupted')\n",
+        (0, "interrupted\n", ""),
     ),
     "where Python drops what is raised": (
         "class Future:\n"

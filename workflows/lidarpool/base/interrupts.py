@@ -7,6 +7,7 @@ import os
 import signal
 import threading
 import time
+import weakref
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from multiprocessing import resource_tracker
@@ -22,6 +23,7 @@ _NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
 _SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
 _IMPATIENT_S = 1.0  # a second signal sooner than this counts as the first
 _AGAIN_S = 0.01
+_WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}  # callbacks of references
 
 
 class _Interrupt:
@@ -32,7 +34,7 @@ class _Interrupt:
 
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
-            if _is_in_del(frame):  # a little later, from a thread
+            if _drops_errors(frame):  # a little later, from a thread
                 threading.Timer(_AGAIN_S, _interrupt_main_thread).start()
                 return
             self.first_at = time.monotonic()
@@ -41,11 +43,14 @@ class _Interrupt:
             _exit(b"lidarpool: stopped at once; workers of this machine end by themselves.\n")
 
 
-def _is_in_del(frame: FrameType | None) -> bool:
-    """Whether an object is being finalised: Python drops errors raised there."""
-    while frame is not None and frame.f_code.co_name != "__del__":
+def _drops_errors(frame: FrameType | None) -> bool:
+    """Whether an object may be being finalised: Python drops errors raised there."""
+    while frame is not None:
+        code = frame.f_code
+        if code.co_name == "__del__" or code.co_filename in _WEAK:
+            return True
         frame = frame.f_back
-    return frame is not None
+    return False
 
 
 def _interrupt_main_thread() -> None:

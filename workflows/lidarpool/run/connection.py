@@ -13,6 +13,7 @@ from typing import NamedTuple
 import dask
 from distributed import Client, Security, SpecCluster
 from distributed.comm import connect
+from distributed.utils import LoopRunner
 
 from poolpart.internals import forked_workers
 
@@ -135,7 +136,8 @@ def connected(
             security = Security(
                 require_encryption=True, tls_ca_file=ca, tls_client_cert=cert, tls_client_key=key
             )
-        asyncio.run(_reach(scheduler, security, waiting))
+        # Not in this thread: an interrupt could be raised in a callback of the loop, and get lost.
+        LoopRunner().run_sync(_reach, scheduler, security, waiting)
         client = Client(
             scheduler, security=security, timeout=CONNECT_TIMEOUT_S, set_as_default=False
         )
