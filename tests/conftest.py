@@ -31,15 +31,16 @@ except ImportError:  # the kernels can be tested without it
 else:
     dask.config.set({"distributed.deploy.lost-worker-timeout": "1h"})
 
-# An example may take as long as a busy machine needs.
+# An example may take as long as a busy machine needs. The examples are the same in each run, or
+# what is checked after a change would fail by chance; `HYPOTHESIS_PROFILE=default` varies them.
 try:
     from hypothesis import HealthCheck, settings
 except ImportError:
     pass
 else:
     slow = [HealthCheck.too_slow]
-    settings.register_profile("patient", deadline=None, suppress_health_check=slow)
-    settings.load_profile("patient")
+    settings.register_profile("patient", deadline=None, suppress_health_check=slow, derandomize=True)
+    settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "patient"))
 
 
 @pytest.fixture(autouse=True)

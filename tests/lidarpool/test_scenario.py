@@ -1,5 +1,6 @@
 """Scenario files: defaults, what they build, and a message for each way to get one wrong."""
 
+import re
 import shutil
 from datetime import UTC, datetime
 from pathlib import Path
@@ -253,7 +254,7 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
     )
     with pytest.raises(LidarpoolError) as raised:
         scenario("\n".join(f"field{number}: 1" for number in range(100)))
-    assert str(raised.value).splitlines()[-1] == "There are 80 more."
+    assert str(raised.value).splitlines()[-1] == "And 80 more."
 
 
 def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
@@ -300,7 +301,7 @@ def test_any_data_is_a_scenario_or_one_error_for_users(data):
     try:
         loaded = Scenario.from_data(data, source="s.yaml")
     except LidarpoolError as error:
-        assert all(line.startswith("s.yaml: ") for line in str(error).splitlines())
+        assert all(re.match(r"s.yaml: |And \d+ more", line) for line in str(error).splitlines())
     else:
         assert set(data) <= set(Scenario.model_fields)
         assert (loaded.steps or 1) >= 1

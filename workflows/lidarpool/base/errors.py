@@ -54,6 +54,6 @@ class Mistakes:
         """Raise LidarpoolError with a line for each, if anything was wrong."""
         lines = list(dict.fromkeys(self.lines))
         if len(lines) > MISTAKES_TOLD:
-            lines[MISTAKES_TOLD:] = [f"There are {len(lines) - MISTAKES_TOLD:,} more."]
+            lines[MISTAKES_TOLD:] = [f"And {len(lines) - MISTAKES_TOLD:,} more."]
         if lines:
             raise LidarpoolError("\n".join(lines))
