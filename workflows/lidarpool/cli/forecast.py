@@ -35,6 +35,7 @@ from ..run.job import Job
 from ..run.local import default_workers
 from ..run.store import RUN_FOLDER
 from ..scenario.sections import PoolSection
+from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.echoes import PATTERN_RAYS
@@ -153,7 +154,7 @@ def forecast(
 
 def _disk(job: Job, points: int, exports: int, out: Path | Storage) -> dict[str, Any]:
     """Disk that parts and database need during the run, that the result needs, and what is free."""
-    survey, faces, point = job.survey, len(job.scene.faces), _point_bytes(job)
+    survey, faces, point = job.survey, job.scene.kept_triangles, _point_bytes(job)
     parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
     tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
     run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
@@ -249,7 +250,7 @@ def _worker_bytes(job: Job) -> int:
     sensors = [carried.sensor for carried in job.survey.carried]
     each = job.survey.returns.subrays
     rays = sum(min((s.period or 0) * s.channels * each, PATTERN_RAYS) for s in sensors)
-    triangles = (SCENE_BYTES + TRIANGLE_BYTES) * len(job.scene.faces)
+    triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
     return PROCESS_BYTES + triangles + RAY_BYTES * rays
 
 
@@ -258,7 +259,8 @@ def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> i
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     other = PROCESS_BYTES + PARTICLE_BYTES * swarm
     piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
-    driver = 2 * SCENE_BYTES * len(job.scene.faces) + SCAN_BYTES * job.survey.scan_count + piece
+    shown = min(job.scene.triangles, job.scene.kept_triangles + DRAWN_TRIANGLES)
+    driver = 2 * SCENE_BYTES * shown + SCAN_BYTES * job.survey.scan_count + piece
     workers = _worker_bytes(job) * slots[GPU]["there"]
     if OTHER in slots:
         workers += other * slots[OTHER]["there"]

@@ -74,6 +74,6 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     write_scene(out, made)
     low, high = made.bounds
     click.echo(
-        f"{len(made.faces):,} triangles, {counted(len(made.names), 'object')}, "
+        f"{made.triangles:,} triangles, {counted(len(made.names), 'object')}, "
         f"{' x '.join(f'{length:.0f}' for length in high - low)} m: {click.format_filename(out)}"
     )

@@ -35,7 +35,7 @@ class LivePoints:
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
         self._share = 1.0  # of the points of a part that are taken
-        self._counts = np.zeros(store.job.scene.triangles, np.int64)
+        self._counts = np.zeros(store.job.scene.counters, np.int64)
         self.hits = 0  # of the parts that were read
         self.version = 0  # incremented when there is something new to show
         self.cloud: Cloud | None = None
@@ -77,7 +77,6 @@ class LivePoints:
             self.version += 1
 
     def hit_counts(self) -> NDArray[np.float64]:
-        """Hits of each triangle, (f,), scaled up to all hits if some parts were not read."""
+        """Hits by counters of the scene, scaled up to all hits if some parts were not read."""
         with self._lock:
-            counts = self._counts[: len(self._store.job.scene.faces)]
-            return np.asarray(counts * (self._store.db.hits / max(self.hits, 1)))
+            return np.asarray(self._counts * (self._store.db.hits / max(self.hits, 1)))

@@ -33,6 +33,7 @@ from ..run.picture_file import Pictured, sensor_ways
 from ..run.progress import STAGES, Progress, Show
 from ..run.result import RunResult
 from ..run.store import RunStore
+from ..scene.drawn import Drawn
 from ..sensor.materials import MaterialTable
 from .live_points import LivePoints
 from .points import HeldPoints, no_points
@@ -53,9 +54,10 @@ class LiveRun(Page):
         self._job = job
         self.stopped = threading.Event()  # by a user of the page; --resume continues
         survey, scene = job.survey, job.scene
+        self._drawn = Drawn.of(scene)
         pictured = Pictured(
-            scene, sensor_ways(survey), np.zeros(0, np.int64), np.zeros((0, 2, 3), np.float32),
-            job.planning, None, (), survey.duration_ns, (),
+            self._drawn.scene, sensor_ways(survey), np.zeros(0, np.int64),
+            np.zeros((0, 2, 3), np.float32), job.planning, None, (), survey.duration_ns, (),
             MaterialTable.of(survey.materials, scene.all_names).reflectance,
         )  # fmt: skip
         self._view = View("lidarpool", no_points((SCAN, *survey.stored_columns)), pictured)
@@ -200,8 +202,10 @@ class LiveRun(Page):
         return 0 if self._progress is None else self._progress.points
 
     def _hits(self) -> NDArray[np.float64]:
-        faces = len(self._job.scene.faces)
-        return np.zeros(faces) if self._points is None else self._points.hit_counts()
+        faces = len(self._drawn.scene.faces)
+        if self._points is None:
+            return np.zeros(faces)
+        return np.asarray(self._drawn.hits(self._points.hit_counts())[:faces])
 
     def _planned(self) -> NDArray[np.float64] | None:
         """Return the planned path, once all trials have ended."""

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from ..columns.table import OBJECT
 from ..render.colouring import colours_of
 from ..render.hits import hit_colours
-from ..render.surface import apart, triangle_areas
+from ..render.surface import apart
 from ..render.theme import mapped
+from ..scene.drawn import simplified
 from ..scene.scene import Scene
 from .legend import Legend, as_bytes, legend_of, scale_legend
 
@@ -40,7 +41,7 @@ class Surface:
         self.coarse, self._objects = scene, scene.face_object
         self._stands: NDArray[np.int64] | None = None  # for each triangle of the scene
         if len(scene.faces) > most:
-            self.coarse, self._stands = _simplified(scene, most)
+            self.coarse, self._stands = simplified(scene, most)
             self._objects = self.coarse.face_object
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
@@ -92,39 +93,3 @@ def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[
     """List the ways to colour a scene, with or without known reflectance."""
     more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     return ("grey", "hits", "object", *more)
-
-
-def _simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
-    """Give a scene of fewer triangles; and for each triangle of this one which stands for it.
-
-    That is -1 where nothing is left of a small object.
-    """
-    area = float(triangle_areas(scene.vertices[scene.faces]).sum())
-    cell, low = (2 * area / most) ** 0.5, scene.vertices.min(axis=0)
-    while True:
-        at = np.floor((scene.vertices - low) / cell).astype(np.int64)
-        _, merged, counts = np.unique(at, axis=0, return_inverse=True, return_counts=True)
-        faces = merged.reshape(-1)[scene.faces]
-        first, second, third = faces.T
-        flat = (first == second) | (second == third) | (third == first)
-        wide = np.flatnonzero(~flat)
-        _, owner, same = np.unique(
-            np.sort(faces[wide], axis=1), axis=0, return_index=True, return_inverse=True
-        )
-        if len(owner) <= most:
-            break
-        cell *= 1.3
-    vertices = np.stack(
-        [np.bincount(merged.reshape(-1), axis) / counts for axis in scene.vertices.T], axis=1
-    )
-    kept = wide[owner]
-    coarse = Scene(
-        vertices, faces[kept].astype(np.int32), scene.face_object[kept], scene.names, scene.origin
-    )
-    stands = np.full(len(faces), -1, np.int64)
-    stands[wide] = same.reshape(-1)
-    near = np.full(len(vertices), -1, np.int64)  # a triangle at each vertex
-    near[faces[kept].ravel()] = np.repeat(np.arange(len(kept)), 3)
-    small = np.flatnonzero(flat)
-    stands[small] = near[faces[small]].max(axis=1)
-    return coarse, stands

@@ -14,6 +14,7 @@ from raybeam import RayCaster
 
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
+from ..scene.drawn import Drawn
 from ..scene.floor import SLAB_M
 from ..scene.scene import Scene
 from ..sensor import Sensor, Spin
@@ -151,6 +152,7 @@ def plan_stations(
     """
     if count is not None and coverage is not None:
         raise LidarpoolError("count and coverage both say when to stop: give one of them.")
+    scene = Drawn.of(scene).scene
     sight = Sight(scene, sensor, slant_deg)
     if spacing_m is None:
         spacing_m = _spacing(scene)

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from raybeam import RayCaster
 
+from ..scene.mesh import triangle_areas
 from ..scene.scene import Scene
-from .surface import spiral, triangle_areas
+from .surface import spiral
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.mesh import triangle_areas
 from ..scene.scene import Scene
 from .colouring import TURBO
-from .surface import triangle_areas
 from .theme import UNSEEN, rgb
 
 Floats = NDArray[np.float64]

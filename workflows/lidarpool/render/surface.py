@@ -103,13 +103,6 @@ def dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
-def triangle_areas(corners: NDArray[np.floating]) -> Floats:
-    """Areas (n,) of triangles with these corners (n, 3, 3)."""
-    sides = corners[:, 1:] - corners[:, :1]
-    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
-    return np.asarray(doubled / 2, np.float64)
-
-
 def spiral(count: int, lowest: float = 0.0) -> Floats:
     """Spread unit vectors (count, 3) over the sphere above a height: a golden spiral."""
     n = np.arange(count)

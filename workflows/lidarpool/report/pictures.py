@@ -109,7 +109,7 @@ def picture_makers(
         return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
 
     makers: dict[str, Callable[[], Page]] = {
-        "scene": lambda: draw_scene(shot(), shown.scene.triangles),
+        "scene": lambda: draw_scene(shot(), shown.triangles),
         "intensity": draw_hits,
     }
     if not alone:

@@ -70,7 +70,7 @@ def make_job(
 
 def _check_precision(scene: Scene, survey: Survey) -> None:
     """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
-    reach = float(np.abs(scene.vertices).max(initial=0.0))
+    reach = float(np.abs(scene.bounds).max(initial=0.0))
     for actor in scene.actors:
         ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
         reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))

@@ -17,6 +17,7 @@ from ..base.words import counted
 from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
 from ..scene.actors import Actor
+from ..scene.drawn import Drawn
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..sensor import Survey, Track
@@ -28,7 +29,7 @@ PICTURE_FILE = "pictures.npz"
 
 MODELS_MOST = 4  # sensors named in a picture
 PLACES_MOST = 1000  # positions of a moving sensor or actor
-_FORMAT = 4
+_FORMAT = 5
 _ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
@@ -57,7 +58,7 @@ class Pictured:
 
     scene: Scene  # trajectories of its actors have a thousand poses at most
     sensors: Sequence[SensorWay]
-    hit_counts: NDArray[np.int64]  # (f,): of each triangle, those of actors after the others
+    hit_counts: NDArray[Any]  # (f,): of each triangle, those of actors after the others
     sample_rays: NDArray[np.float32]  # (k, 2, 3): ends of some rays, metres, local coordinates
     planning: Planning | None
     plan: Plan | None
@@ -68,16 +69,18 @@ class Pictured:
     # (objects,): share of light that each reflects, actors after the others; None if unknown.
     reflectance: NDArray[np.float64] | None = None
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
+    triangles: int = 0  # of the scene, though simpler instances may be drawn
 
     @classmethod
     def of(cls, result: RunResult) -> Pictured:
         """Return what the pictures of a result show."""
         scene, survey = result.scene, result.survey
         actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
+        drawn = Drawn.of(scene)
         return cls(
-            replace(scene, actors=actors),
+            replace(drawn.scene, actors=actors),
             sensor_ways(survey),
-            result.hit_counts,
+            drawn.hits(result.hit_counts),
             result.sample_rays,
             result.planning,
             result.plan,
@@ -86,6 +89,7 @@ class Pictured:
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
             MaterialTable.of(survey.materials, scene.all_names).reflectance,
             survey.coordinates,
+            scene.triangles,
         )
 
     @property
@@ -122,6 +126,7 @@ class Pictured:
             "sensors": [[way.name, way.model, way.moves] for way in self.sensors],
             "own": [asdict(column) for column in self.own],
             "coordinates": self.coordinates,
+            "triangles": self.triangles,
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -193,7 +198,7 @@ class Pictured:
             raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
         rays, duration = arrays["sample_rays"], float(arrays["duration_ns"])
         own = [Column(**column) for column in names["own"]]
-        rest = duration, own, arrays.get("reflectance"), names["coordinates"]
+        rest = duration, own, arrays.get("reflectance"), names["coordinates"], names["triangles"]
         if "path" not in arrays:
             return cls(scene, sensors, counts, rays, None, None, (), *rest)
         start, target = arrays["ends"]

@@ -85,5 +85,5 @@ class RunResult:
 
     @cached_property
     def hit_counts(self) -> NDArray[np.int64]:
-        """Rays that hit each triangle of scene and actors, (f,), read when first asked for."""
+        """Hits by `counters` of the scene, read when first asked for."""
         return self._hit_counts()

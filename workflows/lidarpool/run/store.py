@@ -309,8 +309,8 @@ class RunStore:
         return self.points().cloud_of(columns, rows)
 
     def hit_counts(self) -> NDArray[np.int64]:
-        """Hits of each triangle of the scene, (f,), those of actors after the others."""
-        counts = np.zeros(self.job.scene.triangles, np.int64)
+        """Hits by counters of the scene, see `Scene.counters`."""
+        counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.db.ordered:
             triangles, hits = read_tally(self.storage, part.name)
             counts[triangles] += hits

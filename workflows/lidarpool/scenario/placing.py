@@ -10,6 +10,7 @@ import yaml
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.words import counted
+from ..scene.drawn import Drawn
 from ..scene.floor import room_at
 from ..scene.scene import Scene
 from ..scene.surroundings import Surroundings, Views, is_open
@@ -45,6 +46,7 @@ def place(scene: Scene, carried: Mounted) -> Placing:
     a quarter, half and three quarters of the height of a lower room. Around an object they are on
     four sides and above it.
     """
+    scene = Drawn.of(scene).scene
     low, high = scene.bounds + scene.origin
     x, y = (low[:2] + high[:2]) / 2
     floor, ceiling = room_at(scene, x, y)
@@ -70,7 +72,7 @@ def place(scene: Scene, carried: Mounted) -> Placing:
 
 def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
     """Say that only backs of surfaces are seen from local positions (k, 3); else empty."""
-    looker = _looker(scene)
+    looker = _looker(Drawn.of(scene).scene)
     return "" if looker is None else _inside(looker.views(positions), scene, carried)
 
 

@@ -19,6 +19,7 @@ from ..base.yamlfile import read_yaml
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
+from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
@@ -305,7 +306,7 @@ class Scenario(Section):
         self._notes.clear()
         self._remarks.clear()
         self._placing = None
-        meshes: list[Mesh] = list(seed_objects()) if self.scene.has_seed else []
+        meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
         for entry in self.scene.files:
             with mistakes.noted():
@@ -411,7 +412,7 @@ class Scenario(Section):
         mount = MountSection() if self.mount is None else self.mount
         return [Mounted(self.sensor.sensor(self._folder), mount.pose())]
 
-    def _read(self, entry: MeshFile) -> tuple[Mesh, ...]:
+    def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
         return load_meshes(

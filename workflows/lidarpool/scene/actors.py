@@ -11,7 +11,8 @@ from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE
-from .mesh import Mesh, stacked
+from .instances import Instance
+from .mesh import Cutout, Mesh, stacked
 
 _AT_ZERO = Stations((CENTRE,))
 
@@ -42,7 +43,7 @@ class Actor:
         """Its mesh at a time, in the scene's local coordinates."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
-        return Mesh(self.name, vertices + positions[0], self.mesh.faces)
+        return Mesh(self.name, vertices + positions[0], self.mesh.faces)  # masks do not show
 
     def check(self, begin_ns: float, end_ns: float) -> None:
         """Check that its trajectory covers a time; LidarpoolError if not."""
@@ -56,9 +57,19 @@ class Actor:
             ) from error
 
 
-def one_mesh(name: str, meshes: Iterable[Mesh]) -> Mesh:
-    """Join meshes to one object."""
-    return Mesh(name, *stacked((part.vertices, part.faces) for part in meshes))
+def one_mesh(name: str, objects: Iterable[Mesh | Instance]) -> Mesh:
+    """Join objects to one; masks are kept."""
+    flat = [one.flat() if isinstance(one, Instance) else one for one in objects]
+    vertices, _ = stacked((part.vertices, part.faces) for part in flat)
+    first, solid, cut = 0, [], []
+    cutouts: list[Cutout] = []
+    for part in flat:
+        ends = len(part.faces) - sum(len(one.uv) for one in part.cutouts)
+        solid.append(part.faces[:ends] + first)
+        cut.append(part.faces[ends:] + first)
+        cutouts += part.cutouts
+        first += len(part.vertices)
+    return Mesh(name, vertices, np.concatenate(solid + cut), tuple(cutouts))
 
 
 def box(name: str, size_m: tuple[float, float, float]) -> Mesh:

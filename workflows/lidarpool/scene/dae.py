@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.xmlfile import xml_root
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, flattened, instances, joined
+from .nodes import SMALLER, Content, MeshFileError, Node, instances, joined, settled
 from .polygons import fanned, triangulated, unrolled, with_holes
 from .transform import rotation_about
 
@@ -39,7 +39,7 @@ def read_dae(data: bytes, path: Path) -> Content:
     if root.tag != "COLLADA":
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
     document = _Document(root, Allowance(len(data), SMALLER))
-    content = flattened(instances(document.roots(), document.node, path.stem))
+    content = settled(instances(document.roots(), document.node, path.stem))
     unit = root.find("asset/unit[@meter]")
     if unit is not None:
         content.unit_m = float(unit.attrib["meter"])

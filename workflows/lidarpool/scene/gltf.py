@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, flattened, instances, joined
+from .nodes import SMALLER, Content, MeshFileError, Node, instances, joined, settled
 from .polygons import fanned, unrolled
 
 # Extensions that do not change shapes, or that are supported here.
@@ -44,7 +44,7 @@ def read_gltf(data: bytes, path: Path) -> Content:
     header, body = _chunks(data)
     _check(header)
     reader = _Reader(header, body, path, len(data))
-    content = flattened(instances(_roots(header), reader.node, path.stem))
+    content = settled(instances(_roots(header), reader.node, path.stem))
     content.unit_m, content.up_axis = 1.0, "y"
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content

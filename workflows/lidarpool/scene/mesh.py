@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,26 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
+
+UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
+
+
+@dataclass(frozen=True, eq=False)
+class Cutout:
+    """What faces stop light only in part: leaves on cards, a wire fence.
+
+    Attributes
+    ----------
+    mask
+        bool (h, w): True where light is stopped.
+    uv
+        float32 (k, 3, 2): texture coordinates of the corners of k faces. As in glTF, (0, 0) is the
+        outer corner of the mask's first element, u grows along its rows, v along its columns, and
+        the mask repeats beyond.
+    """
+
+    mask: NDArray[np.bool_]
+    uv: NDArray[np.float32]
 
 
 @dataclass(frozen=True, eq=False)
@@ -26,6 +46,8 @@ class Mesh:
         float64 (v, 3), metres, Z-up, finite.
     faces
         int64 (f, 3), indices into `vertices`, at least one face.
+    cutouts
+        Of the last faces, one cutout after the other.
 
     Raises
     ------
@@ -37,6 +59,7 @@ class Mesh:
     name: str
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
+    cutouts: tuple[Cutout, ...] = ()
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
@@ -54,11 +77,31 @@ class Mesh:
                 f"there are {len(self.vertices)}, counted from 0."
             )
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
+        object.__setattr__(self, "cutouts", tuple(self.cutouts))
+        _check_cutouts(self.name, self.cutouts, len(faces))
 
     def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
-        faces = self.faces[:, ::-1] if np.linalg.det(linear) < 0 else self.faces
-        return Mesh(name, self.vertices @ linear.T + offset, faces)
+        faces, cutouts = self.faces, self.cutouts
+        if np.linalg.det(linear) < 0:
+            faces = faces[:, ::-1]
+            cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
+        return Mesh(name, self.vertices @ linear.T + offset, faces, cutouts)
+
+
+def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
+    for cut in cutouts:
+        if cut.mask.dtype != np.bool_ or cut.mask.ndim != 2 or not cut.mask.size:
+            raise LidarpoolError(
+                f"A mask of {name!r} is {cut.mask.dtype} {cut.mask.shape}; it must be bool (h, w)."
+            )
+        if cut.uv.shape[1:] != (3, 2) or not len(cut.uv) or not (np.abs(cut.uv) < UV_MOST).all():
+            raise LidarpoolError(
+                f"The uv of a cutout of {name!r} must be numbers within {UV_MOST:,}, of the shape "
+                f"(k, 3, 2), not {cut.uv.shape}."
+            )
+    if (cut_out := sum(len(cut.uv) for cut in cutouts)) > faces:
+        raise LidarpoolError(f"{name!r} has {faces} faces, and cutouts of {cut_out}.")
 
 
 def stacked(
@@ -91,3 +134,10 @@ def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:
             f"the first is number {int(bad.argmax())}: repair the mesh."
         )
     return array
+
+
+def triangle_areas(corners: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+    """Areas (n,) of triangles with these corners (n, 3, 3)."""
+    sides = corners[:, 1:] - corners[:, :1]
+    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    return np.asarray(doubled / 2, np.float64)

@@ -6,10 +6,12 @@ import codecs
 import logging
 import re
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.allowance import check_fits
 from ..base.arguments import checked
@@ -18,6 +20,7 @@ from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean
 from .dae import read_dae
 from .gltf import read_gltf
+from .instances import Instance
 from .mesh import Mesh
 from .nodes import Content, MeshFileError
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
@@ -59,11 +62,12 @@ def load_meshes(
     transform: Transform | None = None,
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
-) -> tuple[Mesh, ...]:
+) -> tuple[Mesh | Instance, ...]:
     """Read all objects of a mesh file.
 
-    Every instance of a scene graph is a mesh, named by its node; files without names give one
-    object named by the file. Objects that their nodes scale to zero are left out.
+    Every place of a mesh in a scene graph is an object, named by its node; large meshes with many
+    places are instances. Files without names give one object named by the file. Objects that their
+    nodes scale to zero are left out.
 
     Parameters
     ----------
@@ -84,7 +88,7 @@ def load_meshes(
 
     Returns
     -------
-    Meshes in world coordinates. All arithmetic is in double precision; .glb, .gltf and binary .stl
+    Objects in world coordinates. All arithmetic is in double precision; .glb, .gltf and binary .stl
     store single precision.
 
     Raises
@@ -120,7 +124,10 @@ def wrote_it(path: Path) -> bool:
 
 
 def _tell_axes(
-    path: Path, content: Content, meshes: Sequence[Mesh], axes: Callable[[str], None] | None
+    path: Path,
+    content: Content,
+    meshes: Sequence[Mesh | Instance],
+    axes: Callable[[str], None] | None,
 ) -> None:
     if path.suffix.lower() in (".glb", ".gltf"):
         why, other = _lies(content, meshes), "z"
@@ -135,12 +142,12 @@ def _tell_axes(
     )
 
 
-def _lies(content: Content, meshes: Sequence[Mesh]) -> str:
+def _lies(content: Content, meshes: Sequence[Mesh | Instance]) -> str:
     """Say why a file rotated from Y-up seems to have been Z-up; empty if it does not."""
     if "trimesh" in content.generator:
         return ", and trimesh wrote it, which keeps the axes that it is given"
-    low = np.min([mesh.vertices.min(axis=0) for mesh in meshes], axis=0)
-    x, y, z = np.max([mesh.vertices.max(axis=0) for mesh in meshes], axis=0) - low
+    low = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
+    x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - low
     if 2 * y < min(x, z):
         return f", and is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
     return ""
@@ -230,18 +237,27 @@ def _other_format(path: Path, data: bytes) -> str:
     return ""
 
 
-def _placed(mesh: Mesh, stem: str, places: Sequence[Transform]) -> Mesh:
-    """Mesh in the world, with a name that is safe for terminals and files."""
-    name = _printable(mesh.name) or _printable(stem)
+def _placed(one: Mesh | Instance, stem: str, places: Sequence[Transform]) -> Mesh | Instance:
+    """Object in the world, with a name that is safe for terminals and files."""
+    name = _printable(one.name) or _printable(stem)
     for place in places:
-        mesh = mesh.moved(name, place.linear, place.offset)
-    reach = np.abs(mesh.vertices).max()
+        one = one.moved(name, place.linear, place.offset)
+    reach = np.abs(_corners(one)).max()
     if reach > FARTHEST_M:
         raise LidarpoolError(
-            f"Object {mesh.name!r} reaches {reach:.3g} m from the origin, farther than anything "
+            f"Object {one.name!r} reaches {reach:.3g} m from the origin, farther than anything "
             "on Earth: check its unit and placement."
         )
-    return mesh
+    return one
+
+
+def _corners(one: Mesh | Instance) -> NDArray[np.float64]:
+    """Points that an object lies between, in the world."""
+    if isinstance(one, Mesh):
+        return one.vertices
+    low, high = one.mesh.vertices.min(axis=0), one.mesh.vertices.max(axis=0)
+    box = np.array(list(product(*zip(low, high, strict=True))))
+    return np.asarray(box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
 
 
 def _printable(text: str) -> str:

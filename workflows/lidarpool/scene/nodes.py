@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
@@ -11,10 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, bytes_of, memory_share
+from .instances import Instance
 from .mesh import Mesh, stacked
 from .polygons import check_corners
 
 SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to too much
+# A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
+SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
 
 
@@ -29,7 +33,7 @@ class Content:
     `meshes` are in the file's unit and axes.
     """
 
-    meshes: list[Mesh]
+    meshes: Sequence[Mesh | Instance]
     unit_m: float | None = None  # metres in its unit; None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
     generator: str = ""  # the program that wrote it, if known
@@ -46,7 +50,7 @@ class Node:
     children: Iterable[Hashable] = ()  # keys of the nodes in it
 
 
-class Instance(NamedTuple):
+class Place(NamedTuple):
     """A mesh in its own coordinates, and where a scene graph places it."""
 
     mesh: Mesh
@@ -54,7 +58,7 @@ class Instance(NamedTuple):
     name: str
 
 
-def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[Instance]:
+def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[Place]:
     """Find all places of meshes in a scene graph; a node may be in several others.
 
     `roots` are keys of the outermost nodes, and `node_of` returns the node of a key. An instance is
@@ -73,7 +77,7 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
         begun += 1
         node = node_of(key)
         matrix, name = above @ node.matrix, node.name or name
-        placed += [Instance(mesh, matrix, name or mesh.name or stem) for mesh in node.meshes]
+        placed += [Place(mesh, matrix, name or mesh.name or stem) for mesh in node.meshes]
         stack += [(child, matrix, name) for child in reversed(list(node.children))]
         # A few lines can make any number of nodes.
         if begun + len(stack) > MOST_NODES:
@@ -84,19 +88,22 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
     return placed
 
 
-def flattened(placed: Sequence[Instance]) -> Content:
-    """Copy each mesh to all its places.
+def settled(placed: Sequence[Place]) -> Content:
+    """Make instances of meshes that many places share, and copy the others to their places.
 
     Raises
     ------
     MeshFileError
         If a matrix is none of a place, or the copies would take more than a quarter of the memory.
     """
-    content = Content([])
-    total = sum(mesh.vertices.nbytes + mesh.faces.nbytes for mesh, _, _ in placed)
-    if total > memory_share():
+    objects: list[Mesh | Instance] = []
+    content = Content(objects)
+    uses = Counter(mesh for mesh, _, _ in placed)
+    shared = {mesh for mesh, n in uses.items() if (n - 1) * len(mesh.faces) >= SHARED_TRIANGLES}
+    own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, _, _ in placed if mesh not in shared]
+    if sum(own) > memory_share():
         raise MeshFileError(
-            f"places {len(placed):,} objects, which would take {bytes_of(total)}, of at most "
+            f"places {len(own):,} objects, which would take {bytes_of(sum(own))}, of at most "
             f"{bytes_of(memory_share())}, a quarter of the memory: {SMALLER}"
         )
     for mesh, matrix, name in placed:
@@ -104,10 +111,13 @@ def flattened(placed: Sequence[Instance]) -> Content:
             raise MeshFileError(
                 f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
             )
-        if np.linalg.matrix_rank(matrix[:3, :3]) < 2:
+        rank = np.linalg.matrix_rank(matrix[:3, :3])
+        if rank < 2:
             content.skipped.append(name)
+        elif mesh in shared and rank == 3:
+            objects.append(Instance(mesh, matrix, name))
         else:
-            content.meshes.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))
+            objects.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))
     return content
 
 

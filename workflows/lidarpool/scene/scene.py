@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -15,7 +15,8 @@ from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
 from .actors import Actor
-from .mesh import Mesh, points_array, stacked
+from .instances import Instance, Instances, Part, parts_of
+from .mesh import Cutout, Mesh, points_array, stacked
 from .meshfile import load_meshes
 from .shapes import seed_objects
 from .transform import Transform
@@ -47,6 +48,9 @@ class Scene:
         float64 (3,), whole metres.
     actors
         Moving objects, numbered after the others.
+    instances
+        Triangles that are kept once and are in several places, or have a mask; they are numbered
+        after `faces`, instance by instance. Those of actors follow.
 
     Raises
     ------
@@ -60,6 +64,7 @@ class Scene:
     names: tuple[str, ...]
     origin: NDArray[np.float64]
     actors: tuple[Actor, ...] = ()
+    instances: Instances | None = None
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
@@ -71,11 +76,11 @@ class Scene:
         faces = np.ascontiguousarray(as_array("faces", self.faces, np.int32))
         owners = np.ascontiguousarray(as_array("face_object", self.face_object, np.int32))
         (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
-        if faces.ndim != 2 or faces.shape[1:] != (3,) or not len(faces):
+        if faces.ndim != 2 or faces.shape[1:] != (3,) or not (len(faces) or self.instances):
             raise LidarpoolError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
-        if faces.min() < 0 or faces.max() >= len(vertices):
+        if not _within(faces, len(vertices)):
             raise LidarpoolError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
-        if owners.shape != faces.shape[:1] or owners.min() < 0 or owners.max() >= len(self.names):
+        if owners.shape != faces.shape[:1] or not _within(owners, len(self.names)):
             raise LidarpoolError(
                 f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
                 f"each of the {len(faces)} faces."
@@ -133,42 +138,79 @@ class Scene:
 
     @classmethod
     @checked
-    def from_meshes(cls, meshes: Iterable[Mesh]) -> Scene:
+    def from_meshes(cls, meshes: Iterable[Mesh | Instance]) -> Scene:
         """Make a scene of objects, each mesh one object.
 
         Parameters
         ----------
         meshes
-            In world coordinates. Duplicate names are numbered: Shelf, Shelf.2.
+            In world coordinates, or instances of meshes, whose triangles are kept once. Duplicate
+            names are numbered: Shelf, Shelf.2.
 
         Raises
         ------
         LidarpoolError
             If there are none, or more vertices or triangles than 32 bits can count.
         """
-        parts = list(meshes)
-        for part in parts:
-            if not isinstance(part, Mesh):
+        objects = list(meshes)
+        for one in objects:
+            if not isinstance(one, (Mesh, Instance)):
                 raise LidarpoolError(
-                    f"meshes holds {shown(part)}; each must be a Mesh(name, vertices, faces)."
+                    f"meshes holds {shown(one)}; each must be a Mesh(name, vertices, faces), or an "
+                    "Instance of one."
                 )
-        if not parts:
+        if not objects:
             raise LidarpoolError("A scene needs at least one object with triangles.")
-        sizes = [len(mesh.faces) for mesh in parts]
-        points, most = sum(len(mesh.vertices) for mesh in parts), np.iinfo(np.int32).max
-        if max(points, sum(sizes)) > most:
+        plain: list[tuple[int, Mesh]] = []  # (object, mesh without masks)
+        shared: list[tuple[int, int, NDArray[np.float64]]] = []  # (object, part, matrix)
+        parts: list[Part] = []
+        known: dict[Mesh, list[int]] = {}  # {mesh of instances: its parts}
+        for number, one in enumerate(objects):
+            if isinstance(one, Mesh) and not one.cutouts:
+                plain.append((number, one))
+                continue
+            mesh, matrix = (one, np.eye(4)) if isinstance(one, Mesh) else (one.mesh, one.matrix)
+            if mesh not in known:
+                made = list(parts_of(mesh))
+                known[mesh] = list(range(len(parts), len(parts) + len(made)))
+                parts += made
+            for part in known[mesh]:
+                if isinstance(one, Mesh) and parts[part].mask is None:
+                    vertices, faces = parts[part].vertices, parts[part].faces
+                    plain.append((number, Mesh(one.name, vertices, faces.astype(np.int64))))
+                else:
+                    shared.append((number, part, matrix))
+        sizes = [len(mesh.faces) for _, mesh in plain]
+        points, most = sum(len(mesh.vertices) for _, mesh in plain), np.iinfo(np.int32).max
+        triangles = sum(sizes) + sum(len(parts[part].faces) for _, part, _ in shared)
+        if max(points, triangles) > most:
             raise LidarpoolError(
-                f"The scene has {points} vertices and {sum(sizes)} triangles; at most {most} of "
+                f"The scene has {points} vertices and {triangles} triangles; at most {most} of "
                 "each can be numbered."
             )
-        vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in parts)
-        origin = local_origin(vertices)
+        vertices, faces = np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+        if plain:
+            vertices, faces = stacked((mesh.vertices, mesh.faces) for _, mesh in plain)
+        instances = None
+        ends = [vertices]
+        if shared:
+            owners, used, matrices = zip(*shared, strict=True)
+            transforms = np.array(matrices)[:, :3]
+            instances = Instances(
+                tuple(parts), np.array(used, np.intp), transforms, np.array(owners, np.int32)
+            )
+            ends.append(instances.bounds.reshape(-1, 3))
+        origin = local_origin(np.concatenate(ends))
+        if instances is not None and origin.any():
+            transforms = transforms - np.pad(origin[:, None], ((0, 0), (3, 0)))
+            instances = replace(instances, transforms=transforms)
         return cls(
             vertices=vertices - origin,
             faces=faces.astype(np.int32),
-            face_object=np.repeat(np.arange(len(parts), dtype=np.int32), sizes),
-            names=unique_names([mesh.name for mesh in parts]),
+            face_object=np.repeat(np.array([n for n, _ in plain], np.int32), sizes),
+            names=unique_names([one.name for one in objects]),
             origin=origin,
+            instances=instances,
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
@@ -196,11 +238,27 @@ class Scene:
 
     @property
     def triangles(self) -> int:
-        """Number of triangles, including those of actors."""
-        return len(self.faces) + sum(len(actor.mesh.faces) for actor in self.actors)
+        """Number of triangles, including those of instances and actors."""
+        shared = self.instances.triangles if self.instances else 0
+        return len(self.faces) + shared + sum(len(actor.mesh.faces) for actor in self.actors)
 
-    def solid(self, time_ns: float | None = None) -> Scene:
-        """All triangles, those of actors after the others: in their own axes, or where they are.
+    @property
+    def kept_triangles(self) -> int:
+        """Number of triangles in memory, those that instances share once; without actors."""
+        parts = self.instances.parts if self.instances else ()
+        return len(self.faces) + sum(len(part.faces) for part in parts)
+
+    @property
+    def counters(self) -> int:
+        """Length of a count of hits: of each triangle, and of each instance as a whole.
+
+        Those of instances follow `faces`; those of the actors' triangles come last.
+        """
+        shared = len(self.instances) if self.instances else 0
+        return len(self.faces) + shared + sum(len(actor.mesh.faces) for actor in self.actors)
+
+    def solid(self, time_ns: float) -> Scene:
+        """All triangles at a time, those of actors after the others; there are no instances.
 
         Parameters
         ----------
@@ -209,7 +267,7 @@ class Scene:
         """
         if not self.actors:
             return self
-        meshes = [actor.mesh if time_ns is None else actor.placed(time_ns) for actor in self.actors]
+        meshes = [actor.placed(time_ns) for actor in self.actors]
         moving = [(mesh.vertices, mesh.faces.astype(np.int32)) for mesh in meshes]
         owners = np.repeat(
             np.arange(len(self.names), len(self.all_names), dtype=np.int32),
@@ -222,21 +280,41 @@ class Scene:
             self.origin,
         )
 
-    def meshes(self) -> tuple[Mesh, ...]:
-        """Return the objects that have triangles, in world coordinates and in order."""
+    def meshes(self) -> tuple[Mesh | Instance, ...]:
+        """Return the objects that have triangles, in world coordinates and in order.
+
+        Of an object with masks, each part is one.
+        """
         order = np.argsort(self.face_object, kind="stable")
         ends = np.cumsum(np.bincount(self.face_object, minlength=len(self.names)))[:-1]
-        out = []
-        for name, rows in zip(self.names, np.split(order, ends), strict=True):
+        out: list[list[Mesh | Instance]] = [[] for _ in self.names]
+        for name, rows, found in zip(self.names, np.split(order, ends), out, strict=True):
             if len(rows):
                 used, faces = np.unique(self.faces[rows], return_inverse=True)
-                out.append(Mesh(name, self.vertices[used] + self.origin, faces.reshape(-1, 3)))
-        return tuple(out)
+                found.append(Mesh(name, self.vertices[used] + self.origin, faces.reshape(-1, 3)))
+        if (shared := self.instances) is not None:
+            meshes = [
+                Mesh(
+                    self.names[shared.owner[np.argmax(shared.part == number)]],
+                    part.vertices,
+                    part.faces.astype(np.int64),
+                    () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),),
+                )
+                for number, part in enumerate(shared.parts)
+            ]
+            for number, matrix, owner in zip(
+                shared.part, shared.transforms, shared.owner, strict=True
+            ):
+                placed = Transform(matrix[:, :3], matrix[:, 3] + self.origin)
+                out[owner].append(Instance(meshes[number], placed, self.names[owner]))
+        return tuple(one for found in out for one in found)
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
         used = self.vertices[np.unique(self.faces)]
+        if self.instances:
+            used = np.concatenate([used, self.instances.bounds.reshape(-1, 3)])
         return np.stack([used.min(axis=0), used.max(axis=0)])
 
     @cached_property
@@ -250,6 +328,9 @@ class Scene:
         high = np.full((len(self.names), 3), -np.inf)
         np.minimum.at(low, self.face_object, corners.min(axis=1))
         np.maximum.at(high, self.face_object, corners.max(axis=1))
+        if (shared := self.instances) is not None:
+            np.minimum.at(low, shared.owner, shared.bounds[:, 0])
+            np.maximum.at(high, shared.owner, shared.bounds[:, 1])
         return np.stack([low, high], axis=1)
 
     @cached_property
@@ -264,7 +345,13 @@ class Scene:
         for corner in range(3):
             offset = self.vertices[self.faces[:, corner], :2] - centres[self.face_object]
             np.maximum.at(reach, self.face_object, np.hypot(*offset.T))
+        if (shared := self.instances) is not None:
+            np.maximum.at(reach, shared.owner, shared.reach(centres[shared.owner]))
         return np.column_stack([centres, reach])
+
+
+def _within(numbers: NDArray[np.int32], count: int) -> bool:
+    return not numbers.size or bool(numbers.min() >= 0 and numbers.max() < count)
 
 
 def local_origin(vertices: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -13,6 +13,9 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from ..base.errors import LidarpoolError, explained
+from .drawn import Drawn
+from .instances import Instance
+from .mesh import Mesh
 from .meshfile import GENERATOR, OWN
 from .scene import Scene
 from .transform import UP_AXES
@@ -68,16 +71,29 @@ def check_target(path: Path) -> None:
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Content of a file of one of `SUFFIXES`."""
     if suffix == ".ply":
-        whole = trimesh.Trimesh(scene.vertices + scene.origin, scene.faces, process=False)
+        drawn = Drawn.of(scene, scene.triangles).scene
+        whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
         data = bytes(export_ply(whole, vertex_normal=False))
         head, _, rest = data.partition(b"\ncomment ")
         return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
     # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
     turn = UP_AXES["y"].T if suffix == ".glb" else np.eye(3)
+    turned = np.eye(4)
+    turned[:3, :3] = turn
     objects = trimesh.Scene()
-    for mesh in scene.meshes():
-        geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
-        objects.add_geometry(geometry, node_name=mesh.name, geom_name=mesh.name)
+    shared: dict[Mesh, str] = {}  # {mesh of instances: name of its geometry}
+    for one in scene.meshes():
+        matrix = None
+        if isinstance(one, Instance) and suffix == ".glb":
+            mesh, matrix = one.mesh, turned @ one.matrix @ turned.T
+        else:
+            mesh = one.flat() if isinstance(one, Instance) else one
+        if mesh not in shared:
+            geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
+            shared[mesh] = mesh.name
+            objects.add_geometry(geometry, one.name, mesh.name, transform=matrix)
+        else:
+            objects.graph.update(one.name, geometry=shared[mesh], matrix=matrix)
     if suffix == ".obj":
         text = export_obj(objects, include_normals=False, include_texture=False)
         return f"# {OWN}\n{text}".encode()

@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.xmlfile import refuse_entity
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, flattened, instances
+from .nodes import SMALLER, Content, MeshFileError, Node, instances, settled
 
 _UNITS_M = {
     "micron": 1e-6,
@@ -76,7 +76,7 @@ def read_3mf(data: bytes, path: Path) -> Content:
             made = package.object(place.key)
             return Node(place.name or made.name, place.matrix, made.meshes, made.components)
 
-        content = flattened(instances(root.items, node, path.stem))
+        content = settled(instances(root.items, node, path.stem))
     content.unit_m, content.up_axis = _UNITS_M[root.unit], "z"
     return content
 

@@ -89,9 +89,8 @@ class EchoCaster:
         # Whether each ray that hits something has one return.
         several = survey.returns.subrays > 1 or survey.noise.loses
         self._one_each = surfaces.materials.plain and not several
-        self._faces = surfaces.triangles
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
-        reach = np.float32(np.abs(scene.vertices).max())
+        reach = np.float32(np.abs(scene.bounds).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
 
     def divided(self, sensor: Sensor, pattern: Pattern) -> Pattern | None:
@@ -276,6 +275,10 @@ class EchoCaster:
 
         return hits, planes
 
+    def _tally(self, triangle: NDArray[np.int32]) -> Whole:
+        surfaces = self._surfaces
+        return np.bincount(surfaces.counter(triangle), minlength=surfaces.counters)
+
     def _reported(self, returns: Hits, keys: Keys) -> Hits:
         """Select detected returns, and among them those that the mode reports."""
         if self._noise.loses:
@@ -297,7 +300,7 @@ class EchoCaster:
             distance=thinned.distance,
             triangle=thinned.triangle,
             hits=np.diff(cuts),
-            tally=np.bincount(returns.triangle, minlength=self._faces) if tally else None,
+            tally=self._tally(returns.triangle) if tally else None,
             instance=np.zeros(len(thinned.ray), np.int32),
             energy=thinned.energy,
             number=np.minimum(number[kept] + 1, 255).astype(np.uint8),

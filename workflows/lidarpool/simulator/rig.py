@@ -47,8 +47,9 @@ class Rig:
         device: int | None = None,
     ) -> None:
         self.scene, self.survey = scene, survey
-        self._world = World(scene, backend=backend, threads=threads, device=device)
         self._surfaces = Surfaces(scene, tuple(survey.materials))
+        options = {"backend": backend, "threads": threads, "device": device}
+        self._world = World(scene, self._surfaces, **options)
         self._echoes = EchoCaster(self._world, scene, survey, self._surfaces)
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}

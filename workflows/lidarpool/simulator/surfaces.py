@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from copy import copy
 from functools import cached_property
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.instances import Instances
 from ..scene.scene import Scene
 from ..sensor import Trajectory
 from ..sensor.materials import Material, MaterialTable, at_right_angles
@@ -21,6 +23,8 @@ Real = NDArray[np.float64]
 class Surfaces:
     """Optical properties of triangles.
 
+    Triangles are numbered by the scene's faces, then instance by instance, then by actors.
+
     Raises
     ------
     LidarpoolError
@@ -28,10 +32,42 @@ class Surfaces:
     """
 
     def __init__(self, scene: Scene, materials: tuple[Material, ...]) -> None:
-        self._scene = scene.solid()
+        self._scene = scene
         self._standing = len(scene.names)  # objects
-        self.triangles = len(self._scene.faces)
+        self.counters = scene.counters
         self.materials = MaterialTable.of(materials, scene.all_names)
+        shared = scene.instances
+        plain = len(scene.faces)
+        sizes = np.zeros(0, np.int64) if shared is None else shared.sizes
+        # Where the triangles of each instance begin, and those of actors.
+        self._begins = plain + np.cumsum([0, *sizes])
+        moving = [len(actor.mesh.faces) for actor in scene.actors]
+        owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
+        # Objects of the triangles of faces and of actors; the last is none.
+        owned = [scene.face_object, np.repeat(owners, moving), np.zeros(1, np.int32)]
+        self._owners = np.concatenate(owned)
+        if shared is not None:
+            self._turn_normals(shared)
+
+    def _turn_normals(self, shared: Instances) -> None:
+        """Prepare what takes the normals of parts to those of instances."""
+        self._turns = np.linalg.inv(shared.transforms[:, :, :3]).transpose(0, 2, 1)  # (n, 3, 3)
+
+    def moved(self, scene: Scene) -> Surfaces:
+        """Return the same with the scene's instances in other places."""
+        made = copy(self)
+        made._scene = scene
+        if scene.instances is not None:
+            made._turn_normals(scene.instances)
+        return made
+
+    def _found(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
+        """Rows without instances, which of them are in one, and in which: (n,), (k,), (k,)."""
+        plain, actors = self._begins[[0, -1]]
+        rows = np.where(triangle >= actors, triangle - (actors - plain), triangle)
+        on = np.flatnonzero((triangle >= plain) & (triangle < actors))
+        which = np.searchsorted(self._begins, triangle[on], side="right") - 1
+        return rows, on, which
 
     def normals(
         self, triangle: Triangles, times: Real | NDArray[np.int64], ways: tuple[Trajectory, ...]
@@ -41,8 +77,16 @@ class Surfaces:
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
         """
         normals = np.empty((3, len(triangle)))
+        rows, shared = triangle, self._scene.instances
+        if shared is not None:
+            rows, on, which = self._found(triangle)
+            local = rows[on] - self._begins[which]
+            rows[on] = self._first_normal[shared.part[which]] + local
         for axis, out in zip(self._unit_normals, normals, strict=True):
-            out[:] = axis.take(triangle)
+            out[:] = axis.take(rows)
+        if shared is not None and len(on):
+            turned = np.einsum("nij,jn->in", self._turns[which], normals[:, on])
+            normals[:, on] = turned / np.linalg.norm(turned, axis=0)
         objects = self.objects(triangle) if ways else None
         for number, way in enumerate(ways, self._standing):
             rows = np.flatnonzero(objects == number)
@@ -54,7 +98,24 @@ class Surfaces:
 
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
         """Objects of triangles (n,)."""
-        return self._scene.face_object[triangle]
+        shared = self._scene.instances
+        if shared is None:
+            return self._owners[triangle]
+        rows, on, which = self._found(triangle)
+        rows[on] = -1
+        objects = self._owners[rows]
+        objects[on] = shared.owner[which]
+        return objects
+
+    def counter(self, triangle: Triangles) -> Triangles:
+        """Counters of hits of triangles (n,), see `Scene.counters`."""
+        if self._scene.instances is None:
+            return triangle
+        rows, on, which = self._found(triangle)
+        plain, instances = self._begins[0], len(self._begins) - 1
+        rows[rows >= plain] += instances
+        rows[on] = plain + which
+        return rows
 
     def energy(self, triangle: Triangles, cosine: Real, distance: Real, extinction: float) -> Real:
         """Received energy of rays that end on triangles (n,), at distances in metres.
@@ -67,13 +128,30 @@ class Surfaces:
 
     @cached_property
     def _unit_normals(self) -> NDArray[np.float32]:
-        """Unit normals of all triangles, one row for each axis, the fastest layout: (3, f)."""
-        vertices, faces = self._scene.vertices, self._scene.faces
-        out = np.empty((3, len(faces)), np.float32)
-        for begin in range(0, len(faces), BLOCK_FACES):
-            block = slice(begin, begin + BLOCK_FACES)
-            a, b, c = vertices[faces[block]].transpose(1, 0, 2)
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1, keepdims=True)
-            out[:, block] = (normals / np.maximum(lengths, 1e-300)).T
+        """Unit normals of all triangles, one row for each axis, the fastest layout: (3, f).
+
+        Those of actors follow the scene's, and those of the parts of instances follow them.
+        """
+        scene = self._scene
+        bodies: list[tuple[Real, Triangles]] = [(scene.vertices, scene.faces)]
+        bodies += [(actor.mesh.vertices, actor.mesh.faces) for actor in scene.actors]
+        if scene.instances is not None:
+            bodies += [(part.vertices, part.faces) for part in scene.instances.parts]
+        out = np.empty((3, sum(len(faces) for _, faces in bodies)), np.float32)
+        at = 0
+        for vertices, faces in bodies:
+            for begin in range(0, len(faces), BLOCK_FACES):
+                block = faces[begin : begin + BLOCK_FACES]
+                a, b, c = vertices[block].transpose(1, 0, 2)
+                normals = np.cross(b - a, c - a)
+                lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+                out[:, at : at + len(block)] = (normals / np.maximum(lengths, 1e-300)).T
+                at += len(block)
         return out
+
+    @cached_property
+    def _first_normal(self) -> NDArray[np.intp]:
+        """Where the normals of each part of instances begin."""
+        assert self._scene.instances is not None
+        sizes = [len(part.faces) for part in self._scene.instances.parts]
+        return len(self._owners) - 1 + np.cumsum([0, *sizes[:-1]])

@@ -1,4 +1,4 @@
-"""The ray caster of a whole world: the static scene and moving actors.
+"""The ray caster of a whole world: the static scene, its instances, and moving actors.
 
 Each ray is transformed to an actor's axes at its own time, so that no tree is ever rebuilt. Only
 rays that come near the actor's bounding sphere are made and cast; the position of the sphere in the
@@ -7,20 +7,33 @@ axes of each pose selects them.
 
 from __future__ import annotations
 
+from dataclasses import replace
+from hashlib import blake2b
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern, RayCaster, ScanReturns, available_backends
+from raybeam import (
+    Instance,
+    Mesh,
+    Opacity,
+    Pattern,
+    RayCaster,
+    ScanReturns,
+    available_backends,
+)
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
 from ..scene.actors import Actor
+from ..scene.instances import Instances, Part, parts_of
+from ..scene.mesh import Mesh as ActorMesh
 from ..scene.scene import Scene
 from ..sensor import Trajectory
 from .motion import Poses, into_axes, products
+from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 CELL_RAYS = 1 << 10  # rays in a cell of a still sensor, which are fired at nearly one time
@@ -48,18 +61,41 @@ def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
 class World:
     """Casts scans like `RayCaster.scan`, including hits on actors.
 
-    Triangles of actors are numbered after those of the scene, see `Scene.solid`. Rays that touch
-    no actor give the same bits as without actors. Where the actors are, the poses of a scan say.
-    `options` are those of `RayCaster`.
+    Triangles of instances are numbered after those of the scene, and those of actors after both.
+    Rays that touch no actor give the same bits as without actors. Where the actors are, the poses
+    of a scan say. A tally is by the counters of `surfaces`. `options` are those of `RayCaster`.
     """
 
-    def __init__(self, scene: Scene, **options: Any) -> None:
-        self._caster = RayCaster(scene.vertices, scene.faces, **options)
-        self._actors, faces = [], len(scene.faces)
+    def __init__(self, scene: Scene, surfaces: Surfaces, **options: Any) -> None:
+        self._surfaces, self._shared = surfaces, scene.instances
+        self._begins: NDArray[np.int32] | None = None  # of each body of the caster
+        faces = len(scene.faces)
+        if self._shared is None:
+            self._caster = RayCaster(scene.vertices, scene.faces, **options)
+        else:
+            own = [Instance(Mesh(scene.vertices, scene.faces))] if faces else []
+            meshes = [_mesh_of(part) for part in self._shared.parts]
+            placed = zip(self._shared.part, self._shared.transforms, strict=True)
+            shared = [Instance(meshes[part], matrix) for part, matrix in placed]
+            self._caster = RayCaster.of([*own, *shared], **options)
+            begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
+            self._begins = np.append([0] * bool(own), begins).astype(np.int32)
+            faces += self._shared.triangles
+        self._actors = []
+        casters: dict[bytes, RayCaster] = {}
         for actor in scene.actors:
-            self._actors.append(_Cast(actor, faces, options))
+            self._actors.append(_Cast(actor, faces, options, casters))
             faces += len(actor.mesh.faces)
-        self._faces = faces
+
+    def place(self, surfaces: Surfaces, shared: Instances) -> None:
+        """Move instances to other places."""
+        before = self._shared
+        assert before is not None
+        first = self._caster.instance_count - len(shared)
+        changed = (shared.transforms != before.transforms).any(axis=(1, 2))
+        for row in np.flatnonzero(changed):
+            self._caster.move(first + int(row), shared.transforms[row])
+        self._surfaces, self._shared = surfaces, shared
 
     @property
     def backend(self) -> str:
@@ -83,11 +119,43 @@ class World:
         common: dict[str, Any] = {
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
         }  # fmt: skip
-        if not self._actors:
+        if self._begins is None and not self._actors:
             return self._caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
         found = self._caster.scan(pattern, **common)
+        if self._begins is not None:
+            found = replace(found, triangle=found.triangle + self._begins[found.instance])
+        ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
+        if self._actors:
+            window, reach = (start, stop), (t_min, t_max)
+            ray, distance, triangle = self._with_actors(found, pattern, poses, window, reach)
+        begins = np.zeros(1, np.int64) if groups is None else groups
+        cuts = np.append(np.searchsorted(ray, begins), len(ray))
+        counts = np.diff(cuts)
+        counted = None
+        if tally:
+            counted = np.bincount(
+                self._surfaces.counter(triangle), minlength=self._surfaces.counters
+            )
+        if keep_every > 1:
+            place = np.arange(len(ray)) - np.repeat(cuts[:-1], counts)
+            kept = np.flatnonzero(place % keep_every == 0)
+            ray, distance, triangle = ray[kept], distance[kept], triangle[kept]
+        none = np.zeros(len(ray), np.int32)
+        return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
+
+    def _with_actors(
+        self,
+        found: ScanReturns,
+        pattern: Pattern,
+        poses: Poses,
+        window: tuple[int, int],
+        reach: tuple[float, float],
+    ) -> tuple[NDArray[np.int64], Float, NDArray[np.int32]]:
+        """Rays, distances and triangles of all hits, those on actors among them."""
+        start, stop = window
+        t_min, t_max = reach
         distance = np.full(stop - start, np.inf)
         triangle = np.full(stop - start, -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
@@ -102,20 +170,12 @@ class World:
             nearer = t < distance[ray[rows]]
             distance[ray[rows[nearer]]], triangle[ray[rows[nearer]]] = t[nearer], face[nearer]
         ray = np.flatnonzero(triangle >= 0)
-        begins = np.zeros(1, np.int64) if groups is None else groups
-        cuts = np.append(np.searchsorted(ray, begins), len(ray))
-        counts = np.diff(cuts)
-        kept = (np.arange(len(ray)) - np.repeat(cuts[:-1], counts)) % keep_every == 0
-        counted = np.bincount(triangle[ray], minlength=self._faces) if tally else None
-        ray = ray[kept]
-        return ScanReturns(
-            ray.astype(np.uint32),
-            distance[ray],
-            triangle[ray],
-            counts,
-            counted,
-            np.zeros(len(ray), np.int32),
-        )
+        return ray, distance[ray], triangle[ray]
+
+
+def _mesh_of(part: Part) -> Mesh:
+    opacity = None if part.mask is None or part.uv is None else Opacity(part.mask, part.uv)
+    return Mesh(part.vertices, part.faces, opacity)
 
 
 class _Cells:
@@ -178,13 +238,26 @@ class _Cells:
         return ray[ray < self._rays]
 
 
+def _arrays(mesh: ActorMesh) -> list[NDArray[Any]]:
+    return [mesh.vertices, mesh.faces, *(a for cut in mesh.cutouts for a in (cut.mask, cut.uv))]
+
+
 class _Cast:
     """An actor with its ray caster, and the bounding sphere of its vertices."""
 
-    def __init__(self, actor: Actor, first: int, options: dict[str, Any]) -> None:
-        vertices = actor.mesh.vertices
-        self._first = first  # number of its first triangle
-        self._caster = RayCaster(vertices, actor.mesh.faces, **options)
+    def __init__(
+        self, actor: Actor, first: int, options: dict[str, Any], casters: dict[bytes, RayCaster]
+    ) -> None:
+        mesh = actor.mesh
+        vertices = mesh.vertices
+        # Actors of one shape share a tree; what they share as objects is lost on the way here.
+        shape = blake2b(b"".join(a.tobytes() for a in _arrays(mesh))).digest()
+        if shape not in casters:
+            parts = [Instance(_mesh_of(part)) for part in parts_of(mesh)]
+            casters[shape] = RayCaster.of(parts, **options)
+        self._caster = casters[shape]
+        sizes = [len(part.faces) for part in parts_of(mesh)]
+        self._parts = (first + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
         self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
         self.radius = float(np.linalg.norm(vertices - self.middle, axis=1).max())
 
@@ -208,4 +281,4 @@ class _Cast:
         on = np.flatnonzero(hits.hit)
         # Directions of a sensor that turns during a pose are not quite of unit length.
         lengths = np.linalg.norm(directions[on], axis=1)
-        return on, hits.distance[on] / lengths, hits.triangle[on] + np.int32(self._first)
+        return on, hits.distance[on] / lengths, hits.triangle[on] + self._parts[hits.instance[on]]

@@ -13,7 +13,10 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from ...base.errors import LidarpoolError, prefixed
+from ...scene.actors import one_mesh
+from ...scene.drawn import Drawn
 from ...scene.floor import heights_at
+from ...scene.instances import Instance
 from ...scene.mesh import Mesh
 from ...scene.meshfile import load_meshes
 from ...scene.scene import Scene, unique_names
@@ -74,7 +77,7 @@ class Part:
         """Whether platforms and parts can stand on it."""
         return any(values.get("isGround", "").lower() in ("true", "1") for values in self.materials)
 
-    def meshes(self) -> tuple[Mesh, ...]:
+    def meshes(self) -> tuple[Mesh | Instance, ...]:
         """Read it, in the world."""
         placed = Transform(self.turn * self.scale, self.offset)
         return load_meshes(self.file, up_axis=self.up_axis, transform=placed, tell=lambda _: None)
@@ -151,7 +154,7 @@ class Surroundings:
     @cached_property
     def _ground(self) -> Scene | None:
         meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
-        return Scene.from_meshes(meshes) if meshes else None
+        return Drawn.of(Scene.from_meshes(meshes)).scene if meshes else None
 
     def height(self, x: float, y: float) -> float:
         """Height of the lowest ground at a place; 0 where there is none."""
@@ -163,7 +166,7 @@ class Surroundings:
 
     def _let_fall(self, part: Part) -> None:
         """Move a part up or down so that its lowest point stands on the ground."""
-        points = np.concatenate([mesh.vertices for mesh in part.meshes()])
+        points = one_mesh("", part.meshes()).vertices
         x, y, z = points[points[:, 2].argmin()].tolist()
         part.offset[2] += self.height(x, y) - z
 
