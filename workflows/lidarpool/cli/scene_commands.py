@@ -33,33 +33,38 @@ def _made(triangles: int) -> Callable[[Command], Command]:
 
 @scene.command(context_settings={"show_default": True})
 @_made(triangles=100_000)
-def city(out: Path, triangles: int, seed: int, overwrite: bool) -> None:
+@click.option("--trees", default=0, help="Number of detailed trees, instead of the simple ones.")
+@click.option("--cars", default=0, help="Number of detailed cars, instead of the simple ones.")
+def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars: int) -> None:
     """Make a city: streets, houses, towers, trees, cars; more triangles make it larger.
 
     \b
     Examples:
       lidarpool scene city city.glb
       lidarpool scene city city.ply --triangles 10000000 --seed 7
+      lidarpool scene city green.glb --trees 500 --cars 200
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.city import city as make
 
-    _write(out, lambda: make(triangles, seed), overwrite)
+    _write(out, lambda: make(triangles, seed, trees, cars), overwrite)
 
 
 @scene.command(context_settings={"show_default": True})
 @_made(triangles=2_000_000)
 @click.option("--side", default=1000.0, help="Length of a side in metres.")
-def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool) -> None:
+@click.option("--trees", default=0, help="Number of trees, in woods on ground that is not steep.")
+def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, trees: int) -> None:
     """Make a square of hills and mountains; more triangles make it finer.
 
     \b
     Examples:
       lidarpool scene terrain hills.ply
       lidarpool scene terrain small.obj --triangles 20000 --side 100
+      lidarpool scene terrain woods.glb --trees 10000
     """  # noqa: D301 - click wants the character, not its name
     from ..scene.terrain import terrain as make
 
-    _write(out, lambda: make(triangles, seed, side), overwrite)
+    _write(out, lambda: make(triangles, seed, side, trees), overwrite)
 
 
 def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:

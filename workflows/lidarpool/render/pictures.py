@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -29,16 +30,25 @@ SURROUNDING = 0.6
 
 
 def draw_scene(shot: Shot, triangles: int) -> Page:
-    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number."""
+    """Draw a scene and the sensors; `triangles` is their number.
+
+    Each object has its own colour; those that share a name but for a number, as Oak and Oak.2, have
+    one colour.
+    """
     scene = shot.scene
-    colours = _object_colours(scene)
+    kinds, words = _kinds(scene.names)
+    colours = _object_colours(scene, kinds)
     page = Page(shot.camera.size)
     page.show(shot, shot.paint(colours[scene.face_object]))
-    entries = list(zip(without_common_prefix(scene.names), colours, strict=True))
-    there = np.bincount(scene.face_object, minlength=len(entries)) > 0
-    first = len(entries) - shot.actors  # actors are first in the legend
-    order = [*range(first, len(entries)), *range(first)]
-    page.legend([entries[k] for k in order if there[k]])
+    there = np.unique(scene.face_object)  # objects that are drawn
+    counts = np.bincount(kinds[there], minlength=len(words))
+    entries = {}  # {kind: name and colour}
+    # Actors are first in the legend, then the many of a kind.
+    actors = there >= len(scene.names) - shot.actors
+    for k in there[np.lexsort((counts[kinds[there]] == 1, ~actors))].tolist():
+        many = f" × {counts[kinds[k]]:,}" if counts[kinds[k]] > 1 else ""
+        entries.setdefault(int(kinds[k]), (words[kinds[k]] + many, colours[k]))
+    page.legend(list(entries.values()))
     page.title(
         "Scene",
         f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
@@ -113,8 +123,17 @@ def draw_cloud(
     return page
 
 
-def _object_colours(scene: Scene) -> Floats:
-    """Colours of a scene's objects, (objects, 3) in 0 to 1.
+def _kinds(names: Sequence[str]) -> tuple[NDArray[np.int64], list[str]]:
+    """Kind of each object (objects,), and their names, without a number that made them unique."""
+    given, numbers = set(names), dict[str, int]()
+    bases = [re.sub(r"\.\d+$", "", name) for name in names]
+    same = [base if base in given else name for base, name in zip(bases, names, strict=True)]
+    kinds = [numbers.setdefault(name, len(numbers)) for name in same]
+    return np.array(kinds, np.int64), without_common_prefix(list(numbers))
+
+
+def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
+    """Colours of a scene's objects by their kinds (objects,): (objects, 3) in 0 to 1.
 
     Floors and halls are grey, so that objects in them stand out.
     """
@@ -123,7 +142,8 @@ def _object_colours(scene: Scene) -> Floats:
     share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / whole[:2].prod()
     grey = (share >= SURROUNDING) & (len(scene.names) > 1)
     colours = np.empty((len(scene.names), 3))
-    colours[~grey] = theme.object_colours(int((~grey).sum()))
+    found, kind = np.unique(kinds[~grey], return_inverse=True)
+    colours[~grey] = theme.object_colours(len(found))[kind.reshape(-1)]
     steps = np.linspace(0, 0.22, max(int(grey.sum()), 1))[: int(grey.sum()), None]
     colours[grey] = theme.rgb(theme.CLAY) * (1 - steps) + theme.rgb(theme.MUTED) * steps
     return colours

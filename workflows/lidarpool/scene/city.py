@@ -16,7 +16,10 @@ from pydantic import Field
 from ..base.arguments import checked
 from ..base.declared import Seed
 from . import city_kinds
+from .city_furniture import MOST_CARS, parked_cars, street_trees
 from .city_kinds import Solid
+from .instances import Instance
+from .plants import MOST_TREES
 from .scene import Scene
 from .terrain import grid_faces
 
@@ -36,14 +39,17 @@ _GROUND_SHARE = 0.03  # of the triangles, at least
 _MARGIN_M = 12.0
 _STREET_M, _AVENUE_M, _AVENUE_EVERY = 13.0, 24.0, 4
 _BLOCK_M = ((60.0, 100.0), (46.0, 62.0))  # along x, along y
-_PAVEMENT_M = 3.5
+_PAVEMENT_M, _KERB_M = 3.5, 0.15  # width and height
 _LOT_M = 16.5
 _PARKS = 0.09  # share of the blocks
 
 
 @checked
 def city(
-    triangles: Annotated[int, Field(ge=1_000, le=100_000_000)] = 100_000, seed: Seed = 0
+    triangles: Annotated[int, Field(ge=1_000, le=100_000_000)] = 100_000,
+    seed: Seed = 0,
+    trees: Annotated[int, Field(ge=0, le=MOST_TREES)] = 0,
+    cars: Annotated[int, Field(ge=0, le=MOST_CARS)] = 0,
 ) -> Scene:
     """Make a city of a number of triangles: more triangles make it larger, not finer.
 
@@ -57,11 +63,18 @@ def city(
         The scene has at most one in fifty fewer.
     seed
         The same seed and number give the same city.
+    trees
+        Number of trees with branches and leaves instead of the simple ones: instances of one mesh
+        for each of `lidarpool.scene.plants.SPECIES`, at streets, in yards and in parks. Ground,
+        buildings and lamps stay the same.
+    cars
+        Number of cars with windows and wheels instead of the simple ones: instances of one mesh for
+        each of `lidarpool.scene.cars.MODELS`, parked at the kerbs.
 
     Raises
     ------
     LidarpoolError
-        For a number that is out of range.
+        For a number that is out of range, or trees or cars that do not fit.
 
     Examples
     --------
@@ -74,7 +87,35 @@ def city(
     sizes = np.array([len(solid.faces) for solid in solids])
     things = _things(kinds, sizes, int((1 - _GROUND_SHARE) * triangles), seed)
     left = triangles - int(sizes[things["kind"]].sum())
-    return _scene(solids, things, _ground(things, left))
+    ground = _ground(things, left)
+    replaced = [owner for owner, count in ((TREE, trees), (CAR, cars)) if count]
+    things = things[~np.isin(things["owner"], replaced)]
+    scene = _scene(solids, things, ground)
+    if not replaced:
+        return scene
+    return Scene.from_meshes([*scene.meshes(), *_furniture(scene, things, trees, cars, seed)])
+
+
+def _furniture(scene: Scene, things: Things, trees: int, cars: int, seed: int) -> list[Instance]:
+    """Place trees and cars among things."""
+    pavement = things[things["owner"] == PAVEMENT]
+    blocks = np.stack([pavement["place"][:, :2], pavement["scale"][:, :2]], axis=1)
+    names = CLASSES[BUILDING] + "-"
+    built = [number for number, name in enumerate(scene.names) if name.startswith(names)]
+    boxes = scene.object_bounds[built][..., :2]
+    houses, lamps = (things[things["owner"] == owner] for owner in (BUILDING, LAMP))
+    ends = [np.searchsorted(some["block"], pavement["block"][1:]) for some in (houses, lamps)]
+    return [
+        *street_trees(
+            blocks,
+            np.split(boxes, ends[0]),
+            np.split(lamps["place"][:, :2], ends[1]),
+            _KERB_M,
+            trees,
+            seed,
+        ),
+        *parked_cars(blocks, cars, seed),
+    ]
 
 
 def _things(kinds: dict[str, list[Solid]], sizes: Int, budget: int, seed: int) -> Things:
@@ -206,7 +247,7 @@ class _City:
         xy: Float,
         yaw: Float | float,
         scale: Float | float,
-        z: float = 0.15,
+        z: float = _KERB_M,
     ) -> Things:
         """Rows of one class, `kind` being counted within its group."""
         out = np.empty(len(block), _THING)

@@ -67,16 +67,23 @@ class Drawn:
 def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Vertices and at most so many faces that stand for a part.
 
-    What falls apart when its vertices are merged, as a tree's leaves do, is a choice of its
-    triangles instead, made larger (Cook et al., 2007).
+    Of what falls apart when its vertices are merged, as a tree's leaves do, the largest triangles
+    stay, as those of trunk and boughs are, and a choice of the others, made larger for all of them
+    (Cook et al., 2007); long ones less, which would stick out.
     """
     vertices, faces, kept, _ = _merged(part.vertices, part.faces, most)
     if len(kept) >= most // 4:
         return vertices, faces[kept]
-    some = np.random.default_rng(0).choice(len(part.faces), most, replace=False)
-    corners = part.vertices[part.faces[some]]
-    middle = corners.mean(axis=1, keepdims=True)
-    larger = middle + (corners - middle) * (len(part.faces) / most) ** 0.5
+    corners = part.vertices[part.faces]
+    order = np.argsort(-triangle_areas(corners), kind="stable")
+    large, small = np.split(order, [most // 4])
+    some = np.random.default_rng(0).choice(small, most - len(large), replace=False)
+    scale = np.ones(most)
+    long = np.linalg.norm(corners[some] - np.roll(corners[some], 1, axis=1), axis=2).max(axis=1)
+    scale[len(large) :] = (len(small) / len(some)) ** 0.5 * np.minimum(1, np.median(long) / long)
+    chosen = corners[np.append(large, some)]
+    middle = chosen.mean(axis=1, keepdims=True)
+    larger = middle + (chosen - middle) * np.maximum(1, scale)[:, None, None]
     return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3)
 
 

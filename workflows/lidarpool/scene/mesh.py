@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
+from itertools import product
 from typing import Any
 
 import numpy as np
@@ -79,6 +81,12 @@ class Mesh:
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
         object.__setattr__(self, "cutouts", tuple(self.cutouts))
         _check_cutouts(self.name, self.cutouts, len(faces))
+
+    @cached_property
+    def box(self) -> NDArray[np.float64]:
+        """Corners of its bounding box, (8, 3)."""
+        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
+        return np.array(list(product(*zip(low, high, strict=True))))
 
     def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""

@@ -6,7 +6,6 @@ import codecs
 import logging
 import re
 from collections.abc import Callable, Sequence
-from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -255,9 +254,7 @@ def _corners(one: Mesh | Instance) -> NDArray[np.float64]:
     """Points that an object lies between, in the world."""
     if isinstance(one, Mesh):
         return one.vertices
-    low, high = one.mesh.vertices.min(axis=0), one.mesh.vertices.max(axis=0)
-    box = np.array(list(product(*zip(low, high, strict=True))))
-    return np.asarray(box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
+    return np.asarray(one.mesh.box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
 
 
 def _printable(text: str) -> str:

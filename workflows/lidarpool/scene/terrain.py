@@ -10,7 +10,10 @@ from pydantic import Field
 
 from ..base.arguments import checked
 from ..base.declared import Seed
+from ..base.errors import LidarpoolError
+from .instances import Instance
 from .mesh import Mesh
+from .plants import MOST_TREES, SCALES, SPECIES, all_trees, placed
 from .scene import Scene
 
 Float = NDArray[np.float64]
@@ -20,6 +23,14 @@ _OCTAVES = 11
 _ROUGHNESS = 0.5  # height of each octave over that of the one before
 _RELIEF = 0.16  # greatest height over the side's length
 
+# One tree at most in a cell, at the flattest of some places in its middle part.
+_CELL_M, _MOST_CELLS, _TRIED, _MIDDLE = 5.0, 1_000, 4, 0.4
+_STEEPEST = np.tan(np.radians(40.0))
+_ROOT_M = 0.6
+_EDGE_M = 5.0  # of the terrain, without trees
+_GLADE_M = 12.0  # without trees around the middle, where a sensor stands by default
+_WOODS_M, _DENSER = 120.0, 5.0  # size of woods; how much denser than between them, as an exponent
+
 
 @checked
 def terrain(
@@ -27,6 +38,7 @@ def terrain(
     seed: Seed = 0,
     # Files reject coordinates beyond 1e8 m.
     side_m: Annotated[float, Field(gt=0, le=1e7)] = 1000.0,
+    trees: Annotated[int, Field(ge=0, le=MOST_TREES)] = 0,
 ) -> Scene:
     """Make a square of fractal terrain: ridges and valleys at every scale, flatter low down.
 
@@ -42,11 +54,15 @@ def terrain(
         The same numbers give the same terrain.
     side_m
         Length of a side, metres; (0, 0) is in the middle, and z = 0 is the lowest point.
+    trees
+        Number of trees, in woods on ground of at most 40 degrees: instances of one mesh for each
+        of `lidarpool.scene.plants.SPECIES`. Conifers are higher up. Their triangles are not
+        counted in `triangles`.
 
     Raises
     ------
     LidarpoolError
-        For a number that is out of range.
+        For a number that is out of range, or trees that do not fit.
 
     Examples
     --------
@@ -61,7 +77,56 @@ def terrain(
     points[..., 0], points[..., 1] = (x[:, None] - 0.5) * side_m, (y - 0.5) * side_m
     points[..., 2] = height * side_m
     faces = grid_faces(columns, rows).reshape(-1, 3)
-    return Scene.from_meshes([Mesh("terrain", points.reshape(-1, 3), faces)])
+    ground = Mesh("terrain", points.reshape(-1, 3), faces)
+    return Scene.from_meshes([ground, *_woods(points[..., 2], side_m, trees, seed)])
+
+
+def _woods(heights: Float, side_m: float, count: int, seed: int) -> list[Instance]:
+    """Place trees on ground of these heights over a square grid."""
+    if not count:
+        return []
+    rng = np.random.default_rng([seed, count])
+    cells = min(int(side_m / _CELL_M), _MOST_CELLS)
+    number = np.stack(np.meshgrid(np.arange(cells), np.arange(cells), indexing="ij"), axis=-1)
+    inside = 0.5 + _MIDDLE * rng.uniform(-0.5, 0.5, (_TRIED, cells * cells, 2))
+    tried = (number.reshape(-1, 2) + inside) / max(cells, 1)
+    height, slope = _ground_at(heights, side_m, tried)
+    best = slope.argmin(axis=0), np.arange(cells * cells)
+    share, height = tried[best], height[best]
+    places = np.column_stack([(share - 0.5) * side_m, height])
+    fits = slope[best] <= _STEEPEST
+    fits &= np.hypot(*places.T[:2]) > _GLADE_M
+    fits &= np.abs(places[:, :2]).max(axis=1) < side_m / 2 - _EDGE_M
+    if fits.sum() < count:
+        raise LidarpoolError(
+            f"The terrain has room for {fits.sum():,} trees, not {count:,}: make it larger, or "
+            "take fewer trees."
+        )
+    line = np.linspace(0, 1, cells) * side_m / _WOODS_M
+    density = np.exp(_DENSER * _noise(line, line, rng)).reshape(-1) * fits
+    chosen = rng.choice(len(places), count, replace=False, p=density / density.sum())
+    # Conifers are higher up.
+    conifer = rng.random(count) < height[chosen] / heights.max()
+    kinds = np.array([species.conifer for species in SPECIES])
+    kind = np.where(
+        conifer, rng.choice(np.flatnonzero(kinds), count), rng.choice(np.flatnonzero(~kinds), count)
+    )
+    turn, scale = rng.uniform(0, 2 * np.pi, count), rng.uniform(*SCALES, count)
+    return placed(all_trees(seed, _ROOT_M), kind, places[chosen], turn, scale)
+
+
+def _ground_at(heights: Float, side_m: float, share: Float) -> tuple[Float, Float]:
+    """Heights and slopes (rise over run) of the triangles at shares (..., 2) of the sides."""
+    size = np.array(heights.shape) - 1
+    at = share * size
+    i, j = np.moveaxis(np.minimum(at.astype(np.int64), size - 1), -1, 0)
+    u, v = at[..., 0] - i, at[..., 1] - j
+    low, high = heights[i, j], heights[i + 1, j + 1]
+    corner = np.where(u >= v, heights[i + 1, j], heights[i, j + 1])
+    along_u = np.where(u >= v, corner - low, high - corner)
+    along_v = np.where(u >= v, high - corner, corner - low)
+    slope = np.hypot(along_u * size[0], along_v * size[1]) / side_m
+    return low + u * along_u + v * along_v, slope
 
 
 def grid_faces(columns: int, rows: int) -> NDArray[np.int64]:
