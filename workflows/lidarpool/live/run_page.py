@@ -54,9 +54,10 @@ class LiveRun(Page):
         self._job = job
         self.stopped = threading.Event()  # by a user of the page; --resume continues
         survey, scene = job.survey, job.scene
-        self._drawn = Drawn.of(scene)
+        ways = sensor_ways(survey)
+        self._drawn = Drawn.of(scene, near=[way.positions for way in ways])
         pictured = Pictured(
-            self._drawn.scene, sensor_ways(survey), np.zeros(0, np.int64),
+            self._drawn.scene, ways, np.zeros(0, np.int64),
             np.zeros((0, 2, 3), np.float32), job.planning, None, (), survey.duration_ns, (),
             MaterialTable.of(survey.materials, scene.all_names).reflectance,
         )  # fmt: skip

@@ -24,6 +24,7 @@ _MOST = 0.5  # share of the scene's ground from which all of it is shown
 
 _ROOFED = 0.7  # share of steep rays from a sensor that hit the scene if there is a roof
 _STEEP_DEG, _RAYS = 60.0, 64
+_ROUGH = 0.5  # spread of what is above a sensor over its height there: more is a tree's crown
 _TOUCHES = 1e-3  # of the scene's diagonal: a sensor on a surface does not stand under it
 _PLACES = 8  # that are asked
 
@@ -57,12 +58,23 @@ def floor_and_cut(
     rays = spiral(_RAYS, np.sin(np.radians(_STEEP_DEG)))
     near = _TOUCHES * float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
     found = caster.cast(np.repeat(some, _RAYS, axis=0), np.tile(rays, (len(some), 1)), t_min=near)
-    heights = (some[:, 2, None] + found.distance.reshape(-1, _RAYS) * rays[:, 2]).ravel()
-    met = np.isfinite(heights)
-    cut = None
-    if met.mean() >= _ROOFED:
+    above = found.distance.reshape(-1, _RAYS) * rays[:, 2]
+    met, cut = np.isfinite(above), None
+    if (
+        met.mean() >= _ROOFED
+        and np.median([_rough(a[m]) for a, m in zip(above, met, strict=True)]) <= _ROUGH
+    ):
+        heights = some[:, 2, None] + above
         cut = float(places[:, 2].max() + np.median(heights[met])) / 2
     return (float(floor.min()) if np.isfinite(floor).all() else None), cut
+
+
+def _rough(heights: Floats) -> float:
+    """Spread of the middle half of heights (n,), in their median; of none it is 0."""
+    if not len(heights):
+        return 0.0
+    low, middle, high = np.percentile(heights, [25, 50, 75])
+    return float((high - low) / middle)
 
 
 @dataclass(frozen=True, eq=False)

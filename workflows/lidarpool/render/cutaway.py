@@ -47,7 +47,11 @@ class Cutaway:
         core[:, 1, :2] -= 0.06 * width[:, :2]
         # The roof and things under it: all above the middle between sensors and top.
         core[:, 1, 2] = (core[:, 1, 2] + sensors[:, 2].max()) / 2
-        return cls(surface, sensors, eye, inside.mean(axis=0) >= 0.5, core)
+        # Hills are no walls: what only faces up, from below the sensors, is ground.
+        facing = np.full(len(core), np.inf)
+        np.minimum.at(facing, surface.scene.face_object, surface.face_normals[:, 2])
+        ground = (facing > 0) & (core[:, 0, 2] < sensors[:, 2].min())
+        return cls(surface, sensors, eye, (inside.mean(axis=0) >= 0.5) & ~ground, core)
 
     def removes(self, points: Floats, triangle: Ints) -> Bools:
         """Whether hits at points (n, 3) on triangles (n,) are removed."""

@@ -76,10 +76,11 @@ class Pictured:
         """Return what the pictures of a result show."""
         scene, survey = result.scene, result.survey
         actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
-        drawn = Drawn.of(scene)
+        ways = sensor_ways(survey)
+        drawn = Drawn.of(scene, near=[way.positions for way in ways])
         return cls(
             replace(drawn.scene, actors=actors),
-            sensor_ways(survey),
+            ways,
             drawn.hits(result.hit_counts),
             result.sample_rays,
             result.planning,

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from .instances import Part
+from .instances import Instances, Part
 from .mesh import stacked, triangle_areas
 from .scene import Scene
 
 DRAWN_TRIANGLES = 2_000_000  # of instances; of more, each gets its share of fewer
 PART_LEAST = 32  # triangles of a simplified part
+_PLACES = 200  # to which distances are measured
 
 
 @dataclass(frozen=True, eq=False)
@@ -28,20 +30,26 @@ class Drawn:
     same: bool = False
 
     @classmethod
-    def of(cls, scene: Scene, most: int = DRAWN_TRIANGLES) -> Drawn:
-        """Copy all instances to their places, with at most about so many triangles."""
+    def of(
+        cls, scene: Scene, most: int = DRAWN_TRIANGLES, near: Sequence[NDArray[np.float64]] = ()
+    ) -> Drawn:
+        """Copy all instances to their places, with at most about so many triangles.
+
+        Those close to places `near`, (k, 3) each, local coordinates, have more of them.
+        """
         faces = len(scene.faces)
         if (shared := scene.instances) is None:
             return cls(scene, np.arange(faces), same=True)
-        share = min(1.0, most / shared.triangles)
+        shares = _shares(shared, most, near)
         meshes = [(scene.vertices, scene.faces)]
         owners, counters = [scene.face_object], [np.arange(faces)]
-        for number, part in enumerate(shared.parts):
+        for number, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
+            part = shared.parts[number]
             vertices, own = part.vertices, part.faces
             size = max(PART_LEAST, int(len(own) * share))
             if size < len(own):
                 vertices, own = _fewer(part, size)
-            for row in np.flatnonzero(shared.part == number):
+            for row in np.flatnonzero((shared.part == number) & (shares == share)):
                 matrix = shared.transforms[row]
                 mirrored = np.linalg.det(matrix[:, :3]) < 0
                 meshes.append(
@@ -62,6 +70,31 @@ class Drawn:
         share = area / np.bincount(self.counter, area, len(counts))[self.counter]
         moving = sum(len(actor.mesh.faces) for actor in self.scene.actors)
         return np.append(counts[self.counter] * share, counts[len(counts) - moving :])
+
+
+def _shares(
+    shared: Instances, most: int, near: Sequence[NDArray[np.float64]]
+) -> NDArray[np.float64]:
+    """Share of its triangles that each instance has in a drawing, (n,).
+
+    Half of all are shared evenly, the others by the square of the distance to the nearest place:
+    then all have about one size in a picture taken from there.
+    """
+    even = min(1.0, most / shared.triangles)
+    if even == 1 or not len(near):
+        return np.full(len(shared), even)
+    places, middles = np.concatenate(near), shared.bounds.mean(axis=1)
+    distance = np.full(len(shared), np.inf)
+    for place in places[:: len(places) // _PLACES + 1]:
+        np.minimum(distance, np.linalg.norm(middles - place, axis=1), out=distance)
+    distance += 1e-3
+    full = distance.max()  # up to this distance they have all
+    while True:
+        # In few steps, because each is another mesh.
+        shares = np.maximum(4.0 ** np.floor(np.log2(np.minimum(full / distance, 1))), even / 2)
+        if shares @ shared.sizes <= most:
+            return shares
+        full *= 0.9
 
 
 def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
