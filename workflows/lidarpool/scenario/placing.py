@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -13,11 +14,16 @@ from ..base.words import counted
 from ..scene.drawn import Drawn
 from ..scene.floor import room_at
 from ..scene.scene import Scene
-from ..scene.surroundings import Surroundings, Views, is_open
+from ..scene.surroundings import Surroundings, Views, in_the_way, is_open, reaching
 from ..sensor import Mounted, Pose
+
+Real = NDArray[np.float64]
 
 # Heights above a floor; and the least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
+
+# Distances from the middle that are tried in turn if something is in the way there.
+_ASIDE_M = (2.0, 4.0, 8.0)
 
 # Poses around an object: azimuths, which see two sides of a box each; degrees above its middle; and
 # distance from its middle, in its diagonals, the least and the most.
@@ -42,24 +48,21 @@ class Placing:
 def place(scene: Scene, carried: Mounted) -> Placing:
     """Choose poses in a scene from mesh files.
 
-    In a room or a landscape they are in the middle, 1, 2 and 3 m above the floor or ground, or at
-    a quarter, half and three quarters of the height of a lower room. Around an object they are on
-    four sides and above it.
+    In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
+    2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
+    a lower room. Around an object they are on four sides and above it.
     """
     scene = Drawn.of(scene).scene
     low, high = scene.bounds + scene.origin
-    x, y = (low[:2] + high[:2]) / 2
-    floor, ceiling = room_at(scene, x, y)
-    heights = [*_HEIGHTS_M]
-    if floor + heights[-1] > ceiling - _BELOW_M:
-        heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
-    standing = tuple(Pose((float(x), float(y), float(floor + height))) for height in heights)
+    middle = (low + high) / 2
+    standing = _standing(scene, middle)
     looker = _looker(scene)
-    if looker is None:
-        return Placing(standing)
-    seen = looker.views([np.subtract(pose.position, scene.origin) for pose in standing])
-    if not looker.is_object(seen):
-        return Placing(standing, _inside(seen, scene, carried))
+    if looker is None or not looker.is_object(looker.views(_local(standing, scene))):
+        if in_the_way(scene, _local(standing, scene)):
+            standing = _aside(scene, middle) or standing
+        if looker is None:
+            return Placing(standing)
+        return Placing(standing, _inside(looker.views(_local(standing, scene)), scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
     sides = " x ".join(f"{side:,.3g}" for side in high - low)
@@ -68,6 +71,41 @@ def place(scene: Scene, carried: Mounted) -> Placing:
         f"{counted(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
     )
     return Placing(poses, note, around=True)
+
+
+def _standing(scene: Scene, at: Real) -> tuple[Pose, ...]:
+    """Poses above the floor at a place (3,), of which x and y count, in world coordinates."""
+    x, y, _ = at.tolist()
+    floor, ceiling = room_at(scene, x, y)
+    heights = [*_HEIGHTS_M]
+    if floor + heights[-1] > ceiling - _BELOW_M:
+        heights = [(ceiling - floor) * share for share in (0.25, 0.5, 0.75)]
+    return tuple(Pose((x, y, float(floor + height))) for height in heights)
+
+
+def _aside(scene: Scene, middle: Real) -> tuple[Pose, ...]:
+    """Poses beside the middle (3,) of a scene where nothing is in the way; none if there are none.
+
+    World coordinates.
+    """
+    half = np.ptp(scene.bounds, axis=0) / 2
+    reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
+    local = middle - scene.origin
+    near = reaching(scene, local - reach, local + reach)
+    around = replace(scene, faces=scene.faces[near], face_object=scene.face_object[near])
+    for far in _ASIDE_M:
+        for angle in np.arange(8) * np.pi / 4:
+            step = far * np.array([np.cos(angle), np.sin(angle), 0.0])
+            if (np.abs(step[:2]) < half[:2]).all():
+                poses = _standing(around, middle + step)
+                if not in_the_way(around, _local(poses, scene)):
+                    return poses
+    return ()
+
+
+def _local(poses: Sequence[Pose], scene: Scene) -> Real:
+    """Positions in a scene's coordinates, (k, 3)."""
+    return np.array([pose.position for pose in poses]) - scene.origin
 
 
 def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:

@@ -16,6 +16,7 @@ Real = NDArray[np.float64]
 
 RAYS = 1000  # from each position, and from outside
 HAND_M = 0.1  # surfaces nearer than this are in the way
+CLEAR_M = 0.5  # around a sensor in a place
 BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 
 # Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
@@ -23,6 +24,26 @@ BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 _GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 0.3
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _WIDE_M, _HIGH_M = 2.0, 15.0
+
+
+def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
+    """Whether there is a surface within `CLEAR_M` of one of some local positions (k, 3)."""
+    at = np.asarray(positions, np.float64).reshape(-1, 3)
+    near = reaching(scene, at.min(axis=0) - CLEAR_M, at.max(axis=0) + CLEAR_M)
+    if not near.any():
+        return False
+    caster = RayCaster(scene.vertices, scene.faces[near], "numpy")
+    around = np.tile(directions_around(RAYS), (len(at), 1))
+    return bool(caster.cast(np.repeat(at, RAYS, axis=0), around, t_max=CLEAR_M).hit.any())
+
+
+def reaching(scene: Scene, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
+    """Which triangles may reach into a box, local coordinates: (f,)."""
+    found = np.ones(len(scene.faces), np.bool_)
+    for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high), strict=True)):
+        ends = scene.vertices[:, axis][scene.faces]
+        found &= (ends.max(axis=1) > least) & (ends.min(axis=1) < most)
+    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +102,10 @@ class Surroundings:
         if below < _GROUND and above < _GROUND:
             return True
         outside = self.outside()
-        if np.mean(outside.back[outside.hit]) > 1 - _CLOSED:
-            return False  # a terrain from below, or the walls of a room
+        back = np.mean(outside.back[outside.hit])
+        if back > 1 - _CLOSED:
+            # A terrain from below, or the walls of a room. Of leaves, half are seen from behind.
+            return bool(back < _CLOSED and not is_open(self._scene) and not _has_floor(seen))
         if np.mean(np.isfinite(seen.distance)) < _ENCLOSED:
             ground = np.mean((seen.hit & ~seen.back)[down]) >= _GROUND
             # Of a machine with openings there is something above the sensor, too.
