@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.words import counted
 from ..scene.drawn import Drawn
-from ..scene.floor import room_at
+from ..scene.floor import reaching, room_at
 from ..scene.scene import Scene
-from ..scene.surroundings import Surroundings, Views, in_the_way, is_open, reaching
+from ..scene.surroundings import Surroundings, Views, in_the_way, is_open
 from ..sensor import Mounted, Pose
 
 Real = NDArray[np.float64]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from .scene import Scene
 
@@ -35,9 +35,18 @@ def heights_at(scene: Scene, x: float, y: float) -> Float:
     return heights + scene.origin[2]
 
 
+def reaching(scene: Scene, low: ArrayLike, high: ArrayLike) -> NDArray[np.intp]:
+    """Triangles that may reach into a box, or a rectangle seen from above, local: (k,)."""
+    found = np.arange(len(scene.faces))
+    for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high), strict=True)):
+        ends = scene.vertices[:, axis][scene.faces[found]]
+        found = found[(ends.max(axis=1) >= least) & (ends.min(axis=1) <= most)]
+    return found
+
+
 def _crossings(scene: Scene, at: Float) -> tuple[Float, NDArray[np.bool_]]:
     """Heights (k,) at which a vertical line crosses triangles, and which of them face up."""
-    a, b, c = np.moveaxis(scene.vertices[scene.faces], 1, 0)
+    a, b, c = np.moveaxis(scene.vertices[scene.faces[reaching(scene, at, at)]], 1, 0)
     # Twice the areas of the triangles that the place makes with each side, seen from above.
     parts = np.stack([_areas(p, q, at) for p, q in ((b, c), (c, a), (a, b))], axis=1)
     whole = parts.sum(axis=1)

@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from raybeam import RayCaster, available_backends
 
+from .floor import reaching
 from .scene import Scene
 
 Real = NDArray[np.float64]
@@ -22,6 +23,8 @@ BLOCK_FACES = 1 << 18  # triangles whose areas are added up at a time
 # Shares of rays. Of those that look down from 1, 2 and 3 m above a patch of ground, 0.4 meet it if
 # it is 5 m wide.
 _GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 0.3
+# Openness, from which a surface is not closed; and that of leaves at most.
+_OPEN, _LEAVES = 0.1, 0.4
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _WIDE_M, _HIGH_M = 2.0, 15.0
 
@@ -30,20 +33,11 @@ def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
     """Whether there is a surface within `CLEAR_M` of one of some local positions (k, 3)."""
     at = np.asarray(positions, np.float64).reshape(-1, 3)
     near = reaching(scene, at.min(axis=0) - CLEAR_M, at.max(axis=0) + CLEAR_M)
-    if not near.any():
+    if not len(near):
         return False
     caster = RayCaster(scene.vertices, scene.faces[near], "numpy")
     around = np.tile(directions_around(RAYS), (len(at), 1))
     return bool(caster.cast(np.repeat(at, RAYS, axis=0), around, t_max=CLEAR_M).hit.any())
-
-
-def reaching(scene: Scene, low: ArrayLike, high: ArrayLike) -> NDArray[np.bool_]:
-    """Which triangles may reach into a box, local coordinates: (f,)."""
-    found = np.ones(len(scene.faces), np.bool_)
-    for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high), strict=True)):
-        ends = scene.vertices[:, axis][scene.faces]
-        found &= (ends.max(axis=1) > least) & (ends.min(axis=1) < most)
-    return found
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,7 +99,9 @@ class Surroundings:
         back = np.mean(outside.back[outside.hit])
         if back > 1 - _CLOSED:
             # A terrain from below, or the walls of a room. Of leaves, half are seen from behind.
-            return bool(back < _CLOSED and not is_open(self._scene) and not _has_floor(seen))
+            return bool(
+                back < _CLOSED and _openness(self._scene) < _LEAVES and not _has_floor(seen)
+            )
         if np.mean(np.isfinite(seen.distance)) < _ENCLOSED:
             ground = np.mean((seen.hit & ~seen.back)[down]) >= _GROUND
             # Of a machine with openings there is something above the sensor, too.
@@ -147,9 +143,14 @@ def _has_floor(seen: Views) -> bool:
 
 
 def is_open(scene: Scene) -> bool:
-    """Whether a scene's surfaces are far from closed, as a terrain's; needs no rays.
+    """Whether a scene's surfaces are far from closed, as a terrain's; needs no rays."""
+    return _openness(scene) > _OPEN
 
-    The areas of a closed surface, as vectors along the normals, add up to nothing.
+
+def _openness(scene: Scene) -> float:
+    """Length of the sum of all areas as vectors along the normals, over the area: 0 to 1.
+
+    Those of a closed surface add up to nothing.
     """
     total, area = np.zeros(3), 0.0
     for begin in range(0, len(scene.faces), BLOCK_FACES):
@@ -157,7 +158,7 @@ def is_open(scene: Scene) -> bool:
         areas = np.cross(b - a, c - a)
         total += areas.sum(axis=0)
         area += float(np.linalg.norm(areas, axis=1).sum())
-    return bool(np.linalg.norm(total) > 0.1 * area)
+    return float(np.linalg.norm(total)) / max(area, 1e-300)
 
 
 def directions_around(count: int) -> Real:
