@@ -4,9 +4,14 @@ import numpy as np
 import pytest
 
 from lidarpool import Scene
-from lidarpool.render.closeup import Part, around_ways
+from lidarpool.render.closeup import Part, around_ways, floor_and_cut
+from lidarpool.render.cutaway import Cutaway
+from lidarpool.render.surface import Surface
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.plants import SPECIES, tree
+from lidarpool.scene.terrain import terrain
+from raybeam import RayCaster
 
 BOUNDS = np.array([[-200.0, -200, 0], [200, 200, 80]])
 
@@ -50,3 +55,20 @@ def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
 def test_where_nothing_stands_the_scene_stays_whole():
     whole = Part.whole(Scene.seed())
     assert whole.cut(np.array([[900.0, 900, 0], [990, 990, 9]])) is whole
+
+
+def test_a_roof_is_cut_open_and_a_crown_is_not():
+    places = np.array([[0.9, 0, 1], [-0.8, 0.5, 1], [0, 1.1, 1]])
+    for over, cut in ((box("hall", (20, 20, 7)), 4.0), (tree(SPECIES[0]), None)):
+        scene = Scene.from_meshes([over])
+        caster = RayCaster(scene.vertices, scene.faces, "numpy")
+        assert floor_and_cut(scene, caster, places)[1] == (cut and pytest.approx(cut))
+
+
+def test_hills_around_a_sensor_are_no_walls():
+    hills, hall = terrain(2_000, 0, 100.0), Scene.from_meshes([box("hall", (20, 20, 7))])
+    for scene, is_wall in ((hills, False), (hall, True)):
+        around = Cutaway.around(
+            Surface.of(scene, "numpy"), np.array([[0.0, 0, 2]]), np.array([90.0, 90, 90])
+        )
+        assert around.surrounds.tolist() == [is_wall]

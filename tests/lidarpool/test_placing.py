@@ -13,9 +13,10 @@ from lidarpool.scenario.placing import inside_note, place, poses_around
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
 from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.plants import SPECIES, tree
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.surroundings import Surroundings, is_open
+from lidarpool.scene.surroundings import Surroundings, in_the_way, is_open
 from lidarpool.scene.terrain import terrain
 from lidarpool.sensor import Mounted, Sensor, Survey
 from lidarpool.sensor.models import load_sensor
@@ -133,6 +134,25 @@ def test_in_a_place_the_sensor_stands_in_the_middle(name):
     middle = (scene.bounds + scene.origin).mean(axis=0)
     assert all(pose.position[:2] == pytest.approx(middle[:2]) for pose in placed.poses)
     assert ("only the backs" in placed.note) == (name == "box hall")
+
+
+@pytest.mark.parametrize("species", SPECIES, ids=lambda species: species.name)
+def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
+    alone = tree(species)
+    assert place(Scene.from_meshes([alone]), GRID).around
+    corners = np.array([[-20.0, -20, 0], [20, -20, 0], [20, 20, 0], [-20, 20, 0]])
+    lawn = Mesh("lawn", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    for far in (0.0, 4_000_000.0):
+        meshes = [mesh.moved(mesh.name, np.eye(3), np.full(3, far)) for mesh in (lawn, alone)]
+        scene = Scene.from_meshes(meshes)
+        placed = place(scene, GRID)
+        at = np.array([pose.position for pose in placed.poses]) - scene.origin
+        assert not placed.around and not placed.note
+        assert not in_the_way(scene, at)
+        assert 1.9 < np.linalg.norm(at[0, :2] + scene.origin[:2] - far) < 8.1
+        assert at[:, 2] + scene.origin[2] - far == pytest.approx([1, 2, 3])
+    middle = np.array([[0, 0, 1.0]]) + far - scene.origin
+    assert in_the_way(scene, middle)
 
 
 def test_open_surfaces_are_known_without_rays():

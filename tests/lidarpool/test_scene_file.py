@@ -72,6 +72,14 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
             ["terrain", "out.ply", "--triangles", "800", "--side", "50"],
             r"800 triangles, 1 object, 50 x 50 x 8 m: out.ply\n",
         ),
+        (
+            ["city", "out.glb", "--triangles", "20000", "--trees", "40", "--cars", "20"],
+            r"\d+,\d+ triangles, \d+ objects, \d+ x \d+ x \d+ m: out.glb\n",
+        ),
+        (
+            ["terrain", "out.glb", "--triangles", "800", "--side", "100", "--trees", "30"],
+            r"\d+,\d+ triangles, 31 objects, 100 x 100 x \d+ m: out.glb\n",
+        ),
     ],
 )
 def test_commands(tmp_path, monkeypatch, arguments, words):
@@ -80,3 +88,11 @@ def test_commands(tmp_path, monkeypatch, arguments, words):
     assert done.exit_code == 0
     assert re.fullmatch(words, done.output)
     assert len(Scene.load(arguments[1]).faces) > 700
+
+
+def test_files_that_cannot_share_meshes_do_not_hold_a_forest(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["terrain", "out.obj", "--triangles", "800", "--side", "1000", "--trees", "5000"]
+    with pytest.raises(LidarpoolError, match=r"out.obj would hold 4\d,\d+,\d+ triangles, because"):
+        CliRunner().invoke(command, arguments, catch_exceptions=False)
+    assert not list(tmp_path.iterdir())

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpool import LidarpoolError
+from lidarpool.scene.plants import SPECIES
 from lidarpool.scene.terrain import terrain
 from raybeam import RayCaster
 
@@ -33,9 +34,44 @@ def test_it_is_a_height_field_without_holes():
     assert (np.cross(b - a, c - a)[:, 2] > 0).all()
 
 
+def test_trees_stand_on_ground_that_is_not_steep():
+    plain, scene = terrain(80_000, 1, 200.0), terrain(80_000, 1, 200.0, trees=400)
+    assert scene.vertices.tobytes() == plain.vertices.tobytes()
+    kinds = {name.partition(".")[0] for name in scene.names[1:]}
+    assert len(scene.names) == 401 and kinds == {species.name for species in SPECIES}
+    roots = scene.instances.transforms[:, :, 3]
+    caster = RayCaster(plain.vertices, plain.faces, "numpy")
+    above = np.column_stack([roots[:, :2], np.full(400, 500)])
+    hits = caster.cast(above, [[0, 0, -1]] * 400)
+    np.testing.assert_allclose(500 - hits.distance, roots[:, 2], atol=1e-6)
+    a, b, c = plain.vertices[plain.faces[hits.triangle]].transpose(1, 0, 2)
+    normals = np.cross(b - a, c - a)
+    assert (normals[:, 2] / np.linalg.norm(normals, axis=1) > np.cos(np.radians(40.1))).all()
+    apart = np.linalg.norm(roots[:, None, :2] - roots[None, :, :2], axis=2)
+    assert apart[~np.eye(400, dtype=bool)].min() > 2.9
+    assert np.hypot(*roots[:, :2].T).min() > 12
+    # Trunks go on below the ground, and nothing stands over the edge.
+    assert (scene.object_bounds[1:, 0, 2] < roots[:, 2]).all()
+    again = terrain(80_000, 1, 200.0, trees=400)
+    assert again.instances.transforms.tobytes() == scene.instances.transforms.tobytes()
+
+
+@pytest.mark.parametrize(("side", "room"), [(30.0, "0"), (100.0, r"\d+")])
+def test_more_trees_than_fit(side, room):
+    with pytest.raises(LidarpoolError, match=rf"has room for {room} trees, not 900: make it"):
+        terrain(20_000, 0, side, trees=900)
+
+
 @pytest.mark.parametrize(
     "wrong",
-    [{"triangles": 1}, {"triangles": 10**9}, {"seed": -1}, {"side_m": 0.0}, {"side_m": 1e8}],
+    [
+        {"triangles": 1},
+        {"triangles": 10**9},
+        {"seed": -1},
+        {"side_m": 0.0},
+        {"side_m": 1e8},
+        {"trees": -1},
+    ],
 )
 def test_out_of_range(wrong):
     with pytest.raises(LidarpoolError):

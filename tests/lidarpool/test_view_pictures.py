@@ -173,6 +173,16 @@ def test_many_objects_fit_the_legend():
     assert max(map(len, names)) <= 18
 
 
+def test_objects_of_one_name_have_one_colour_and_one_entry():
+    names = ["Wall", "Oak", "Post.1", "Oak.2", "Oak.3", "Post.2"]
+    scene = Scene.from_meshes([Mesh(name, *solid(k)) for k, name in enumerate(names)])
+    page = draw_scene(take_shot(scene, [], size=SIZE, backend="numpy"), 9)
+    words = [text.get_text() for text in page.figure.legends[0].get_texts()]
+    assert words == ["Oak × 3", "Wall", "Post.1", "Post.2", "Sensor"]
+    colours = [line.get_color() for line in page.figure.legends[0].get_lines()]
+    assert len({tuple(colour) for colour in colours}) == 5
+
+
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
 def test_names_from_files_are_words_and_nothing_else(name):
     scene = Scene.from_meshes([Mesh(name, *solid(0)), Mesh("plain", *solid(1))])

@@ -15,6 +15,9 @@ if TYPE_CHECKING:
     from ..scene.scene import Scene
 
 
+MOST_COPIED = 20_000_000  # triangles of files that cannot share them
+
+
 @click.group(name="scene")
 def scene() -> None:
     """Generate scenes as mesh files."""
@@ -76,6 +79,11 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     if out.exists() and not overwrite:
         raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
     made = make()
+    if made.instances and out.suffix.lower() != ".glb" and made.triangles > MOST_COPIED:
+        raise LidarpoolError(
+            f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "
+            "once for many places: write one."
+        )
     write_scene(out, made)
     low, high = made.bounds
     click.echo(

@@ -52,14 +52,14 @@ def place(scene: Scene, carried: Mounted) -> Placing:
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
     a lower room. Around an object they are on four sides and above it.
     """
-    scene = Drawn.of(scene).scene
+    drawn = Drawn.of(scene).scene
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
-    standing = _standing(scene, middle)
-    looker = _looker(scene)
+    standing = _standing(drawn, middle)
+    looker = _looker(drawn)
     if looker is None or not looker.is_object(looker.views(_local(standing, scene))):
-        if in_the_way(scene, _local(standing, scene)):
-            standing = _aside(scene, middle) or standing
+        if in_the_way(drawn, _local(standing, scene)):
+            standing = _aside(drawn, middle) or standing
         if looker is None:
             return Placing(standing)
         return Placing(standing, _inside(looker.views(_local(standing, scene)), scene, carried))

@@ -43,6 +43,7 @@ class Drawn:
         shares = _shares(shared, most, near)
         meshes = [(scene.vertices, scene.faces)]
         owners, counters = [scene.face_object], [np.arange(faces)]
+        mirrored = np.linalg.det(shared.transforms[:, :, :3]) < 0
         for number, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
             part = shared.parts[number]
             vertices, own = part.vertices, part.faces
@@ -51,10 +52,8 @@ class Drawn:
                 vertices, own = _fewer(part, size)
             for row in np.flatnonzero((shared.part == number) & (shares == share)):
                 matrix = shared.transforms[row]
-                mirrored = np.linalg.det(matrix[:, :3]) < 0
-                meshes.append(
-                    (vertices @ matrix[:, :3].T + matrix[:, 3], own[:, ::-1] if mirrored else own)
-                )
+                corners = own[:, ::-1] if mirrored[row] else own
+                meshes.append((vertices @ matrix[:, :3].T + matrix[:, 3], corners))
                 owners.append(np.full(len(own), shared.owner[row]))
                 counters.append(np.full(len(own), faces + row))
         vertices, triangles = stacked(meshes)
@@ -81,9 +80,10 @@ def _shares(
     then all have about one size in a picture taken from there.
     """
     even = min(1.0, most / shared.triangles)
-    if even == 1 or not len(near):
+    places = np.concatenate([np.empty((0, 3)), *near])
+    if even == 1 or not len(places):
         return np.full(len(shared), even)
-    places, middles = np.concatenate(near), shared.bounds.mean(axis=1)
+    middles = shared.bounds.mean(axis=1)
     distance = np.full(len(shared), np.inf)
     for place in places[:: len(places) // _PLACES + 1]:
         np.minimum(distance, np.linalg.norm(middles - place, axis=1), out=distance)
@@ -100,12 +100,13 @@ def _shares(
 def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
     """Vertices and at most so many faces that stand for a part.
 
-    Of what falls apart when its vertices are merged, as a tree's leaves do, the largest triangles
-    stay, as those of trunk and boughs are, and a choice of the others, made larger for all of them
-    (Cook et al., 2007); long ones less, which would stick out.
+    Of many small pieces, as a tree's leaves are, merged vertices would leave little. There the
+    largest triangles stay, as of trunk and boughs, and a choice of the others, made larger for all
+    of them (Cook et al., 2007); long ones less, which would stick out.
     """
+    pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)  # half as many in one surface
     vertices, faces, kept, _ = _merged(part.vertices, part.faces, most)
-    if len(kept) >= most // 4:
+    if not pieces and len(kept) >= most // 4:
         return vertices, faces[kept]
     corners = part.vertices[part.faces]
     order = np.argsort(-triangle_areas(corners), kind="stable")

@@ -58,7 +58,7 @@ SPECIES = (
         rise_deg=-20, branches=46, twigs=8, leaves=14, leaf_m=(0.22, 0.15), hang=0.9,
     ),
     Species(
-        "Spruce", 15, 0.22, bare=0.08, crown=(3.1, 2.5, 1.8, 1.1, 0.15), angle_deg=(98, 60),
+        "Spruce", 15, 0.22, bare=0.13, crown=(3.1, 2.5, 1.8, 1.1, 0.15), angle_deg=(94, 60),
         rise_deg=14, branches=84, twigs=8, leaves=9, leaf_m=(0.36, 0.15), hang=0.35, conifer=True,
     ),
     Species(
@@ -78,7 +78,7 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> Mesh:
     seed
         The same seed gives the same tree.
     root_m
-        How far the trunk goes on below the ground, metres; on slopes some more.
+        How far the trunk goes on below the ground, metres, above 0; for slopes some more.
 
     Examples
     --------
