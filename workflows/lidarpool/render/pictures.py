@@ -42,7 +42,7 @@ def draw_scene(shot: Shot, triangles: int) -> Page:
     page.show(shot, shot.paint(colours[scene.face_object]))
     there = np.unique(scene.face_object)  # objects that are drawn
     counts = np.bincount(kinds[there], minlength=len(words))
-    entries = {}  # {kind: name and colour}
+    entries: dict[int, tuple[str, Floats]] = {}  # {kind: name and colour}
     # Actors are first in the legend, then the many of a kind.
     actors = there >= len(scene.names) - shot.actors
     for k in there[np.lexsort((counts[kinds[there]] == 1, ~actors))].tolist():

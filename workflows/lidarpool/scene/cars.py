@@ -97,16 +97,15 @@ def _body(model: Model) -> tuple[Float, NDArray[np.int64]]:
         right = [(0.9 * half, low), (half, 0.55 * belt), (0.97 * half, belt), (top, roof)]
         rings.append([(x, -y, z) for y, z in right] + [(x, y, z) for y, z in right[::-1]])
     ring = np.array(rings)
-    quads, panes = [], []
+    quads: list[Float] = []
     for k in range(len(ring) - 1):
         for side in range(8):
             after = (side + 1) % 8
-            quad = ring[k, after], ring[k + 1, after], ring[k + 1, side], ring[k, side]
+            quad = ring[[k, k + 1, k + 1, k], [after, after, side, side]]
             # 2 and 4 are beside the belt line, 3 is the roof, or a windscreen if it slopes.
             slopes = abs(ring[k, 3, 2] - ring[k + 1, 3, 2]) > 0.25
             glass = k in model.glazed and (side in (2, 4) or (side == 3 and slopes))
-            (panes if glass else quads).append(quad)
-    quads += [part for pane in panes for part in _window(np.array(pane))]
+            quads += _window(quad) if glass else [quad]
     for end, turn in ((ring[0], -1), (ring[-1], 1)):
         quads += [end[[a, b, 7 - b, 7 - a][::turn]] for a, b in ((0, 1), (1, 2), (2, 3))]
     corners = np.array(quads)

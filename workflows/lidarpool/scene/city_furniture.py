@@ -21,7 +21,7 @@ _CAR_SHIFT_M = 0.5  # at most, either way
 _RIGHT_WAY = 0.9  # share of cars with the kerb at their right
 _STREET_REACH_M = 3.5  # crowns at streets leave the middle of the carriageway free
 _YARD_M, _YARD_MIDDLE = 6.0, 0.4  # one tree at most in the middle part of a cell
-_STREETS_FIRST = 3.0  # how much rather a place at a street is taken
+_STREETS_FIRST = 4.0  # how much rather a place at a street is taken
 _LAMP_M = 1.5  # from a trunk
 _ROOT_M = 0.1
 
@@ -64,7 +64,7 @@ def street_trees(
         rooms.append(room[fits])
         streets.append(at_street[fits])
     xy, room, at_street = (np.concatenate(parts) for parts in (places, rooms, streets))
-    chosen = _choose(1.0 + _STREETS_FIRST * at_street, count, "trees", rng)
+    chosen = _choose(np.where(at_street, _STREETS_FIRST, 1.0), count, "trees", rng)
     fitting = np.where(at_street[chosen, None], least, SCALES[0] * reach) <= room[chosen, None]
     kind = (fitting * rng.random(fitting.shape)).argmax(axis=1)
     most = np.minimum(room[chosen] / reach[kind], SCALES[1])
