@@ -312,7 +312,9 @@ class Scene:
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
-        used = self.vertices[np.unique(self.faces)]
+        there = np.zeros(len(self.vertices), np.bool_)
+        there[self.faces] = True
+        used = self.vertices[there]
         if self.instances:
             used = np.concatenate([used, self.instances.bounds.reshape(-1, 3)])
         return np.stack([used.min(axis=0), used.max(axis=0)])
