@@ -241,7 +241,7 @@ class _Reader:
         passing = np.flatnonzero(np.arange(256) / 255 * factor[3] >= cutoff)
         least = int(passing[0]) if len(passing) else 256
         texture = {} if info is None else self._part("textures", info["index"])
-        opacity = self._opacity(_image_of(texture)) if texture else None
+        opacity = None if info is None else self._opacity(_image_of(texture))
         if info is None or opacity is None or (mode == "BLEND" and opacity.max() < least):
             if least > 255 or opacity is not None:
                 self.notes.glass[self._material_name(number)] = None

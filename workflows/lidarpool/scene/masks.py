@@ -173,6 +173,7 @@ class MaskNotes:
     def __init__(self) -> None:
         self.unread: dict[str, str] = {}  # {material: why its triangles are solid}
         self.glass: dict[str, None] = {}  # in order
+        self.gone: list[str] = []  # files of materials that are not there
 
     def instead(self, material: str) -> _Instead:
         """Note errors within a `with` block; the triangles can be read all the same."""
@@ -181,6 +182,8 @@ class MaskNotes:
     def lines(self) -> list[str]:
         """Return notes, as clauses that follow the file's name."""
         out = []
+        if self.gone:
+            out.append(f"names materials in {_some(self.gone)}, which cannot be read: all is solid")
         if self.unread:
             shown = _some([f"{name} ({why})" for name, why in self.unread.items()])
             out.append(f"has masks that cannot be read, so that these materials are solid: {shown}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
 
@@ -92,9 +93,8 @@ class Materials:
     ) -> dict[bytes, ObjTexture]:
         """Masks of the used materials that have one, from files named by the lines `libraries`."""
         images: dict[bytes, dict[bytes, _Image]] = {}
-        for line in libraries:
-            for data in self._files(line):
-                images |= _read_mtl(data)
+        for data in self._files(libraries):
+            images |= _read_mtl(data)
         found: dict[bytes, ObjTexture] = {}
         for name in used:
             if name in images:
@@ -103,46 +103,51 @@ class Materials:
                         found[name] = texture
         return found
 
-    def _files(self, line: bytes) -> Iterator[bytes]:
-        """Content of the files that a line names: one, or several between spaces."""
-        names = as_text(line.strip())
-        with self._notes.instead(names):
-            whole = self._file(names)
-            for one in [names] if whole else names.split():
-                path = self._file(one)
-                if path is None or path.stat().st_size > _MOST_BYTES:
-                    raise MaskError("the file of materials is not there, or too large")
-                yield path.read_bytes()
+    def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
+        """Content of the files that lines name: each one, or several between spaces."""
+        read: set[Path | None] = set()
+        for names in map(as_text, libraries):
+            for name in [names] if self._file(names) else names.split():
+                path = self._file(name)
+                if path not in read:
+                    read.add(path)
+                    try:
+                        yield self._content(path)
+                    except OSError:
+                        self._notes.gone.append(name)
+
+    def _content(self, path: Path | None) -> bytes:
+        if path is None or path.stat().st_size > _MOST_BYTES:
+            raise FileNotFoundError
+        return path.read_bytes()
 
     def _file(self, name: str) -> Path | None:
         """File of a name, or of its last part if it leads elsewhere, to another machine say."""
         paths = PureWindowsPath(name)
         for one in (name, paths.as_posix(), paths.name):
-            try:
+            with suppress(MeshFileError, OSError, ValueError, RuntimeError):
                 if one and (found := file_beside(self._mesh, [one])):
                     return found
-            except MeshFileError:
-                pass
         return None
 
     def _texture(self, name: str, images: dict[bytes, _Image]) -> ObjTexture | None:
-        colour, image = images.get(b"map_kd"), images.get(b"map_d") or images.get(b"map_kd")
-        assert image
+        colour = images.get(b"map_kd")
+        image = images.get(b"map_d", colour)
+        if image is None:
+            return None
         # Some programs name the same image twice: then its brightness is its colour's.
         grey = image is not colour and not (colour and colour.name == image.name)
         opacity = self._opacity((image.name, grey))
         if opacity is None:
             return None
-        mask = opacity >= HALF
+        base, gain = map(float, image.options.get(b"-mm", (0, 1)))
+        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
         if mask.all():
             return None
         if not mask.any():
             self._notes.glass[name] = None
             return None
-        if not np.array_equal(image.numbers(b"-mm", 0)[:2], [0, 0]):
-            base, gain = (float(word) for word in image.options[b"-mm"])
-            mask = base + gain * (opacity / 255) >= 0.5
-        clamped = [word.lower() for word in image.options.get(b"-clamp", [])] == [b"on"]
+        clamped = image.options.get(b"-clamp") == [b"on"]
         wrap: Wrap = "clamp" if clamped else "repeat"
         texture = Texture(mask, (wrap, wrap), self._allowance)
         return ObjTexture(texture, image.numbers(b"-s", 1), image.numbers(b"-o", 0))
