@@ -132,7 +132,7 @@ class Texture:
             If they are infinite, too large, or too far beyond a mask that does not repeat.
         """
         uv = np.array(uv, np.float64)
-        if not (np.abs(uv) < UV_MOST).all():
+        if not (np.abs(uv) < UV_MOST / 2).all():  # half, for what rounding adds
             raise MaskError("texture coordinates are infinite or too large")
         mask = self._mask
         for column, wrap in enumerate(self._wraps):
