@@ -108,6 +108,8 @@ def texel(u, v, mask=MASK):
 @pytest.mark.parametrize("kind", ["png", "webp"])
 def test_a_card_of_leaves_lets_through_what_it_should(tmp_path, backend, kind):
     header, body = card(image(kind=kind))
+    if kind == "webp":
+        header["textures"] = [{"extensions": {"EXT_texture_webp": {"source": 0}}}]
     scene = load(tmp_path / "m.glb", header, body)
     solid = load(tmp_path / "m.glb", header, body, opacity="ignore")
     check(scene, solid, texel, backend)
@@ -254,8 +256,8 @@ GLASS = "has transparent materials without holes, taken as solid: Leaf; transpar
         (lambda h: h["textures"][0].pop("source"), "in a format that cannot be read"),
         (lambda h: h["meshes"][0]["primitives"][0].update(material=9), "material 9 (it is broken)"),
         (lambda h: h["meshes"][0]["primitives"][0]["attributes"].pop("TEXCOORD_0"),
-         "Leaf (there are no texture coordinates)"),
-        (lambda h: h["accessors"][1].update(count=3), "Leaf (it is broken)"),
+         "Leaf (texture coordinates are missing)"),
+        (lambda h: h["accessors"][1].update(count=3), "coordinates are missing"),
         (lambda h: h["accessors"][1].update(type="VEC3"), "Leaf ("),
         (lambda h: h["materials"][0].update(alphaCutoff="half"), "Leaf (it is broken)"),
         (lambda h: h["materials"][0].update(name=["\x1b[31m"]), ""),
@@ -296,10 +298,22 @@ def test_an_image_beside_is_read_and_too_large_ones_are_not(tmp_path, monkeypatc
     assert not load(tmp_path / "m.glb", header, body).masked
 
 
+def test_materials_share_masks(tmp_path, monkeypatch):
+    header, body = card()
+    header["materials"] *= 50
+    header["meshes"][0]["primitives"] = [
+        header["meshes"][0]["primitives"][0] | {"material": i} for i in range(50)
+    ]
+    monkeypatch.setattr(allowance, "LEAST", 0)
+    monkeypatch.setattr(allowance, "TIMES", 3)
+    (mesh,) = load_meshes(write(tmp_path / "m.glb", glb(header, body)), up_axis="z")
+    assert len(mesh.cutouts) == 1 and len(mesh.faces) == 100
+
+
 def test_clamped_coordinates_far_away_take_no_memory(tmp_path, caplog):
     header, body = card(uv=UV * np.float32(1e8) - 1, sampler={"wrapS": 33071, "wrapT": 33071})
     assert not load(tmp_path / "m.glb", header, body).masked
-    assert "too large where it goes on beyond its edges" in caplog.text
+    assert "Leaf (its mask would be too large)" in caplog.text
 
 
 def test_draco(tmp_path):
@@ -375,9 +389,9 @@ def test_obj(tmp_path, backend, lines, face):
         ("map_d gone.png", "f 1/1 2/2 3/3", "wire (its image 'gone.png' is not there)"),
         ("map_d ../x.png", "f 1/1 2/2 3/3", "wire (its image '../x.png' is not there)"),
         ("map_d broken.png", "f 1/1 2/2 3/3", "wire (broken.png cannot be decoded)"),
-        ("map_d mask.png", "f 1 2 3", "wire (there are no texture coordinates)"),
-        ("map_d mask.png", "f 1/9 2/2 3/3", "wire (there are no texture coordinates)"),
-        ("map_d mask.png", f"f 1/{'9' * 30} 2/-9 3/x", "wire (there are no texture"),
+        ("map_d mask.png", "f 1 2 3", "wire (texture coordinates are missing)"),
+        ("map_d mask.png", "f 1/9 2/2 3/3", "wire (texture coordinates are missing)"),
+        ("map_d mask.png", f"f 1/{'9' * 30} 2/-9 3/x", "wire (texture coordinates are"),
         ("map_d mask.png", "vt nan 1\nf 1/5 2/2 3/3", "wire (texture coordinates are infinite"),
         ("map_d mask.png", "vt\nf 1/5 2/2 3/3", "wire (texture coordinates are infinite"),
         ("map_d -mm x y mask.png", "f 1/1 2/2 3/3", "wire (it is broken)"),

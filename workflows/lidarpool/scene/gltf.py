@@ -35,7 +35,7 @@ from .nodes import (
     joined,
     settled,
 )
-from .polygons import check_corners, fanned, unrolled
+from .polygons import fanned, unrolled
 
 # Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
@@ -134,6 +134,7 @@ class _Reader:
         self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
         self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
+        self._mask = remembered(self._read_mask)
         self._image_files: set[Path] = set()
         self.notes = MaskNotes()
 
@@ -212,8 +213,7 @@ class _Reader:
             if found is not None:
                 texture, info = found
                 uv = self._coordinates(info, primitive, mesh)
-                check_corners(piece.faces, min(len(piece.vertices), len(uv)))
-                return piece._replace(cutout=texture.cutout(uv[piece.faces]))
+                return piece._replace(cutout=texture.cutout(uv, piece.faces))
         return piece
 
     def _material_name(self, number: Any) -> str:
@@ -241,17 +241,24 @@ class _Reader:
         passing = np.flatnonzero(np.arange(256) / 255 * factor[3] >= cutoff)
         least = int(passing[0]) if len(passing) else 256
         texture = {} if info is None else self._part("textures", info["index"])
-        opacity = None if info is None else self._opacity(_image_of(texture))
+        image = -1 if info is None else _image_of(texture)
+        opacity = None if info is None else self._opacity(image)
         if info is None or opacity is None or (mode == "BLEND" and opacity.max() < least):
             if least > 255 or opacity is not None:
                 self.notes.glass[self._material_name(number)] = None
             return None
-        mask = opacity >= least
-        if mask.all():
+        if opacity.min() >= least:
             return None
         sampler = self._part("samplers", texture["sampler"]) if "sampler" in texture else {}
         along, across = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
-        return Texture(mask, (along, across), self._allowance), info
+        return self._mask((image, least, along, across)), info
+
+    def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
+        """Texture of an image, its least alpha that stops light, and how it goes on."""
+        image, least, along, across = key
+        opacity = self._opacity(image)
+        assert opacity is not None
+        return Texture(opacity >= least, (along, across), self._allowance)
 
     def _read_opacity(self, index: int) -> NDArray[np.uint8] | None:
         """Opacity of an image; None if it is opaque everywhere."""
@@ -277,7 +284,7 @@ class _Reader:
         moved = _extension(info, "KHR_texture_transform")
         name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
         if name not in primitive["attributes"]:
-            raise MaskError("there are no texture coordinates")
+            raise MaskError("texture coordinates are missing")
         accessor = primitive["attributes"][name]
         if mesh is None:
             uv = self._accessor(accessor)

@@ -20,7 +20,8 @@ from .mesh import UV_MOST, Cutout
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")  # Pillow has more, some run programs
 HALF = 128  # least 8-bit opacity that stops light, unless a file states another
-PIXEL_BYTES = 8  # of an image while it is decoded
+PIXEL_BYTES = 10  # of an image while it is decoded
+FACE_BYTES = 120  # of a triangle while its texture coordinates are made
 NAMED = 3  # materials that a note names
 
 Mask = NDArray[np.bool_]
@@ -96,7 +97,9 @@ def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np
         raise _TooLargeError
     allowance.take(pixels)
     if image.has_transparency_data:
-        alpha = np.asarray(image.convert("RGBA").getchannel("A"))
+        alpha = np.asarray(
+            (image if "A" in image.getbands() else image.convert("RGBA")).getchannel("A")
+        )
         if alpha.min() < 255:
             return alpha
     if not grey:
@@ -109,6 +112,8 @@ def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np
 class Texture:
     """A mask, and how it goes on beyond its edges, along u and along v.
 
+    Materials should share it, since every one takes memory.
+
     Raises
     ------
     MaskError
@@ -117,21 +122,28 @@ class Texture:
 
     def __init__(self, mask: Mask, wraps: tuple[Wrap, Wrap], allowance: Allowance) -> None:
         self._wraps, self._allowance = wraps, allowance
+        _take(allowance, mask.size)
         for axis, wrap in zip((1, 0), wraps, strict=True):
             if wrap == "mirror":  # repeats with its mirror image
                 _take(allowance, 2 * mask.size)
                 mask = np.concatenate([mask, np.flip(mask, axis)], axis)
         self._mask = mask
 
-    def cutout(self, uv: NDArray[Any]) -> Cutout:
-        """Cut it out of triangles with these texture coordinates (k, 3, 2), as in glTF.
+    def cutout(self, coordinates: NDArray[Any], corners: NDArray[np.int64]) -> Cutout:
+        """Cut it out of triangles, as in glTF.
+
+        `coordinates` are (c, 2), and `corners` (k, 3) which of them each triangle has.
 
         Raises
         ------
         MaskError
-            If they are infinite, too large, or too far beyond a mask that does not repeat.
+            If they are missing, infinite, too large, or too far beyond a mask that does not repeat.
         """
-        uv = np.array(uv, np.float64)
+        if not len(coordinates) or not 0 <= corners.min() <= corners.max() < len(coordinates):
+            raise MaskError("texture coordinates are missing")
+        if not self._allowance.fits(FACE_BYTES * len(corners)):
+            raise MaskError("there are too many triangles")
+        uv = coordinates[corners].astype(np.float64)
         if not (np.abs(uv) < UV_MOST / 2).all():  # half, for what rounding adds
             raise MaskError("texture coordinates are infinite or too large")
         mask = self._mask
@@ -163,7 +175,7 @@ class Texture:
 
 def _take(allowance: Allowance, count: int) -> None:
     if not allowance.fits(count):
-        raise MaskError("it would be too large where it goes on beyond its edges")
+        raise MaskError("its mask would be too large")
     allowance.take(count)
 
 

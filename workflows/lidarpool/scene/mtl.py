@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path, PureWindowsPath
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,6 +25,7 @@ _OPTIONS = {
     b"-imfchan": 1, b"-type": 1, b"-cc": 1, b"-o": 3, b"-s": 3, b"-t": 3,
 }  # fmt: skip
 _NUMBERS = (b"-o", b"-s", b"-t")
+_WITHOUT_ALPHA = (".jpg", ".jpeg")
 _MOST_BYTES = 1 << 26  # of a file of materials
 
 
@@ -65,16 +67,10 @@ class ObjTexture:
     scale: NDArray[np.float64]  # (2,)
     offset: NDArray[np.float64]
 
-    def cutout(self, vt: NDArray[np.float64]) -> Cutout:
-        """Cut it out of triangles with texture coordinates (k, 3, 2), whose v grows upwards.
-
-        Raises
-        ------
-        MaskError
-            As `Texture.cutout`.
-        """
-        u, v = np.moveaxis(vt * self.scale + self.offset, -1, 0)
-        return self.texture.cutout(np.stack([u, 1 - v], axis=-1))
+    def cutout(self, vt: NDArray[np.float64], corners: NDArray[np.int64]) -> Cutout:
+        """As `Texture.cutout`, but v of the coordinates (c, 2) grows upwards."""
+        u, v = (vt * self.scale + self.offset).T
+        return self.texture.cutout(np.column_stack([u, 1 - v]), corners)
 
 
 class Materials:
@@ -86,7 +82,7 @@ class Materials:
 
     def __init__(self, mesh: Path, size: int, notes: MaskNotes) -> None:
         self._mesh, self._notes, self._allowance = mesh, notes, Allowance(size, SMALLER)
-        self._opacity = remembered(self._read_opacity)
+        self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
 
     def textures(
         self, libraries: Sequence[bytes], used: Sequence[bytes]
@@ -135,22 +131,32 @@ class Materials:
         image = images.get(b"map_d", colour)
         if image is None:
             return None
+        if image is colour and image.name.lower().endswith(_WITHOUT_ALPHA):
+            return None
         # Some programs name the same image twice: then its brightness is its colour's.
         grey = image is not colour and not (colour and colour.name == image.name)
-        opacity = self._opacity((image.name, grey))
-        if opacity is None:
-            return None
         base, gain = map(float, image.options.get(b"-mm", (0, 1)))
-        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
-        if mask.all():
-            return None
-        if not mask.any():
+        clamped = [word.lower() for word in image.options.get(b"-clamp", [])] == [b"on"]
+        texture = self._mask((image.name, grey, base, gain, clamped))
+        if isinstance(texture, Texture):
+            return ObjTexture(texture, image.numbers(b"-s", 1), image.numbers(b"-o", 0))
+        if texture == "glass":
             self._notes.glass[name] = None
-            return None
-        clamped = image.options.get(b"-clamp") == [b"on"]
+        return None
+
+    def _read_mask(
+        self, key: tuple[str, bool, float, float, bool]
+    ) -> Texture | Literal["solid", "glass"]:
+        """Mask of an image, or what it makes of a material."""
+        name, grey, base, gain, clamped = key
+        opacity = self._opacity((name, grey))
+        if opacity is None:
+            return "solid"
+        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
+        if mask.all() or not mask.any():
+            return "solid" if mask.all() else "glass"
         wrap: Wrap = "clamp" if clamped else "repeat"
-        texture = Texture(mask, (wrap, wrap), self._allowance)
-        return ObjTexture(texture, image.numbers(b"-s", 1), image.numbers(b"-o", 0))
+        return Texture(mask, (wrap, wrap), self._allowance)
 
     def _read_opacity(self, key: tuple[str, bool]) -> NDArray[np.uint8] | None:
         name, grey = key

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.words import as_text
-from .masks import MaskError, MaskNotes
+from .masks import MaskNotes
 from .mesh import Cutout, Mesh
 from .mtl import Materials, ObjTexture
 from .nodes import Content, MeshFileError
@@ -63,6 +63,8 @@ def _mesh(name: str, vertices: Float, faces: Int, cutouts: tuple[Cutout, ...] = 
 
 
 # -- .obj ----------------------------------------------------------------------------------------
+
+_MOST = 1 << 62  # texture coordinates that a number may name
 
 
 @dataclass
@@ -134,13 +136,12 @@ def read_obj(data: bytes, path: Path, masks: bool = True) -> Content:
         for material, masked in part.masked.items():
             own, places = masked.triangles(vertices)
             cutout = None
-            with notes.instead(as_text(material)):
-                if len(places) and not 0 <= places.min() <= places.max() < len(uv):
-                    raise MaskError("there are no texture coordinates")
-                cutout = textures[material].cutout(uv[places])
+            if len(own):
+                with notes.instead(as_text(material)):
+                    cutout = textures[material].cutout(uv, places)
             if cutout is None:
                 faces.insert(0, own)
-            elif len(own):
+            else:
                 faces.append(own)
                 cutouts.append(cutout)
         meshes += _mesh(name, vertices, np.concatenate(faces), tuple(cutouts))
@@ -164,12 +165,12 @@ def _obj_coordinates(rest: bytes) -> list[float]:
 
 def _obj_places(rest: bytes, count: int) -> list[int]:
     """Texture coordinates of a face's corners, from 0, or below; `count` are known so far."""
-    out = []
-    for word in rest.split():
-        digits = (*word.split(b"/"), b"")[1]
-        number = int(digits) if re.fullmatch(rb"-?\d{1,18}", digits) else 0
-        out.append(number - 1 if number >= 0 else max(-1, count + number))
-    return out
+    words = [word.split(b"/") for word in rest.split()]
+    try:
+        numbers = [min(int(word[1]), _MOST) for word in words]
+    except (IndexError, ValueError):
+        return [-1] * len(words)
+    return [number - 1 if number >= 0 else max(-1, count + number) for number in numbers]
 
 
 def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
