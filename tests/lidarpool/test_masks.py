@@ -6,6 +6,7 @@ import logging
 
 import numpy as np
 import pytest
+import trimesh
 from PIL import Image
 from tests.lidarpool.meshes import write
 from tests.lidarpool.test_gltf import glb
@@ -247,6 +248,13 @@ GLASS = "has transparent materials without holes, taken as solid: Leaf; transpar
             ),
             GLASS,
         ),
+        (
+            lambda h: h["materials"][0].update(
+                alphaMode="OPAQUE",
+                extensions={"KHR_materials_transmission": {"transmissionFactor": 0.9}},
+            ),
+            GLASS,
+        ),
         (lambda h: h["images"].clear(), "Leaf (it is broken)"),
         (lambda h: h["images"][0].update(bufferView=0), "Leaf (its image is no PNG"),
         (lambda h: h["bufferViews"][3].update(byteLength=120), "Leaf (its image cannot be dec"),
@@ -442,6 +450,12 @@ def test_scenes_with_masks_are_written(tmp_path, suffix):
         assert read.masked == made.masked == made.names
         np.testing.assert_allclose(seen(read), seen(made), atol=2e-4)
         assert len({id(part.mask) for part in read.instances.parts if part.mask is not None}) == 2
+        # Another reader finds the same, Y-up.
+        other = trimesh.load(tmp_path / "m.glb", force="scene")
+        materials = [getattr(shape.visual, "material", None) for shape in other.geometry.values()]
+        assert [getattr(one, "alphaMode", "") for one in materials].count("MASK") == 3
+        low, high = made.bounds[:, [0, 2, 1]] * [1, 1, -1]
+        np.testing.assert_allclose(other.bounds, np.sort([low, high], axis=0), atol=1e-6)
 
 
 def test_a_scenario_ignores_masks_if_told(tmp_path):

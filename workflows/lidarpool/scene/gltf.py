@@ -43,6 +43,7 @@ _READ = re.compile(
 )
 _DRACO = "KHR_draco_mesh_compression"
 _INSTANCING = "EXT_mesh_gpu_instancing"
+_TRANSMISSION = "KHR_materials_transmission"
 _GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -233,6 +234,8 @@ class _Reader:
         material = self._part("materials", number)
         mode = material.get("alphaMode", "OPAQUE")
         if mode not in ("MASK", "BLEND"):
+            if _extension(material, _TRANSMISSION).get("transmissionFactor", 0) > 0:
+                self.notes.glass[self._material_name(number)] = None
             return None
         usual, glossy = material.get("pbrMetallicRoughness", {}), _extension(material, _GLOSSY)
         info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
