@@ -137,6 +137,7 @@ def forecast(
         "notes": notes,
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
+        "masked": list(job.scene.masked),
         "bounds": (job.scene.bounds + job.scene.origin).tolist(),
         "poses": job.survey.path.stations,
         "drive": _drive(job.survey),

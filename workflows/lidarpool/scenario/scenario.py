@@ -420,6 +420,7 @@ class Scenario(Section):
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
+            opacity=entry.opacity,
             tell=self._notes.append,
             axes=self._remarks.append,
         )

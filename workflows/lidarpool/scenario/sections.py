@@ -14,6 +14,7 @@ from ..base.declared import Angle, Coordinate, Text, Triple, declared, is_text, 
 from ..base.vocabulary import BACKENDS, UNITS_M
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
+from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
 from ..sensor import Material, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
@@ -75,6 +76,10 @@ class MeshFile(Section):
         told("one factor, or one for each axis; applied first"),
     ] = (1, 1, 1)
     matrix: Annotated[Matrix | None, told("instead of the three: 4 rows of 4, metres")] = None
+    opacity: Annotated[
+        Opacity,
+        told("mask: light passes where the image of a material is transparent; ignore: nowhere"),
+    ] = "mask"
 
     @model_validator(mode="after")
     def _one_placement(self) -> MeshFile:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -79,6 +80,11 @@ class Mesh:
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
         object.__setattr__(self, "cutouts", tuple(self.cutouts))
         _check_cutouts(self.name, self.cutouts, len(faces))
+
+    @cached_property
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of its vertices, (2, 3)."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""

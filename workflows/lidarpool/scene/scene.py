@@ -17,7 +17,7 @@ from ..base.words import counted
 from .actors import Actor
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
-from .meshfile import load_meshes
+from .meshfile import Opacity, load_meshes
 from .shapes import seed_objects
 from .transform import Transform
 
@@ -112,6 +112,7 @@ class Scene:
         unit: str | None = None,
         up_axis: str | None = None,
         transform: Transform | None = None,
+        opacity: Opacity = "mask",
     ) -> Scene:
         """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf.
 
@@ -128,13 +129,18 @@ class Scene:
         transform
             Placement of the mesh in the world, in metres, after unit and up axis: a
             `lidarpool.scene.transform.Transform`.
+        opacity
+            With "mask", light passes where the image of a material is transparent (.glb, .gltf,
+            .obj). With "ignore", triangles are solid, and no image is read.
 
         Raises
         ------
         LidarpoolError
             If the file cannot be read completely, or has no triangles.
         """
-        return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
+        return cls.from_meshes(
+            load_meshes(path, unit=unit, up_axis=up_axis, transform=transform, opacity=opacity)
+        )
 
     @classmethod
     @checked
@@ -235,6 +241,17 @@ class Scene:
     def all_names(self) -> tuple[str, ...]:
         """Names of all objects, actors after the others."""
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
+
+    @property
+    def masked(self) -> tuple[str, ...]:
+        """Names of the objects that stop light only in part, in order."""
+        owners = set()
+        if (shared := self.instances) is not None:
+            cut = np.array([part.mask is not None for part in shared.parts])
+            owners = set(shared.owner[cut[shared.part]].tolist())
+        own = len(self.names)
+        owners |= {own + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
+        return tuple(name for i, name in enumerate(self.all_names) if i in owners)
 
     @property
     def triangles(self) -> int:
