@@ -9,8 +9,8 @@ order:
 - open3d: Open3D's RaycastingScene and NumPy, from poses to float32 images, as one would write it.
 
 The poses of each round are others, as in a loop. MuJoCo's ``mj_multiRay`` and the CPU and Warp
-backends of MuJoCo-LiDAR (Warp on the processor) stand in a Python of their own. They are called once
-for each pose, with directions that were turned before.
+backends of MuJoCo-LiDAR (Warp on the processor) stand in a Python of their own. They are called
+once for each pose, with directions that were turned before.
 """
 
 from __future__ import annotations
@@ -243,14 +243,18 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--robots", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=21)
     parser.add_argument("--clock", choices=CLOCKS, default="wall")
-    parser.add_argument("--peers", default="", metavar="PYTHON", help="that has mujoco-lidar and warp-lang")
+    parser.add_argument(
+        "--peers", default="", metavar="PYTHON", help="that has mujoco-lidar and warp-lang"
+    )
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.triangles, chosen.robots, chosen.rounds = 10_000, 20, 2
     if not chosen.peers:
         print("mujoco-lidar: not installed; --peers names a Python that has it")
-    elif subprocess.run([chosen.peers, "-c", "import mujoco_lidar, warp"], capture_output=True).returncode:
+    elif subprocess.run(
+        [chosen.peers, "-c", "import mujoco_lidar, warp"], capture_output=True
+    ).returncode:
         parser.error(f"{chosen.peers} lacks peers: pip install mujoco-lidar mujoco warp-lang")
     backends = {name: why for name, why in available_backends().items() if not why}
     backend = chosen.backend or next(iter(backends))

@@ -39,7 +39,9 @@ except ImportError:
     pass
 else:
     slow = [HealthCheck.too_slow]
-    settings.register_profile("patient", deadline=None, suppress_health_check=slow, derandomize=True)
+    settings.register_profile(
+        "patient", deadline=None, suppress_health_check=slow, derandomize=True
+    )
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "patient"))
 
 
