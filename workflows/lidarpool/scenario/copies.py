@@ -139,7 +139,7 @@ def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, folder: Path
     matrices = np.tile(np.eye(4), (len(places), 1, 1))
     matrices[:, :3, :3] = rotations_of(angles) * scales[:, None]
     matrices[:, :3, 3] = places
-    return [Instance(mesh, matrix, entry.name) for matrix in matrices]
+    return Instance.several(mesh, matrices, entry.name)
 
 
 def _of_table(table: CopyTable, folder: Path) -> tuple[Float, Float, Float]:

@@ -203,7 +203,9 @@ class Scene:
         origin = local_origin(np.concatenate(ends))
         if instances is not None and origin.any():
             transforms = transforms - np.pad(origin[:, None], ((0, 0), (3, 0)))
+            bounds = instances.bounds - origin
             instances = replace(instances, transforms=transforms)
+            vars(instances)["bounds"] = bounds  # which take time
         return cls(
             vertices=vertices - origin,
             faces=faces.astype(np.int32),
@@ -234,6 +236,8 @@ class Scene:
     @property
     def all_names(self) -> tuple[str, ...]:
         """Names of all objects, actors after the others."""
+        if not self.actors:
+            return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
 
     @property
