@@ -123,7 +123,7 @@ WRONG = {
     Scanner(Scene.seed(), GRID).move: [
         (3, AT[0], "name is 3"),
         ("Car", None, "pose is None"),
-        ("Car", AT[0], "no actor 'Car'"),
+        ("Car", AT[0], "no actor or instance 'Car'"),
     ],
     Scene.load: [(3, "path is 3"), (["a.glb"], "text or a path"), (None, "None; it must")],
     Sensor: [

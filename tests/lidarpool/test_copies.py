@@ -108,7 +108,7 @@ def test_a_table_without_z_stands_on_the_surface(build, folder):
 
 
 def test_scattered_copies_stand_on_what_is_seen_from_above(build):
-    scatter = {"count": 300, "on": "Hill", "spacing_m": 0.6, "scale": [0.5, 1.5]}
+    scatter = {"count": 300, "surfaces": "Hill", "spacing_m": 0.6, "scale": [0.5, 1.5]}
     _, scene = build(TREE | {"scatter": scatter})
     at = places(scene)
     assert len(at) == 300 and np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
@@ -134,7 +134,7 @@ def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangl
 
 
 def test_a_roof_over_all_of_a_surface_does_not_count(build):
-    scatter = {"count": 50, "on": "Hill", "within": [12, -8, 19, 8]}
+    scatter = {"count": 50, "surfaces": "Hill", "within": [12, -8, 19, 8]}
     _, scene = build(TREE | {"scatter": scatter})
     at = places(scene)
     assert np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
@@ -229,7 +229,7 @@ WRONG = {
         "(2 copies): give z.",
     ),
     "flat": (TREE | {"at": [{"position": [0, 0], "scale": [1, 0, 1]}]}, "would flatten"),
-    "name": (TREE | {"scatter": {"count": 1, "on": "Hil"}}, "'Hil', but no object has"),
+    "name": (TREE | {"scatter": {"count": 1, "surfaces": "Hil"}}, "'Hil', but no object has"),
     "ordered": (TREE | {"scatter": {"count": 1, "within": [5, 0, 4, 1]}}, "x and y come first"),
     "factors": (TREE | {"scatter": {"count": 1, "scale": [2, 1]}}, "the largest factor"),
     "full": (

@@ -34,7 +34,7 @@ GOOD: list[dict[str, Any]] = [
                           {"name": "B", "file": "a.glb",
                            "table": {"file": "b.csv", "columns": {"x": "east"}}}]}},
     {"scene": {"files": "a.glb", "copies": [{"name": "A", "file": "a.glb", "scatter": {
-        "count": 9, "on": ["Ground", "Hill*"], "within": [0, 0, 9, 9], "scale": [0.5, 2]}}]}},
+        "count": 9, "surfaces": ["Ground", "Hill*"], "within": [0, 0, 9, 9], "scale": [0.5, 2]}}]}},
     {"poses": [[0, 0, 1], {"position": [0, 0, 2], "yaw_deg": 90}]},
     {"planning": {"obstacles": "auto"}},
     {"planning": {"obstacles": ["Shelf*", {"centre": [1, 2], "radius_m": 3}], "start": [1, 1]}},

@@ -62,7 +62,7 @@ class Standing:
         for name, found in zip(names, rows, strict=True):
             if not len(found):
                 raise LidarpoolError(
-                    f"scatter.on names {name!r}, but no object has that name."
+                    f"scatter.surfaces names {name!r}, but no object has that name."
                     + (
                         did_you_mean(name, scene.names)
                         or f" There are {', '.join(scene.names[:5])}."
@@ -175,7 +175,7 @@ def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Float, Fl
     Places are drawn in a rectangle and kept if the highest surface there is one of those named:
     only sums, products and comparisons, so that all machines draw the same.
     """
-    own = standing.only(given.on)
+    own = standing.only(given.surfaces)
     x0, y0, x1, y1 = own.rectangle if given.within is None else given.within
     # The name, so that trees and rocks of one seed are not at the same places.
     seeds = [given.seed, *name.encode()]
@@ -186,9 +186,9 @@ def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Float, Fl
     while len(found) < given.count:
         if drawn > max(DRAWS_LEAST, DRAWS_MOST * given.count):
             raise LidarpoolError(
-                f"only {len(found):,} of {given.count:,} found room on "
-                f"{', '.join(given.on)} within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to {y1:.6g}: "
-                "take fewer, a smaller spacing_m, or other surfaces."
+                f"only {len(found):,} of {given.count:,} found room on {', '.join(given.surfaces)} "
+                f"within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to {y1:.6g}: take fewer, a smaller "
+                "spacing_m, or other surfaces."
             )
         block = draw.random((DRAWN, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
         heights, objects = standing.under(block)

@@ -162,7 +162,7 @@ class Scatter(Section):
     """Copies that stand upright on surfaces, at random; the same fields give the same places."""
 
     count: Annotated[int, told("how many", ge=1, le=COPIES_MOST)]
-    on: Annotated[
+    surfaces: Annotated[  # not "on", which YAML takes for true
         TextOrTexts, told("names of the objects to stand on, with * and ?; by default all")
     ] = ("*",)
     within: Annotated[
@@ -263,8 +263,8 @@ class SceneSection(Section):
         Strict(False),
         told(
             "objects in many places, by lists, tables, or at random",
-            [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5], [6, 5, 0]], "class": 4}],
-            [{"name": "Tree", "file": "tree.glb", "scatter": {"count": 100, "on": "Ground"}}],
+            [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5, 0], [6, 5, 0]], "class": 4}],
+            [{"name": "Tree", "file": "tree.glb", "scatter": {"count": 100, "surfaces": "Ground"}}],
             max_length=10_000,
         ),
     ] = ()

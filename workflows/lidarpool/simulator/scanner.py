@@ -6,6 +6,7 @@ import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
+from itertools import compress
 from typing import Annotated, Any
 
 import numpy as np
@@ -256,13 +257,13 @@ class Scanner:
             self._move_instance(number, path.pose(0))
             return
         if number < standing:
-            names = [*list(self._numbers)[standing:], *np.array(scene.names)[self._movable]]
+            names = [*list(self._numbers)[standing:], *compress(scene.names, self._movable)]
             hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
             if number >= 0:
                 hint = (
                     " It is part of the scene, which stands still: make it an Actor or an Instance."
                 )
-            raise LidarpoolError(f"There is no actor {name!r}.{hint}")
+            raise LidarpoolError(f"There is no actor or instance {name!r}.{hint}")
         with self._lock:
             self._actors[number - standing] = replace(
                 self._actors[number - standing], trajectory=path
