@@ -24,7 +24,7 @@ from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
 from .sections import COPIES_MOST, CopiesSection, CopyTable, Scatter
 
-DRAWN = 1 << 16  # places that are drawn at a time
+DRAWN = 1 << 14  # places that are drawn at a time
 DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
 DRAWS_LEAST = 1 << 21
 
