@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ from ..sensor.calibrations import said
 from ..sensor.materials import rows_named
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
-from .sections import COPIES_MOST, CopiesSection, CopyTable, Scatter
+from .sections import COPIES_MOST, CopiesSection, Scatter
 
 DRAWN = 1 << 14  # places that are drawn at a time
 DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
@@ -35,81 +36,86 @@ Float = NDArray[np.float64]
 
 
 class Standing:
-    """What one can stand on in a scene: the triangles that face up.
+    """What one can stand on in a scene: the triangles of some objects that face up.
 
     Of several above a place the highest counts. None is a scene without triangles.
     """
 
-    def __init__(self, scene: Scene | None) -> None:
-        self._scene, self._tops = scene, np.zeros((0, 3, 3))
-        self._owner = np.zeros(0, np.int32)
-        self._caster: RayCaster | None = None
-        if scene is not None:
-            drawn = Drawn.of(scene).scene
-            self._keep(drawn.vertices[drawn.faces], drawn.face_object)
-
-    def _keep(self, corners: Float, owner: NDArray[np.int32]) -> None:
-        (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
-        up = ax * by - ay * bx > 0
-        self._tops, self._owner, self._caster = corners[up], owner[up], None
+    def __init__(self, scene: Scene | None, objects: NDArray[np.intp] | None = None) -> None:
+        self._scene, self._objects = scene, objects
 
     def only(self, names: Sequence[str]) -> Standing:
-        """Return the same of some objects; LidarpoolError if a name fits none."""
+        """Return the same of some objects; LidarpoolError if there is nothing to stand on."""
         scene = self._scene
         if scene is None:
             raise LidarpoolError("there is nothing to stand on: the scene has no files.")
         rows = [rows_named(name, scene.names) for name in names]
         for name, found in zip(names, rows, strict=True):
             if not len(found):
-                raise LidarpoolError(
-                    f"scatter.surfaces names {name!r}, but no object has that name."
-                    + (
-                        did_you_mean(name, scene.names)
-                        or f" There are {', '.join(scene.names[:5])}."
-                    )
+                hint = (
+                    did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
                 )
-        made = Standing(None)
-        made._scene, own = scene, np.isin(self._owner, np.concatenate(rows))
-        made._keep(self._tops[own], self._owner[own])
-        if not len(made._tops):
+                raise LidarpoolError(
+                    f"scatter.surfaces names {name!r}, but no object has that name.{hint}"
+                )
+        found = np.unique(np.concatenate(rows))
+        made = self if len(found) == len(scene.names) else Standing(scene, found)
+        if not len(made._tops[0]):
             raise LidarpoolError(f"nothing of {', '.join(map(repr, names))} faces up.")
         return made
 
-    @property
-    def owners(self) -> NDArray[np.int32]:
-        """Objects that have triangles here."""
-        return np.unique(self._owner)
+    @cached_property
+    def _tops(self) -> tuple[Float, NDArray[np.int32]]:
+        """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
+        assert self._scene is not None
+        drawn = Drawn.of(self._scene).scene
+        corners, owner = drawn.vertices[drawn.faces], drawn.face_object
+        if self._objects is not None:
+            own = np.isin(owner, self._objects)
+            corners, owner = corners[own], owner[own]
+        (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
+        up = ax * by - ay * bx > 0
+        return corners[up], owner[up]
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        # Never CUDA, whose context would stay in this process.
+        backend = "numpy" if available_backends()["embree"] else "embree"
+        corners = self._tops[0].reshape(-1, 3)
+        return RayCaster(corners, np.arange(len(corners)).reshape(-1, 3), backend)
 
     @property
     def rectangle(self) -> Float:
         """Lowest and highest x and y, world metres: (4,)."""
         assert self._scene is not None
-        x, y = self._tops[..., :2].reshape(-1, 2).T
+        x, y = self._tops[0][..., :2].reshape(-1, 2).T
         at = self._scene.origin[[0, 1, 0, 1]]
         return np.array([x.min(), y.min(), x.max(), y.max()]) + at
+
+    @cached_property
+    def owners(self) -> NDArray[np.int32]:
+        """Objects that have triangles here."""
+        return np.unique(self._tops[1])
 
     def under(self, places: Float) -> tuple[Float, NDArray[np.int32]]:
         """Heights below places (n, 2), world metres, nan for none; and their objects, -1."""
         heights, objects = np.full(len(places), np.nan), np.full(len(places), -1, np.int32)
-        if self._scene is None or not len(self._tops):
+        if self._scene is None or not len(self._tops[0]):
             return heights, objects
-        if self._caster is None:
-            # Never CUDA, whose context would stay in this process.
-            backend = "numpy" if available_backends()["embree"] else "embree"
-            corners = self._tops.reshape(-1, 3)
-            faces = np.arange(len(corners), dtype=np.int32).reshape(-1, 3)
-            self._caster = RayCaster(corners, faces, backend)
-        origin, top = self._scene.origin, float(self._tops[..., 2].max()) + 1.0
+        corners, owner = self._tops
+        origin, top = self._scene.origin, float(corners[..., 2].max()) + 1.0
         origins = np.column_stack([places - origin[:2], np.full(len(places), top)])
         hits = self._caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
         on = hits.hit
         heights[on] = top - hits.distance[on] + origin[2]
-        objects[on] = self._owner[hits.triangle[on]]
+        objects[on] = owner[hits.triangle[on]]
         return heights, objects
 
 
-def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, folder: Path) -> list[Instance]:
-    """Place the copies of an entry.
+def copies_of(
+    entry: CopiesSection, mesh: Mesh, standing: Standing, table: Path | None
+) -> list[Instance]:
+    """Place the copies of an entry; `table` is where its table is.
 
     Raises
     ------
@@ -119,8 +125,8 @@ def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, folder: Path
     if entry.scatter is not None:
         places, angles, scales = _scattered(entry.scatter, entry.name, standing)
     else:
-        if entry.table is not None:
-            places, angles, scales = _of_table(entry.table, folder)
+        if entry.table is not None and table is not None:
+            places, angles, scales = _of_table(table, entry.table.columns)
         else:
             places = np.array([(*one.position, np.nan)[:3] for one in entry.at])
             angles = np.array([[getattr(one, name) for name in _ANGLES] for one in entry.at])
@@ -142,20 +148,19 @@ def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, folder: Path
     return Instance.several(mesh, matrices, entry.name)
 
 
-def _of_table(table: CopyTable, folder: Path) -> tuple[Float, Float, Float]:
+def _of_table(path: Path, columns: dict[str, str]) -> tuple[Float, Float, Float]:
     """Places, z nan if there is none, angles in degrees, and scales of a table: (n, 3) each."""
-    path = folder / Path(table.file).expanduser()
     try:
         check_fits(path)
         text = path.read_text("utf-8-sig")
         if not text.strip():
             raise ValueError("it is empty")
         known = (*_PLACE, *_ANGLES, "scale", *_SCALES)
-        at = columns_of_table(text, table.columns, known, lambda found: ("x", "y"))
+        at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
         if "scale" in at and any(name in at for name in _SCALES):
             raise ValueError("it has both scale and scales of axes: leave one out in columns")
         if wrong := next((name for name in at if not np.isfinite(at[name]).all()), None):
-            raise ValueError(f"its column {table.columns.get(wrong, wrong)!r} has a nan or inf")
+            raise ValueError(f"its column {columns.get(wrong, wrong)!r} has a nan or inf")
     except (OSError, ValueError, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
     count = len(at["x"])

@@ -341,7 +341,8 @@ class Scenario(Section):
                 elif entry.box is not None:
                     meshes.setdefault(shape, box(entry.name, entry.box))
                 with prefixed(f"{self._source}: scene.copies[{number}]"):
-                    out += copies_of(entry, meshes[shape], standing, self._folder)
+                    table = self._path(entry.table.file) if entry.table else None
+                    out += copies_of(entry, meshes[shape], standing, table)
         mistakes.tell()
         return out
 
