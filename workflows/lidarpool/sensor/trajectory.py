@@ -73,15 +73,17 @@ class Pose:
 
 
 def rotations_of(angles_deg: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotations (..., 3, 3) of yaw, pitch and roll in degrees (..., 3), as of `Pose`."""
-    angles = np.moveaxis(np.radians(angles_deg), -1, 0)
+    """Rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), as of `Pose`; or of one."""
+    angles = np.radians(angles_deg.T)
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
-    rows = [
-        [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-        [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.array(rows), (0, 1), (-2, -1)))
+    made = np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+    return made if made.ndim == 2 else np.ascontiguousarray(np.moveaxis(made, 2, 0))
 
 
 def pose_of(name: str, given: Any) -> Pose:
