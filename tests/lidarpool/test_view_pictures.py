@@ -173,6 +173,16 @@ def test_many_objects_fit_the_legend():
     assert max(map(len, names)) <= 18
 
 
+def test_copies_share_a_row_of_the_legend_and_a_colour():
+    """But actors have one each."""
+    names = ["Hall", *["Crate"] * 57, "Crate", "Van"]
+    meshes = [Mesh(name, *solid(k)) for k, name in enumerate(names)]
+    shot = take_shot(Scene.from_meshes(meshes), [], actors=2, size=SIZE, backend="numpy")
+    (legend,) = draw_scene(shot, 9).figure.legends
+    rows = [text.get_text() for text in legend.get_texts()]
+    assert rows == ["Crate.58", "Van", "Hall", "Crate (57)", "Sensor"]
+
+
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
 def test_names_from_files_are_words_and_nothing_else(name):
     scene = Scene.from_meshes([Mesh(name, *solid(0)), Mesh("plain", *solid(1))])

@@ -16,7 +16,7 @@ from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of
 from .hits import hit_colours
-from .page import Page, without_common_prefix
+from .page import LEGEND_ROWS, Page, without_common_prefix
 from .shot import Shot
 
 Floats = NDArray[np.float64]
@@ -29,16 +29,25 @@ SURROUNDING = 0.6
 
 
 def draw_scene(shot: Shot, triangles: int) -> Page:
-    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number."""
+    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number.
+
+    Of more objects than a legend has rows, copies of one thing share a colour.
+    """
     scene = shot.scene
-    colours = _object_colours(scene)
+    kinds, names = _kinds(scene.names, shot.actors)
+    colours = _object_colours(scene, kinds)
     page = Page(shot.camera.size)
     page.show(shot, shot.paint(colours[scene.face_object]))
-    entries = list(zip(without_common_prefix(scene.names), colours, strict=True))
-    there = np.bincount(scene.face_object, minlength=len(entries)) > 0
-    first = len(entries) - shot.actors  # actors are first in the legend
-    order = [*range(first, len(entries)), *range(first)]
-    page.legend([entries[k] for k in order if there[k]])
+    there = np.bincount(scene.face_object, minlength=len(kinds)) > 0
+    _, firsts, counts = np.unique(kinds, return_index=True, return_counts=True)
+    labels = [
+        name if count == 1 else f"{name} ({count:,})"
+        for name, count in zip(without_common_prefix(names), counts, strict=True)
+    ]
+    first = len(names) - shot.actors  # actors are first in the legend
+    order = [*range(first, len(names)), *range(first)]
+    seen = np.bincount(kinds, there) > 0
+    page.legend([(labels[k], colours[firsts[k]]) for k in order if seen[k]])
     page.title(
         "Scene",
         f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
@@ -113,8 +122,21 @@ def draw_cloud(
     return page
 
 
-def _object_colours(scene: Scene) -> Floats:
-    """Colours of a scene's objects, (objects, 3) in 0 to 1.
+def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[str]]:
+    """Kinds of objects (objects,), and their names; the last objects are actors, each a kind."""
+    if len(names) <= LEGEND_ROWS:
+        return np.arange(len(names)), list(names)
+    known, found = {*names}, dict[str, int]()
+    kinds = []
+    for k, name in enumerate(names):
+        stem, _, number = name.rpartition(".")
+        copied = k < len(names) - actors and number.isdecimal() and stem in known
+        kinds.append(found.setdefault(stem if copied else name, len(found)))
+    return np.array(kinds), list(found)
+
+
+def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
+    """Colours of a scene's objects, (objects, 3) in 0 to 1, one for each of their kinds.
 
     Floors and halls are grey, so that objects in them stand out.
     """
@@ -123,7 +145,8 @@ def _object_colours(scene: Scene) -> Floats:
     share = np.where(np.isfinite(width), width, 0.0)[:, :2].prod(axis=1) / whole[:2].prod()
     grey = (share >= SURROUNDING) & (len(scene.names) > 1)
     colours = np.empty((len(scene.names), 3))
-    colours[~grey] = theme.object_colours(int((~grey).sum()))
+    found, kind = np.unique(kinds[~grey], return_inverse=True)
+    colours[~grey] = theme.object_colours(len(found))[kind]
     steps = np.linspace(0, 0.22, max(int(grey.sum()), 1))[: int(grey.sum()), None]
     colours[grey] = theme.rgb(theme.CLAY) * (1 - steps) + theme.rgb(theme.MUTED) * steps
     return colours

@@ -36,6 +36,7 @@ class Drawn:
         share = min(1.0, most / shared.triangles)
         meshes = [(scene.vertices, scene.faces)]
         owners, counters = [scene.face_object], [np.arange(faces)]
+        mirrored = np.linalg.det(shared.transforms[:, :, :3]) < 0
         for number, part in enumerate(shared.parts):
             vertices, own = part.vertices, part.faces
             size = max(PART_LEAST, int(len(own) * share))
@@ -43,10 +44,8 @@ class Drawn:
                 vertices, own = _fewer(part, size)
             for row in np.flatnonzero(shared.part == number):
                 matrix = shared.transforms[row]
-                mirrored = np.linalg.det(matrix[:, :3]) < 0
-                meshes.append(
-                    (vertices @ matrix[:, :3].T + matrix[:, 3], own[:, ::-1] if mirrored else own)
-                )
+                corners = own[:, ::-1] if mirrored[row] else own
+                meshes.append((vertices @ matrix[:, :3].T + matrix[:, 3], corners))
                 owners.append(np.full(len(own), shared.owner[row]))
                 counters.append(np.full(len(own), faces + row))
         vertices, triangles = stacked(meshes)

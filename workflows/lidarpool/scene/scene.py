@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
+from ..sensor import Pose
 from .actors import Actor
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
@@ -209,7 +210,9 @@ class Scene:
         origin = local_origin(np.concatenate(ends))
         if instances is not None and origin.any():
             transforms = transforms - np.pad(origin[:, None], ((0, 0), (3, 0)))
+            bounds = instances.bounds - origin
             instances = replace(instances, transforms=transforms)
+            vars(instances)["bounds"] = bounds  # which take time
         return cls(
             vertices=vertices - origin,
             faces=faces.astype(np.int32),
@@ -237,9 +240,24 @@ class Scene:
         object.__setattr__(scene, "actors", found)
         return scene
 
+    def moved(self, owner: int, pose: Pose) -> Scene:
+        """Return the same scene with the instances of an object at a pose of their mesh's axes.
+
+        They keep their scale; the pose is in local coordinates.
+        """
+        assert self.instances is not None
+        scene = copy(self)
+        for made_before in ("bounds", "object_bounds", "footprints"):
+            vars(scene).pop(made_before, None)
+        moved = self.instances.moved(owner, np.array(pose.position), pose.rotation)
+        object.__setattr__(scene, "instances", moved)
+        return scene
+
     @property
     def all_names(self) -> tuple[str, ...]:
         """Names of all objects, actors after the others."""
+        if not self.actors:
+            return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
 
     @property
@@ -329,10 +347,16 @@ class Scene:
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
-        used = self.vertices[np.unique(self.faces)]
+        ends = self._own_bounds
         if self.instances:
-            used = np.concatenate([used, self.instances.bounds.reshape(-1, 3)])
-        return np.stack([used.min(axis=0), used.max(axis=0)])
+            ends = np.concatenate([ends, self.instances.bounds.reshape(-1, 3)])
+        return np.stack([ends.min(axis=0), ends.max(axis=0)])
+
+    @cached_property
+    def _own_bounds(self) -> NDArray[np.float64]:
+        """Bounds of `faces` alone: (2, 3), or (0, 3) if there are none."""
+        used = self.vertices[np.unique(self.faces)]
+        return np.stack([used.min(axis=0), used.max(axis=0)]) if len(used) else used
 
     @cached_property
     def object_bounds(self) -> NDArray[np.float64]:
