@@ -8,8 +8,9 @@ order:
 - sweep, moving: `Scanner.sweep`, a cloud with its columns, from a pose and from a trajectory;
 - open3d: Open3D's RaycastingScene and NumPy, from poses to float32 images, as one would write it.
 
-The poses of each round are others, as in a loop. MuJoCo's ``mj_multiRay``, which is called once for
-each pose with directions that were turned before, stands in a Python of its own.
+The poses of each round are others, as in a loop. MuJoCo's ``mj_multiRay`` and the CPU and Warp
+backends of MuJoCo-LiDAR (Warp on the processor) stand in a Python of their own. They are called
+once for each pose, with directions that were turned before.
 """
 
 from __future__ import annotations
@@ -36,6 +37,7 @@ from .sensors import Peer
 
 Float = NDArray[np.float64]
 CASES = ("velodyne/vlp16", "ouster/os1-128", "robots")
+PEERS = ("mujoco", "mujoco-lidar cpu", "mujoco-lidar warp")
 BAR = 1.3  # of the time of ranges to that of the cast
 HEIGHT_M = 1.8
 
@@ -175,7 +177,9 @@ def measure(
             hit = found if isinstance(found, int) else np.isfinite(found).sum()
             hits[way] = float(hit / rays)
     if python:
-        seconds["mujoco"], hits["mujoco"] = _mujoco(python, ours, scene, poses, rounds, clock)
+        for peer in PEERS:
+            found = _peer(peer, python, ours, scene, poses, rounds, clock)
+            seconds[peer], hits[peer] = found
     return {
         "case": case,
         "backend": backend,
@@ -187,10 +191,10 @@ def measure(
     }
 
 
-def _mujoco(
-    python: str, ours: Ours, scene: Scene, poses: Float, rounds: int, clock: str
+def _peer(
+    name: str, python: str, ours: Ours, scene: Scene, poses: Float, rounds: int, clock: str
 ) -> tuple[list[float], float]:
-    """Time MuJoCo with the poses of the last round, and find its share of hits."""
+    """Time a peer with the poses of the last round, and find its share of hits."""
     rays = np.concatenate([ours.directions @ pose[:3, :3].T for pose in poses])
     with tempfile.TemporaryDirectory() as folder:
         job = Path(folder) / "job.npz"
@@ -202,7 +206,7 @@ def _mujoco(
             directions=rays,
             far=min(ours.sensor.max_range_m, 1e10),
         )
-        peer = Peer("mujoco", python, job, clock)
+        peer = Peer(name, python, job, clock)
         turns = [peer.cast() for _ in range(rounds + 1)][1:]
         peer.close()
     return [spent for spent, _ in turns], turns[-1][1] / len(rays)
@@ -222,7 +226,7 @@ def show(row: dict[str, Any]) -> None:
     )
     for way, seconds in row["seconds"].items():
         print(
-            f"  {way:<8} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, way):6.2f} x cast; "
+            f"  {way:<17} {1e3 * np.median(seconds):9.2f} ms  {ratio(row, way):6.2f} x cast; "
             f"hits {100 * row['hits'][way]:.1f} % of rays"
         )
     found = ratio(row, "ranges")
@@ -239,15 +243,19 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--robots", type=int, default=1000)
     parser.add_argument("--rounds", type=int, default=21)
     parser.add_argument("--clock", choices=CLOCKS, default="wall")
-    parser.add_argument("--peers", default="", metavar="PYTHON", help="that has mujoco")
+    parser.add_argument(
+        "--peers", default="", metavar="PYTHON", help="that has mujoco-lidar and warp-lang"
+    )
     parser.add_argument("--json", type=Path, help="write the results here")
     chosen = parser.parse_args(arguments)
     if chosen.quick:
         chosen.triangles, chosen.robots, chosen.rounds = 10_000, 20, 2
     if not chosen.peers:
-        print("mujoco: not installed; --peers names a Python that has it")
-    elif subprocess.run([chosen.peers, "-c", "import mujoco"], capture_output=True).returncode:
-        parser.error(f"{chosen.peers} has no mujoco: pip install mujoco")
+        print("mujoco-lidar: not installed; --peers names a Python that has it")
+    elif subprocess.run(
+        [chosen.peers, "-c", "import mujoco_lidar, warp"], capture_output=True
+    ).returncode:
+        parser.error(f"{chosen.peers} lacks peers: pip install mujoco-lidar mujoco warp-lang")
     backends = {name: why for name, why in available_backends().items() if not why}
     backend = chosen.backend or next(iter(backends))
     scene, results = city(chosen.triangles), []

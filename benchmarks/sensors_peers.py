@@ -9,6 +9,7 @@ import json
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from typing import Any
 
@@ -17,8 +18,8 @@ import numpy as np
 Job = dict[str, Any]
 
 
-def mujoco_caster(job: Job) -> Callable[[], int]:
-    """Cast the rays of each firing with one call: they all leave from one place."""
+def _mujoco_model(job: Job) -> tuple[Any, Any]:
+    """Make a model of the scene, and its data."""
     import mujoco
 
     spec = mujoco.MjSpec()
@@ -33,6 +34,14 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
     model = spec.compile()
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
+    return model, data
+
+
+def mujoco_caster(job: Job) -> Callable[[], int]:
+    """Cast the rays of each firing with one call: they all leave from one place."""
+    import mujoco
+
+    model, data = _mujoco_model(job)
     origins = np.ascontiguousarray(job["origins"])
     beams = len(job["directions"]) // len(origins)
     rays = np.ascontiguousarray(job["directions"].reshape(len(origins), 3 * beams))
@@ -46,6 +55,37 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
                 beams, far,
             )  # fmt: skip
         return int(((distance >= 0) & (distance <= far)).sum())
+
+    return cast
+
+
+def mujoco_lidar_caster(job: Job, backend: str) -> Callable[[], int]:
+    """Let MuJoCo-LiDAR cast the rays of each place with one call, by azimuth and elevation."""
+    if backend == "cpu":
+        from mujoco_lidar.core_cpu.mjlidar_cpu import MjLidarCPU as Caster
+    else:
+        import warp
+        from mujoco_lidar.core_warp.mjlidar_warp import MjLidarWarp as Caster
+
+        warp.config.quiet = True
+        warp.set_device("cpu")
+    model, data = _mujoco_model(job)
+    places = len(job["origins"])
+    far = float(job.get("far", 1e10))
+    caster = Caster(model, cutoff_dist=far)
+    caster.update(data)
+    poses = np.tile(np.eye(4), (places, 1, 1))
+    poses[:, :3, 3] = job["origins"]
+    x, y, z = job["directions"].reshape(places, -1, 3).transpose(2, 0, 1)
+    azimuths, elevations = np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))
+
+    def cast() -> int:
+        hits = 0
+        for pose, azimuth, elevation in zip(poses, azimuths, elevations, strict=True):
+            caster.trace_rays(pose, azimuth, elevation)
+            distance = caster.get_distances()
+            hits += int(((distance > 0) & (distance < far)).sum())
+        return hits
 
     return cast
 
@@ -76,7 +116,12 @@ def helios_caster(job: Job) -> Callable[[], int]:
     return cast
 
 
-CASTERS = {"mujoco": mujoco_caster, "pyhelios3d": helios_caster}
+CASTERS = {
+    "mujoco": mujoco_caster,
+    "mujoco-lidar cpu": partial(mujoco_lidar_caster, backend="cpu"),
+    "mujoco-lidar warp": partial(mujoco_lidar_caster, backend="warp"),
+    "pyhelios3d": helios_caster,
+}
 
 
 def main() -> None:
@@ -84,7 +129,7 @@ def main() -> None:
     name, path, clock = sys.argv[1:]
     now = {"wall": time.perf_counter, "cpu": time.process_time}[clock]
     cast = CASTERS[name](dict(np.load(path)))
-    print("ready", version(name), flush=True)
+    print("ready", version(name.partition(" ")[0]), flush=True)
     for _ in sys.stdin:
         start = now()
         hits = cast()

@@ -22,6 +22,10 @@ from lidarpool.scenario.schema import scenario_schema
 _SECTIONS = {
     "scene": "SceneSection",
     "scene: files": "MeshFile",
+    "scene: copies": "CopiesSection",
+    "scene: copies: at": "CopySection",
+    "scene: copies: table": "CopyTable",
+    "scene: copies: scatter": "Scatter",
     "scene: ground": "Ground",
     "sensor": "SensorSection",
     "poses": "PoseSection",

@@ -179,7 +179,8 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Float]:
     given = list(instances)
     if not given:
         raise ValueError("There is no instance: a caster needs at least one.")
-    transforms = np.stack([check_transform(k, one.transform) for k, one in enumerate(given)])
+    transforms = np.stack([_matrix(k, one.transform) for k, one in enumerate(given)])
+    _check_regular(0, transforms)
     numbers: dict[Mesh, int] = {}
     mesh = np.array([numbers.setdefault(one.mesh, len(numbers)) for one in given], np.intp)
     meshes = tuple(mesh._local for mesh in numbers)
@@ -193,6 +194,12 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Float]:
 
 def check_transform(number: int, transform: ArrayLike | None) -> Float:
     """Transform of the instance of that number: float64 (3, 4); ValueError if it is invalid."""
+    matrix = _matrix(number, transform)
+    _check_regular(number, matrix[None])
+    return matrix
+
+
+def _matrix(number: int, transform: ArrayLike | None) -> Float:
     if transform is None:
         return np.eye(3, 4)
     given = np.asarray(transform)
@@ -202,22 +209,33 @@ def check_transform(number: int, transform: ArrayLike | None) -> Float:
             f"not {given.dtype} {given.shape}."
         )
     matrix = given.astype(np.float64)
-    if not np.isfinite(matrix).all():
-        raise ValueError(f"The transform of instance {number} is not finite: {matrix.tolist()}.")
-    if (matrix[3:] != [0, 0, 0, 1]).any():
+    if len(matrix) == 4 and (matrix[3] != [0, 0, 0, 1]).any():
         raise ValueError(
             f"The last row of the transform of instance {number} is {matrix[3].tolist()}: "
             "expected 0, 0, 0, 1."
         )
-    with np.errstate(all="ignore"):
-        lengths = np.sqrt((matrix[:3, :3] ** 2).sum(axis=0))
-        volume = abs(_inverse(matrix[None, :3, :3])[1][0]) / lengths.prod()
-    if not volume >= _FLAT:  # also when it is not a number
+    return matrix[:3]
+
+
+def _check_regular(first: int, transforms: Float) -> None:
+    """Check transforms (n, 3, 4) of instances from a number on, all at once."""
+    finite = np.isfinite(transforms).all(axis=(1, 2))
+    if not finite.all():
+        row = int(finite.argmin())
         raise ValueError(
-            f"The transform of instance {number} is singular: {matrix[:, :3].tolist()} makes "
+            f"The transform of instance {first + row} is not finite: {transforms[row].tolist()}."
+        )
+    turn = transforms[:, :, :3]
+    with np.errstate(all="ignore"):
+        lengths = np.sqrt((turn**2).sum(axis=1))
+        volume = np.abs(_inverse(turn)[1]) / lengths.prod(axis=1)
+    regular = volume >= _FLAT  # also False when it is not a number
+    if not regular.all():
+        row = int(regular.argmin())
+        raise ValueError(
+            f"The transform of instance {first + row} is singular: {turn[row].tolist()} makes "
             "the mesh flat, or is too large or small to be inverted."
         )
-    return matrix[:3]
 
 
 def place(meshes: tuple[LocalMesh, ...], mesh: NDArray[np.intp], transforms: Float) -> Scene:

@@ -123,15 +123,23 @@ class Masks:
 def join_masks(
     opacities: list[LocalOpacity | None], orders: list[NDArray[np.int32]]
 ) -> Masks | None:
-    """Join the opacities of meshes, whose triangles have these orders; None if there is none."""
+    """Join the opacities of meshes, whose triangles have these orders; None if there is none.
+
+    A mask that meshes share, as the same memory, is there once.
+    """
     uv, mask = [np.zeros((0, 6), np.float32)], [np.zeros(0, np.uint8)]
     records = np.zeros((len(orders), 4), np.int64)
+    begins: dict[tuple[int, tuple[int, ...]], int] = {}  # {address and shape: first element}
     triangles = rows = elements = 0
     for record, one, order in zip(records, opacities, orders, strict=True):
         if one is not None:
-            record[:] = rows - triangles, elements, *one.mask.shape
+            key = one.mask.ctypes.data, one.mask.shape
+            if key not in begins:
+                begins[key] = elements
+                mask.append(one.mask.reshape(-1))
+                elements += one.mask.size
+            record[:] = rows - triangles, begins[key], *one.mask.shape
             uv.append(one.uv[order])
-            mask.append(one.mask.reshape(-1))
-            rows, elements = rows + len(order), elements + one.mask.size
+            rows += len(order)
         triangles += len(order)
     return Masks(np.concatenate(uv), np.concatenate(mask), records) if rows else None

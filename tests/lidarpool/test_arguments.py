@@ -14,6 +14,7 @@ from lidarpool import (
     Beams,
     Cloud,
     Column,
+    Instance,
     LidarpoolError,
     Material,
     Mesh,
@@ -58,6 +59,12 @@ WRONG = {
         (1, "u1", "", "", "name"),
         ("a", None, "", "", "dtype"),
         ("a", "u1", "", "", 3, "source is 3"),
+    ],
+    Instance: [
+        ("Tree", Pose((0, 0, 0)), "a Mesh, such as Mesh("),
+        (Mesh("Tree", POINTS, FACES), "here", "transform is 'here'"),
+        (Mesh("Tree", POINTS, FACES), np.eye(3), "four rows of four numbers"),
+        (Mesh("Tree", POINTS, FACES), np.diag([1, 1, 0, 1]), "flattens the mesh"),
     ],
     Material: [
         (3, "list of text"),
@@ -116,7 +123,7 @@ WRONG = {
     Scanner(Scene.seed(), GRID).move: [
         (3, AT[0], "name is 3"),
         ("Car", None, "pose is None"),
-        ("Car", AT[0], "no actor 'Car'"),
+        ("Car", AT[0], "no actor or instance 'Car'"),
     ],
     Scene.load: [(3, "path is 3"), (["a.glb"], "text or a path"), (None, "None; it must")],
     Sensor: [

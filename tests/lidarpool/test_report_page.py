@@ -304,7 +304,11 @@ def test_a_path_far_from_zero_is_told_in_world_coordinates(write):
 def test_the_scenario_on_the_page_is_the_scenario(write):
     scenario = Scenario.from_data(
         {
-            "scene": {"files": ["part <1>.stl"]},
+            "scene": {
+                "files": ["part <1>.stl"],
+                "copies": [{"name": "A", "box": [1, 2, 3], "at": [[1, 2]], "class": 3}],
+            },
+            "materials": [{"objects": "*", "class": 2}],
             "poses": [{"position": [1, 2, 3], "yaw_deg": 5}],
             "planning": {"start": [0, 0], "target": [9, 9], "obstacles": []},
         }

@@ -15,6 +15,7 @@ from lidarpool import (
     Beams,
     Cloud,
     Column,
+    Instance,
     LidarpoolError,
     Material,
     Mesh,
@@ -33,6 +34,7 @@ from lidarpool import (
 from lidarpool.columns.table import OPTIONAL, SCAN
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import box
+from lidarpool.scene.mesh import Cutout
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.simulator import rig as rig_module
 from lidarpool.simulator.returns import columns_of
@@ -240,6 +242,73 @@ def test_a_sweep_sees_actors_where_they_were_when_it_began(scene):
     assert not np.array_equal(scanner.sweep((0, 0, 1)).moves, before.moves)
 
 
+def with_copies(scene, crate=None, *grates):
+    """A crate and two grates with holes, as instances; poses and scales may be given."""
+    uv = np.array([[[0, 0], [2, 0], [2, 2]]], np.float32)
+    corners = np.array([[0, -2, 0], [0, 2, 0], [0, 2, 2], [0, -2, 2.0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    grate = Mesh("Grate", corners, faces, (Cutout(np.array([[True, False]]), uv),))
+    meshes = [(box("Crate", (2, 1, 1)), crate or Pose((5, 2, 0), 10), (1.4, 0.7, 2.1))]
+    meshes += [(grate, pose, 1.3) for pose in grates or [Pose((-5, y, 0), 5) for y in (-3, 3)]]
+    placed = []
+    for mesh, pose, scale in meshes:
+        matrix = np.eye(4)
+        matrix[:3, :3] = (np.eye(3) if pose.rotation is None else pose.rotation) * scale
+        matrix[:3, 3] = pose.position
+        placed.append(Instance(mesh, matrix))
+    return Scene.from_meshes([*scene.meshes(), *placed]).with_actors(scene.actors)
+
+
+@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
+def test_a_moved_copy_is_like_one_that_was_there_before(scene, physics, backend):
+    crate, grates = Pose((6, -2, 0.5), 70, 5), [Pose((-4, 3, 1), 20), Pose((-5, 3, 0), 5, 0, 30)]
+    options = {"columns": COLUMNS, "backend": backend, **physics}
+    moved = Scanner(with_copies(scene), GRID, **options)
+    before = moved.sweep(HERE, number=2)  # fills what is kept
+    for step in ((3, 3, 0), Pose((1, 9, 2), -50, 20, 9), crate):
+        moved.move("Crate", step)
+    moved.move("Grate", grates[0])
+    moved.move("Grate.2", grates[1])
+    new = Scanner(with_copies(scene, crate, *grates), GRID, **options)
+    cloud = moved.sweep(HERE, number=2)
+    assert {7, 8, 9} <= {*cloud.object.tolist()}
+    assert not np.array_equal(before.positions, cloud.positions)
+    assert same(cloud, new.sweep(HERE, number=2))
+    assert np.array_equal(moved.ranges([HERE, (0, 0, 1)]), new.ranges([HERE, (0, 0, 1)]))
+    moved.move("Car", (4, 1, 0))  # an actor in the same scene
+    new.move("Car", (4, 1, 0))
+    assert same(moved.sweep(HERE, number=2), new.sweep(HERE, number=2))
+
+
+def test_a_copy_waits_for_sweeps_before_it_moves(scene):
+    """So each of them sees it in one place."""
+    scanner = Scanner(with_copies(scene), VLP16, threads=1)
+    places = [Pose((5, 2, 0), 10), Pose((4, -1, 0), 50)]
+    seen = []
+    for place in places:
+        scanner.move("Crate", place)
+        seen.append(scanner.sweep((0, 0, 1)).positions.tobytes())
+    assert seen[0] != seen[1]
+    with ThreadPoolExecutor(3) as pool:
+        sweeps = [pool.submit(scanner.sweep, (0, 0, 1)) for _ in range(30)]
+        for number in range(30):
+            scanner.move("Crate", places[number % 2])
+        assert {sweep.result().positions.tobytes() for sweep in sweeps} <= {*seen}
+
+
+def test_a_copy_has_no_trajectory(scene):
+    scanner = Scanner(with_copies(scene), GRID)
+    with pytest.raises(LidarpoolError, match="'Crate' is an Instance, which stands still during"):
+        scanner.move("Crate", DRIVE)
+    with pytest.raises(
+        LidarpoolError, match=r"no actor or instance 'Grate\.4'\. Did you mean 'Grate\.2"
+    ):
+        scanner.move("Grate.4", (0, 0, 0))
+    with pytest.raises(LidarpoolError, match="make it an Actor or an Instance"):
+        scanner.move("Bowl", (0, 0, 0))
+
+
 @pytest.mark.parametrize(("backend", "sensor"), [("numpy", LATE), ("embree", VLP16)])
 def test_threads_share_a_scanner(scene, backend, sensor):
     def scan(number):
@@ -268,7 +337,7 @@ WRONG = {
     "large": (lambda s: s.sweep((0, 0, 1), number=10**9), "counted up to"),
     "start": (lambda s: s.ranges((0, 0, 1), start_s=float("nan")), "start_s is nan"),
     "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
-    "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor 'Cart'. Did you mean"),
+    "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor or instance 'Cart'. Did you mean"),
     "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the scene"),
     "pose": (lambda s: s.sweep("here"), "pose is 'here'"),
     "poses": (lambda s: s.ranges([[0, 0]]), "of the shape (1, 2)"),

@@ -18,8 +18,9 @@ from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.plan import run_trial
 from lidarpool.run.identity import identity_of
-from lidarpool.run.job import Job
+from lidarpool.run.job import Job, make_job
 from lidarpool.run.store import RunStore
+from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.shapes import seed_objects
 
 SCENE = Scene.from_meshes(seed_objects(rings=4, segments=6))
@@ -131,6 +132,23 @@ def test_another_run_cannot_go_on(other, unfinished):
             RunStore(OTHERS[other], unfinished, resume=resume)
     remove_run(unfinished)
     RunStore(OTHERS[other], unfinished).db.close()
+
+
+def test_a_run_with_other_copies_cannot_go_on(folder):
+    def job(**scatter):
+        scattered = {"count": 5, "within": [0, 0, 9, 9]} | scatter
+        copies = {"name": "Crate", "box": [1, 1, 1], "scatter": scattered}
+        scene = {"ground": {}, "copies": [copies]}
+        return make_job(Scenario.from_data({"scene": scene, "poses": [[0, 0, 1]], "steps": 6}))
+
+    store = RunStore(job(), folder)
+    store.backend = "numpy"
+    add(store, 0, 2)
+    store.db.close()
+    for other in ({"seed": 1}, {"count": 6}, {"scale": [1, 2]}):
+        with pytest.raises(LidarpoolError, match="it is of another scene"):
+            RunStore(job(**other), folder, resume=True)
+    RunStore(job(), folder, resume=True).db.close()
 
 
 def with_another_field(thing, value):

@@ -173,14 +173,19 @@ def test_many_objects_fit_the_legend():
     assert max(map(len, names)) <= 18
 
 
-def test_objects_of_one_name_have_one_colour_and_one_entry():
-    names = ["Wall", "Oak", "Post.1", "Oak.2", "Oak.3", "Post.2"]
-    scene = Scene.from_meshes([Mesh(name, *solid(k)) for k, name in enumerate(names)])
-    page = draw_scene(take_shot(scene, [], size=SIZE, backend="numpy"), 9)
-    words = [text.get_text() for text in page.figure.legends[0].get_texts()]
-    assert words == ["Oak × 3", "Wall", "Post.1", "Post.2", "Sensor"]
-    colours = [line.get_color() for line in page.figure.legends[0].get_lines()]
-    assert len({tuple(colour) for colour in colours}) == 5
+def test_copies_share_a_row_of_the_legend_and_a_colour():
+    """But actors have one each."""
+    names = ["Hall", *["Crate"] * 57, "Crate", "Van"]
+    meshes = [Mesh(name, *solid(k)) for k, name in enumerate(names)]
+    shot = take_shot(Scene.from_meshes(meshes), [], actors=2, size=SIZE, backend="numpy")
+    (legend,) = draw_scene(shot, 9).figure.legends
+    rows = [text.get_text() for text in legend.get_texts()]
+    assert rows == ["Crate.58", "Van", "Hall", "Crate (57)", "Sensor"]
+    houses = [f"House {k}" for k in range(50)]
+    meshes = [Mesh(name, *solid(k)) for k, name in enumerate([*houses, *["Oak"] * 9, "Van"])]
+    shot = take_shot(Scene.from_meshes(meshes), [], actors=1, size=SIZE, backend="numpy")
+    rows = [text.get_text() for text in draw_scene(shot, 9).figure.legends[0].get_texts()]
+    assert rows[:3] == ["Van", "Oak (9)", "House 0"] and rows[-1] == "and 22 more"
 
 
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])

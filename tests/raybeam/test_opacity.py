@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raybeam import Instance, Mesh, Opacity, RayCaster, available_backends
+from raybeam.opacity import check_opacity, join_masks
 
 FIELDS = ("distance", "triangle", "u", "v", "instance")
 SQUARE = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
@@ -99,6 +100,26 @@ def test_a_mask_that_is_true_everywhere_changes_no_bit(backend, shapes):
             same(hits, want)
         else:
             assert not hits.hit.any()
+
+
+def test_meshes_that_share_a_mask_keep_it_once(backend):
+    mask = np.random.default_rng(6).random((64, 64)) < 0.5
+    uv = SQUARE[HALVES][:, :, :2]
+    places = [np.eye(4), np.diag([2.0, 2, 1, 1])]
+    places[1][:3, 3] = 3, 0, 1
+
+    def caster(masks):
+        order = np.arange(2, dtype=np.int32)
+        opacities = [Opacity(one, uv) for one in masks]
+        joined = join_masks([check_opacity(one, 2, order) for one in opacities], [order] * 2)
+        meshes = [Mesh(SQUARE, HALVES, one) for one in opacities]
+        return joined.mask.size, RayCaster.of(list(map(Instance, meshes, places)), backend)
+
+    (once, shared), (twice, copied) = caster([mask, mask]), caster([mask, mask.copy()])
+    assert (once, twice) == (mask.size, 2 * mask.size)
+    origins = np.random.default_rng(7).uniform([0, 0, 5], [5, 2, 5], (1000, 3))
+    down = np.broadcast_to([0, 0, -1.0], origins.shape)
+    same(shared.cast(origins, down), copied.cast(origins, down))
 
 
 @pytest.mark.parametrize(

@@ -9,6 +9,7 @@ from collections import namedtuple
 from collections.abc import Callable, Iterator
 from typing import Any
 
+import numpy as np
 import pytest
 import trimesh
 import yaml
@@ -21,6 +22,9 @@ from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.job import make_job
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.sections import PoolSection
+from lidarpool.scene.mesh import Cutout, Mesh
+from lidarpool.scene.scene import Scene
+from lidarpool.scene.scene_file import write_scene
 from raybeam import available_backends
 
 SHORT = {"sensor": {"layers": 8}, "planning": {"trials": 4}, "pool": {"backend": "numpy"}}
@@ -89,6 +93,21 @@ def test_json_is_all_that_is_printed(check):
     assert list(said["slots"]) == ["GPU", "LIDAR"]
     assert said["disk"]["free"] > said["disk"]["result"] > 0
     assert said["memory"]["needed"] > 200e6
+
+
+def test_objects_with_masks_are_named(check, tmp_path):
+    plate = np.eye(3) * 3
+    cut = Cutout(np.eye(2, dtype=bool), np.zeros((1, 3, 2), np.float32))
+    meshes = [Mesh(f"Bush {i}", plate + i, np.array([[0, 1, 2]]), (cut,)) for i in range(4)]
+    floor = Mesh("Floor", plate, np.array([[0, 1, 2]]))
+    write_scene(tmp_path / "m.glb", Scene.from_meshes([floor, *meshes]))
+    scenario = SHORT | {"scene": "m.glb", "poses": [[0, 0, 2]]}
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    assert "masks       4 objects have masks: Bush 0, Bush 1, Bush 2, …\n" in told
+    said = json.loads(check("--json", "--no-plan", text=json.dumps(scenario)).out)
+    assert said["masked"] == [f"Bush {i}" for i in range(4)]
+    scenario["scene"] = {"files": [{"file": "m.glb", "opacity": "ignore"}]}
+    assert "have masks" not in check("--no-plan", text=json.dumps(scenario)).out
 
 
 def test_a_disk_without_room(check, monkeypatch):

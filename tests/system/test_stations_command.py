@@ -95,3 +95,17 @@ def test_what_cannot_be_planned_writes_nothing(arguments, says, hall, lidarpool)
     assert outcome.code == 2 and outcome.out == ""
     assert says in outcome.err
     assert not (hall / "hall-stations").exists()
+
+
+def test_files_of_copies_are_found_from_the_new_folder(hall, lidarpool):
+    (hall / "crate.stl").write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="stl"))
+    (hall / "crates.csv").write_text("x,y,z\n-3,1,0.5\n-3,-1,0.5\n")
+    (hall / "hall.yaml").write_text(
+        "scene:\n  files: [{file: hall.glb, up_axis: z}]\n"
+        "  copies: [{name: Crate, file: crate.stl, table: crates.csv, class: 4}]\n"
+    )
+    outcome = lidarpool("stations", "hall.yaml", "--sensor", "vlp16", "--count", "1")
+    assert outcome.code == 0, outcome.err
+    written = Scenario.load(hall / "hall-stations" / "stations.yaml")
+    assert written.build_scene().names[-2:] == ("Crate", "Crate.2")
+    assert written.scene.copies[0].semantic_class == 4

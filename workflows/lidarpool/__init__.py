@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .plan import Plan, Planning
     from .run.store import remove_run
     from .scene.actors import Actor
+    from .scene.instances import Instance
     from .scene.mesh import Mesh
     from .scene.scene import Scene
     from .sensor import (
@@ -43,6 +44,7 @@ __all__ = [
     "Cloud",
     "Column",
     "Frame",
+    "Instance",
     "LidarpoolError",
     "Material",
     "Mesh",
@@ -82,6 +84,7 @@ _MODULES = {
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
     "scene.actors": ("Actor",),
+    "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),

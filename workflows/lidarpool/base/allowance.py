@@ -45,6 +45,10 @@ class Allowance:
         """Count another file with it, which it names."""
         self._size += size
 
+    def fits(self, count: int) -> bool:
+        """Whether so many bytes more may be taken."""
+        return self.taken + count <= self.limit
+
     def take(self, count: int) -> None:
         """Take so many bytes, before they are made.
 

@@ -22,3 +22,17 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def counted(number: float, what: str, several: str = "") -> str:
     """Return number and noun: «1 worker», «1,200 workers»."""
     return f"{number:,} {what if number == 1 else several or what + 's'}"
+
+
+def as_text(name: bytes) -> str:
+    """Name in UTF-8, or in Latin-1 from old programs."""
+    try:
+        return name.decode("utf-8")
+    except UnicodeDecodeError:
+        return name.decode("latin-1")
+
+
+def printable(text: str, letters: int = 200) -> str:
+    """Text from a file as one line of limited length, without control characters."""
+    kept = "".join(c if c.isprintable() else " " for c in text)
+    return " ".join(kept.split())[:letters]

@@ -95,6 +95,10 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     sides = list(zip("xyz", *found["bounds"], strict=True))
     spans = ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
     yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
+    if masked := found["masked"]:
+        have = "object has masks" if len(masked) == 1 else "objects have masks"
+        shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
+        yield f"masks       {len(masked):,} {have}: {shown}"
     drive = found["drive"]
     where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
     several = len(job.survey.carried) > 1

@@ -48,6 +48,7 @@ from .run_command import no_hits
 PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles what calls Embree
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
+COPY_BYTES = 2000  # of an instance, likewise
 RAY_BYTES = 48  # of a turn, and of the pattern made of it
 PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
 PART_BYTES = 2500  # its head, and its row in the database
@@ -137,6 +138,7 @@ def forecast(
         "notes": notes,
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
+        "masked": list(job.scene.masked),
         "bounds": (job.scene.bounds + job.scene.origin).tolist(),
         "poses": job.survey.path.stations,
         "drive": _drive(job.survey),
@@ -251,7 +253,11 @@ def _worker_bytes(job: Job) -> int:
     each = job.survey.returns.subrays
     rays = sum(min((s.period or 0) * s.channels * each, PATTERN_RAYS) for s in sensors)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
-    return PROCESS_BYTES + triangles + RAY_BYTES * rays
+    return PROCESS_BYTES + triangles + _copies_bytes(job) + RAY_BYTES * rays
+
+
+def _copies_bytes(job: Job) -> int:
+    return COPY_BYTES * len(job.scene.instances) if job.scene.instances else 0
 
 
 def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
@@ -260,7 +266,9 @@ def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> i
     other = PROCESS_BYTES + PARTICLE_BYTES * swarm
     piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
     shown = min(job.scene.triangles, job.scene.kept_triangles + DRAWN_TRIANGLES)
-    driver = 2 * SCENE_BYTES * shown + SCAN_BYTES * job.survey.scan_count + piece
+    driver = (
+        2 * SCENE_BYTES * shown + _copies_bytes(job) + SCAN_BYTES * job.survey.scan_count + piece
+    )
     workers = _worker_bytes(job) * slots[GPU]["there"]
     if OTHER in slots:
         workers += other * slots[OTHER]["there"]

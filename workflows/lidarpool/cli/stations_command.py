@@ -151,9 +151,11 @@ def _scenario(read: Scenario, base: Path, folder: Path, model: str, plan: Statio
         path = (base / Path(file).expanduser()).resolve()
         return Path(os.path.relpath(path, folder.resolve())).as_posix()
 
-    entry = read.scene.model_dump(exclude_unset=True, mode="json")
-    if "files" in entry:
-        entry["files"] = [{**one, "file": moved(one["file"])} for one in entry["files"]]
+    entry = read.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
+    copies = entry.get("copies", [])
+    named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
+    for one in filter(None, named):
+        one["file"] = moved(one["file"])
     if model.endswith((".yaml", ".yml")):
         model = Path(os.path.relpath(Path(model).resolve(), folder.resolve())).as_posix()
     data = {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from typing import Any
 
@@ -17,7 +16,7 @@ from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of
 from .hits import hit_colours
-from .page import Page, without_common_prefix
+from .page import LEGEND_ROWS, Page, without_common_prefix
 from .shot import Shot
 
 Floats = NDArray[np.float64]
@@ -30,25 +29,27 @@ SURROUNDING = 0.6
 
 
 def draw_scene(shot: Shot, triangles: int) -> Page:
-    """Draw a scene and the sensors; `triangles` is their number.
+    """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number.
 
-    Each object has its own colour; those that share a name but for a number, as Oak and Oak.2, have
-    one colour.
+    Of more objects than a legend has rows, copies of one thing share a colour.
     """
     scene = shot.scene
-    kinds, words = _kinds(scene.names)
+    kinds, names = _kinds(scene.names, shot.actors)
     colours = _object_colours(scene, kinds)
     page = Page(shot.camera.size)
     page.show(shot, shot.paint(colours[scene.face_object]))
-    there = np.unique(scene.face_object)  # objects that are drawn
-    counts = np.bincount(kinds[there], minlength=len(words))
-    entries: dict[int, tuple[str, Floats]] = {}  # {kind: name and colour}
-    # Actors are first in the legend, then the many of a kind.
-    actors = there >= len(scene.names) - shot.actors
-    for k in there[np.lexsort((counts[kinds[there]] == 1, ~actors))].tolist():
-        many = f" × {counts[kinds[k]]:,}" if counts[kinds[k]] > 1 else ""
-        entries.setdefault(int(kinds[k]), (words[kinds[k]] + many, colours[k]))
-    page.legend(list(entries.values()))
+    there = np.bincount(scene.face_object, minlength=len(kinds)) > 0
+    _, firsts, counts = np.unique(kinds, return_index=True, return_counts=True)
+    labels = [
+        name if count == 1 else f"{name} ({count:,})"
+        for name, count in zip(without_common_prefix(names), counts, strict=True)
+    ]
+    first = len(names) - shot.actors  # actors are first in the legend
+    seen = np.bincount(kinds, there) > 0
+    order = [*range(first, len(names)), *range(first)]
+    if seen.sum() > LEGEND_ROWS:
+        order.sort(key=lambda k: k < first and counts[k] == 1)  # then copies
+    page.legend([(labels[k], colours[firsts[k]]) for k in order if seen[k]])
     page.title(
         "Scene",
         f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
@@ -123,17 +124,21 @@ def draw_cloud(
     return page
 
 
-def _kinds(names: Sequence[str]) -> tuple[NDArray[np.int64], list[str]]:
-    """Kind of each object (objects,), and their names, without a number that made them unique."""
-    given, numbers = set(names), dict[str, int]()
-    bases = [re.sub(r"\.\d+$", "", name) for name in names]
-    same = [base if base in given else name for base, name in zip(bases, names, strict=True)]
-    kinds = [numbers.setdefault(name, len(numbers)) for name in same]
-    return np.array(kinds, np.int64), without_common_prefix(list(numbers))
+def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[str]]:
+    """Kinds of objects (objects,), and their names; the last objects are actors, each a kind."""
+    if len(names) <= LEGEND_ROWS:
+        return np.arange(len(names)), list(names)
+    known, found = {*names}, dict[str, int]()
+    kinds = []
+    for k, name in enumerate(names):
+        stem, _, number = name.rpartition(".")
+        copied = k < len(names) - actors and number.isdecimal() and stem in known
+        kinds.append(found.setdefault(stem if copied else name, len(found)))
+    return np.array(kinds), list(found)
 
 
 def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
-    """Colours of a scene's objects by their kinds (objects,): (objects, 3) in 0 to 1.
+    """Colours of a scene's objects, (objects, 3) in 0 to 1, one for each of their kinds.
 
     Floors and halls are grey, so that objects in them stand out.
     """
@@ -143,7 +148,7 @@ def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
     grey = (share >= SURROUNDING) & (len(scene.names) > 1)
     colours = np.empty((len(scene.names), 3))
     found, kind = np.unique(kinds[~grey], return_inverse=True)
-    colours[~grey] = theme.object_colours(len(found))[kind.reshape(-1)]
+    colours[~grey] = theme.object_colours(len(found))[kind]
     steps = np.linspace(0, 0.22, max(int(grey.sum()), 1))[: int(grey.sum()), None]
     colours[grey] = theme.rgb(theme.CLAY) * (1 - steps) + theme.rgb(theme.MUTED) * steps
     return colours

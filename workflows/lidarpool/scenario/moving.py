@@ -16,7 +16,7 @@ from ..sensor import Mounted, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import MeshEntry, PoseSection, Section, SensorSection, told
+from .sections import Lengths, MeshEntry, PoseSection, Section, SensorSection, told
 
 
 class MountSection(PoseSection):
@@ -130,7 +130,6 @@ class TrajectorySection(Section):
 TrajectoryEntry = Annotated[
     TrajectorySection, short(is_text, lambda v: {"file": v}, Text | TrajectorySection)
 ]
-Length = Annotated[float, Field(gt=0, le=1e4)]
 
 
 class ActorSection(Section):
@@ -141,7 +140,7 @@ class ActorSection(Section):
         MeshEntry | None, told("its mesh in its own axes, as in scene.files", "car.glb")
     ] = None
     box: Annotated[
-        Annotated[tuple[Length, Length, Length], Strict(False)] | None,
+        Lengths | None,
         told("instead of a file: length, width and height of a box, metres"),
     ] = None
     trajectory: Annotated[TrajectoryEntry, told("its trajectory, by the clock of the survey's")]

@@ -6,6 +6,7 @@ import os
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from glob import escape
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -25,12 +26,14 @@ from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
+from ..sensor.materials import rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
+from .copies import Standing, copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .placing import Placing, inside_note, place
 from .sections import (
     CloudSection,
-    Ground,
+    CopiesSection,
     MaterialSection,
     MeshFile,
     NoiseSection,
@@ -241,8 +244,10 @@ class Scenario(Section):
                 with mistakes.noted(), prefixed(self._source):
                     sensor = section.sensor(self._folder)
                     self.returns.of(sensor.optics)
-        entries = [*self.scene.files, *(actor.file for actor in self.actors if actor.file)]
+        placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
+        entries = [*self.scene.files, *(entry.file for entry in placed if entry.file)]
         files = [entry.file for entry in entries]
+        files += [entry.table.file for entry in self.scene.copies if entry.table]
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
         for file in files if mistakes.lines else ():
             with suppress(RuntimeError):  # of a user who is not known
@@ -312,10 +317,51 @@ class Scenario(Section):
             with mistakes.noted():
                 meshes += self._read(entry)
         mistakes.tell()
+        if self.scene.copies:
+            meshes += self._copies(meshes)
         scene = Scene.from_meshes(meshes)
         if self.scene.ground is not None:
-            scene = Scene.from_meshes([*meshes, _ground(self.scene.ground, scene)])
+            scene = Scene.from_meshes([*meshes, self._ground(scene)])
         return replace(scene, actors=self._actors(scene.origin)) if self.actors else scene
+
+    def _copies(self, base: list[Mesh | Instance]) -> list[Instance]:
+        """Place the copies; they stand on other objects and on the ground, not on one another."""
+        scene = Scene.from_meshes(base) if base else None
+        if self.scene.ground is not None and (base or self._scattered_in()):
+            scene = Scene.from_meshes([*base, self._ground(scene)])
+        standing = Standing(scene)
+        meshes: dict[Any, Mesh] = {}  # {file and its placement, or size of a box: mesh}
+        out: list[Instance] = []
+        mistakes = Mistakes()
+        for number, entry in enumerate(self.scene.copies):
+            shape = entry.file or entry.box
+            with mistakes.noted():
+                if entry.file is not None and shape not in meshes:
+                    meshes[shape] = one_mesh(entry.name, self._read(entry.file))
+                elif entry.box is not None:
+                    meshes.setdefault(shape, box(entry.name, entry.box))
+                with prefixed(f"{self._source}: scene.copies[{number}]"):
+                    table = self._path(entry.table.file) if entry.table else None
+                    out += copies_of(entry, meshes[shape], standing, table)
+        mistakes.tell()
+        return out
+
+    def _scattered_in(self) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
+        """Rectangles that copies are scattered in, [[x0, y0], [x1, y1]]."""
+        scattered = [entry.scatter for entry in self.scene.copies if entry.scatter is not None]
+        return [np.reshape(one.within, (2, 2)) for one in scattered if one.within is not None]
+
+    def _ground(self, scene: Scene | None) -> Mesh:
+        """Two triangles under a scene, and under the rectangles that copies are scattered in."""
+        section = self.scene.ground
+        assert section is not None
+        ends = [] if scene is None else [(scene.bounds + scene.origin)[:, :2]]
+        points = np.concatenate([*ends, *self._scattered_in()])
+        (x0, y0), (x1, y1) = points.min(axis=0), points.max(axis=0)
+        x0, y0, x1, y1 = np.array([x0, y0, x1, y1]) + section.margin_m * np.array([-1, -1, 1, 1])
+        z = section.height_m
+        corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
+        return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
     def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
@@ -332,15 +378,22 @@ class Scenario(Section):
             ways = [entry.way(self._folder, origin, start) for entry in self.actors]
         return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
 
-    def _materials(self) -> list[Material]:
-        """Materials by name; classes of actors come last, so that they count."""
-        given = [Material(**dict(entry)) for entry in self.materials]
-        own = []
-        for entry in self.actors:
-            if entry.semantic_class is not None:
-                of = next((m for m in reversed(given) if m.named(entry.name)), Material("*"))
-                own.append(replace(of, objects=entry.name, semantic_class=entry.semantic_class))
-        return [*(given or [Material("*")] * bool(own)), *own]
+    def _materials(self, scene: Scene) -> list[Material]:
+        """Materials by name, and those of actors and copies that have a class of their own."""
+        made = [Material(**dict(entry)) for entry in self.materials]
+        placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
+        own = [(one, one.semantic_class) for one in placed if one.semantic_class is not None]
+        if own and not made:
+            made = [Material("*")]
+        for entry, semantic_class in own:
+            # After the last that is for it: a later one, for a single copy, counts there.
+            after = max((k for k, m in enumerate(made) if m.named(entry.name)), default=-1)
+            of = made[after] if after >= 0 else Material("*")
+            objects, numbered = [entry.name], f"{escape(entry.name)}.[0-9]*"
+            if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
+                objects.append(numbered)
+            made.insert(after + 1, replace(of, objects=objects, semantic_class=semantic_class))
+        return made
 
     def survey(self, scene: Scene) -> Survey:
         """Return the survey, its poses in the local coordinates of `scene`.
@@ -368,7 +421,7 @@ class Scenario(Section):
                 trajectory=track,
                 **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
                 steps=self.steps,
-                materials=self._materials(),
+                materials=self._materials(scene),
                 returns=Returns(**dict(self.returns)),
                 noise=Noise(**dict(self.noise)),
                 **dict(self.weather),
@@ -420,6 +473,7 @@ class Scenario(Section):
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
+            opacity=entry.opacity,
             tell=self._notes.append,
             axes=self._remarks.append,
         )
@@ -465,15 +519,6 @@ class Scenario(Section):
                 )
             rows |= {scene.names[i]: list(scene.footprints[i]) for i in found}
         return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
-
-
-def _ground(section: Ground, scene: Scene) -> Mesh:
-    """Return two triangles under everything."""
-    (x0, y0, _), (x1, y1, _) = scene.bounds + scene.origin
-    x0, y0, x1, y1 = np.array([x0, y0, x1, y1]) + section.margin_m * np.array([-1, -1, 1, 1])
-    z = section.height_m
-    corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
-    return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _check_free(

@@ -10,16 +10,30 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
 from ..base.arguments import shown
-from ..base.declared import Angle, Coordinate, Text, Triple, declared, is_text, short
+from ..base.declared import (
+    Angle,
+    Coordinate,
+    Seed,
+    Text,
+    TextOrTexts,
+    Triple,
+    declared,
+    is_text,
+    short,
+)
 from ..base.vocabulary import BACKENDS, UNITS_M
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
+from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
 from ..sensor import Material, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
+from ..sensor.materials import SemanticClass
 from ..sensor.models import load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
 from ..sensor.survey import CloudOptions, Weather
+
+COPIES_MOST = 1_000_000  # of one entry
 
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
@@ -27,6 +41,11 @@ Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
 Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
+Scale = Annotated[
+    Factors, short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors)
+]
+Length = Annotated[float, Field(gt=0, le=1e4)]
+Lengths = Annotated[tuple[Length, Length, Length], Strict(False)]
 
 
 def told(description: str, *examples: Any, **limits: Any) -> Any:
@@ -69,12 +88,12 @@ class MeshFile(Section):
         0,
         0,
     )
-    scale: Annotated[
-        Factors,
-        short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors),
-        told("one factor, or one for each axis; applied first"),
-    ] = (1, 1, 1)
+    scale: Annotated[Scale, told("one factor, or one for each axis; applied first")] = (1, 1, 1)
     matrix: Annotated[Matrix | None, told("instead of the three: 4 rows of 4, metres")] = None
+    opacity: Annotated[
+        Opacity,
+        told("mask: light passes where the image of a material is transparent; ignore: nowhere"),
+    ] = "mask"
 
     @model_validator(mode="after")
     def _one_placement(self) -> MeshFile:
@@ -96,6 +115,126 @@ MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | Mes
 MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
+class PoseSection(Section, Pose):
+    """Pose of the sensor, in world coordinates."""
+
+    def pose(self) -> Pose:
+        """Return it as a pose."""
+        return Pose(**declared(self, Pose))
+
+
+def _pose(value: Any) -> Any:
+    if isinstance(value, list):
+        return {"position": value}
+    if not isinstance(value, (dict, PoseSection)):
+        raise ValueError(
+            f"a pose is x, y and z in metres, [0, 0, 1], or position and angles, {{position: "
+            f"[0, 0, 1], yaw_deg: 90}}; given is {shown(value)}."
+        )
+    return value
+
+
+PoseEntry = Annotated[
+    PoseSection, BeforeValidator(_pose, json_schema_input_type=Triple | PoseSection)
+]
+
+
+Place = Annotated[
+    tuple[Coordinate, ...], Strict(False), Field(min_length=2, max_length=3)
+]  # x and y, perhaps z
+
+
+class CopySection(PoseSection):
+    """Where one of several copies stands; in YAML also just [x, y] or [x, y, z]."""
+
+    position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
+        Place, told("x, y and z of the mesh's origin, metres; without z it stands on the surface")
+    ]
+    scale: Annotated[Scale, told("one factor, or one for each axis of the mesh")] = (1, 1, 1)
+
+
+class CopyTable(Section):
+    """Places of copies from a table; in YAML also just the file's name."""
+
+    file: Annotated[Text, told("a table with a header, from the scenario's folder")]
+    columns: Annotated[
+        dict[str, str],
+        told("{x, y, z, yaw_deg, pitch_deg, roll_deg, scale, scale_x, …: name in the file}"),
+    ] = {}
+
+
+class Scatter(Section):
+    """Copies that stand upright on surfaces, at random; the same fields give the same places."""
+
+    count: Annotated[int, told("how many", ge=1, le=COPIES_MOST)]
+    surfaces: Annotated[  # not "on", which YAML takes for true
+        TextOrTexts, told("names of the objects to stand on, with * and ?; by default all")
+    ] = ("*",)
+    within: Annotated[
+        Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False)] | None,
+        told("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]"),
+    ] = None
+    spacing_m: Annotated[
+        float, told("least distance between two, seen from above, metres", ge=0, le=1e6)
+    ] = 0.0
+    scale: Annotated[
+        Annotated[tuple[Factor, Factor], Strict(False)], told("least and largest factor")
+    ] = (1, 1)
+    yaw_deg: Annotated[Angle | None, told("of all of them; by default each has its own")] = None
+    seed: Annotated[Seed, told("another seed gives other places")] = 0
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Scatter:
+        if not 0 < self.scale[0] <= self.scale[1]:
+            raise ValueError("scale is the least and the largest factor, both above 0.")
+        if self.within is not None:
+            x0, y0, x1, y1 = self.within
+            if x0 >= x1 or y0 >= y1:
+                raise ValueError("within is [x0, y0, x1, y1]: the lowest x and y come first.")
+        return self
+
+
+class CopiesSection(Section):
+    """An object that stands in many places, its mesh kept once; each copy is an object."""
+
+    name: Annotated[Text, told("name of the first; the others are numbered: Tree, Tree.2, …")]
+    file: Annotated[
+        MeshEntry | None, told("its mesh in its own axes, as in scene.files", "tree.glb")
+    ] = None
+    box: Annotated[
+        Lengths | None, told("instead of a file: length, width and height of a box, metres")
+    ] = None
+    at: Annotated[
+        tuple[
+            Annotated[
+                CopySection, BeforeValidator(_pose, json_schema_input_type=Place | CopySection)
+            ],
+            ...,
+        ],
+        Strict(False),
+        told("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
+    ] = ()
+    table: Annotated[
+        Annotated[CopyTable, short(is_text, lambda v: {"file": v}, Text | CopyTable)] | None,
+        told("instead of at: a table of places", "trees.csv"),
+    ] = None
+    scatter: Annotated[
+        Scatter | None, told("instead of at: so many on surfaces, at random", {"count": 100})
+    ] = None
+    semantic_class: Annotated[
+        SemanticClass | None,
+        Field(alias="class", description="class of its points; by default that of its material"),
+    ] = None
+
+    @model_validator(mode="after")
+    def _one_of_each(self) -> CopiesSection:
+        if (self.file is None) == (self.box is None):
+            raise ValueError("give either file or box.")
+        if [bool(self.at), self.table is not None, self.scatter is not None].count(True) != 1:
+            raise ValueError("give one of at, table and scatter.")
+        return self
+
+
 class Ground(Section):
     """A horizontal rectangle under the scene, `margin_m` wider on each side."""
 
@@ -106,9 +245,9 @@ class Ground(Section):
 
 
 class SceneSection(Section):
-    """The scene: mesh files, the six default objects, or both.
+    """The scene: mesh files, copies of meshes, the six default objects, or all of them.
 
-    `preset` is 'seed' without files, else 'none'.
+    `preset` is 'seed' without files and copies, else 'none'.
     """
 
     preset: Annotated[
@@ -124,6 +263,16 @@ class SceneSection(Section):
             max_length=10_000,
         ),
     ] = ()
+    copies: Annotated[
+        tuple[CopiesSection, ...],
+        Strict(False),
+        told(
+            "objects in many places, by lists, tables, or at random",
+            [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5, 0], [6, 5, 0]], "class": 4}],
+            [{"name": "Tree", "file": "tree.glb", "scatter": {"count": 100, "surfaces": "Ground"}}],
+            max_length=10_000,
+        ),
+    ] = ()
     ground: Annotated[
         Ground | None,
         told("a horizontal rectangle below the scene, metres", {"height_m": 0, "margin_m": 5}),
@@ -131,14 +280,14 @@ class SceneSection(Section):
 
     @model_validator(mode="after")
     def _something(self) -> SceneSection:
-        if self.preset == "none" and not self.files:
+        if self.preset == "none" and not (self.files or self.copies):
             raise ValueError("the scene is empty: give files, or preset: seed.")
         return self
 
     @property
     def has_seed(self) -> bool:
         """Whether the six default objects are in it."""
-        return self.preset == "seed" or (self.preset is None and not self.files)
+        return self.preset == "seed" or (self.preset is None and not (self.files or self.copies))
 
 
 class SensorSection(Section):
@@ -219,30 +368,6 @@ _GRID = {  # {field of a grid: its default}
     name: SensorSection.model_fields[name].default
     for name in ("rays_per_revolution", "layers", "vertical_fov_deg")
 }
-
-
-class PoseSection(Section, Pose):
-    """Pose of the sensor, in world coordinates."""
-
-    def pose(self) -> Pose:
-        """Return it as a pose."""
-        return Pose(**declared(self, Pose))
-
-
-def _pose(value: Any) -> Any:
-    if isinstance(value, list):
-        return {"position": value}
-    if not isinstance(value, (dict, PoseSection)):
-        raise ValueError(
-            f"a pose is x, y and z in metres, [0, 0, 1], or position and angles, {{position: "
-            f"[0, 0, 1], yaw_deg: 90}}; given is {shown(value)}."
-        )
-    return value
-
-
-PoseEntry = Annotated[
-    PoseSection, BeforeValidator(_pose, json_schema_input_type=Triple | PoseSection)
-]
 
 
 class CloudSection(Section, CloudOptions):

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.xmlfile import xml_root
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, instances, joined, settled
+from .nodes import SMALLER, Content, MeshFileError, Node, Piece, instances, joined, settled
 from .polygons import fanned, triangulated, unrolled, with_holes
 from .transform import rotation_about
 
@@ -117,7 +117,7 @@ class _Document:
                 points = self._points(vertices)
                 made = [f for f in _faces(primitive, points, offset, stride) if len(f)]
                 faces.setdefault(vertices, []).extend(made)
-        parts = ((self._points(v), np.concatenate(f)) for v, f in faces.items() if f)
+        parts = (Piece(self._points(v), np.concatenate(f)) for v, f in faces.items() if f)
         return joined(name, parts, self._allowance)
 
     def _inputs(self, primitive: Element) -> tuple[Element, int, int]:

@@ -3,7 +3,7 @@
 This is not trimesh 5.2, which puts a node of several parents into one place, loses what hangs on a
 camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
 fans nor files without scenes; nor assimp, which skips what it cannot read. Only triangles are read,
-not materials and pictures.
+and of materials where they are transparent.
 """
 
 from __future__ import annotations
@@ -15,14 +15,26 @@ import struct
 from functools import cache
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote, unquote_to_bytes
+from urllib.parse import unquote_to_bytes
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from .beside import file_beside, spellings
+from .masks import MaskError, MaskNotes, Texture, Wrap, read_opacity, remembered
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, instances, joined, settled
+from .nodes import (
+    MOST_NODES,
+    SMALLER,
+    Content,
+    MeshFileError,
+    Node,
+    Piece,
+    instances,
+    joined,
+    settled,
+)
 from .polygons import fanned, unrolled
 
 # Extensions that do not change shapes, or that are supported here.
@@ -31,21 +43,26 @@ _READ = re.compile(
 )
 _DRACO = "KHR_draco_mesh_compression"
 _INSTANCING = "EXT_mesh_gpu_instancing"
+_TRANSMISSION = "KHR_materials_transmission"
+_GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
-def read_gltf(data: bytes, path: Path) -> Content:
+def read_gltf(data: bytes, path: Path, masks: bool = True) -> Content:
     """Read the default scene of a file, or all nodes if it has no scenes.
 
-    Buffer files are read only from the folder of `path` and below.
+    Files that it names are read only from the folder of `path` and below. Without `masks`,
+    triangles are solid, and no image is read.
     """
     header, body = _chunks(data)
     _check(header)
-    reader = _Reader(header, body, path, len(data))
+    reader = _Reader(header, body, path, len(data), masks)
     content = settled(instances(_roots(header), reader.node, path.stem))
     content.unit_m, content.up_axis = 1.0, "y"
+    content.notes = reader.notes.lines()
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
 
@@ -86,11 +103,6 @@ def _check(header: dict[str, Any]) -> None:
         if not _READ.match(name) and name not in (_DRACO, _INSTANCING):
             raise MeshFileError(f"needs {name}, which cannot be read: export without it")
     for node in (node for node in header.get("nodes", ()) if "mesh" in node):
-        if _INSTANCING in node.get("extensions", {}):
-            raise MeshFileError(
-                f"places copies by {_INSTANCING}, which cannot be read: export them as objects of "
-                "their own"
-            )
         if "skin" in node:
             raise MeshFileError(
                 "moves vertices by a skeleton, which is not supported: apply the pose, then export"
@@ -115,11 +127,17 @@ def _roots(header: dict[str, Any]) -> list[int]:
 class _Reader:
     """Nodes, meshes, accessors and buffers by their numbers, each read once."""
 
-    def __init__(self, header: dict[str, Any], body: bytes, path: Path, size: int) -> None:
-        self._header, self._body, self._path = header, body, path
+    def __init__(
+        self, header: dict[str, Any], body: bytes, path: Path, size: int, masks: bool
+    ) -> None:
+        self._header, self._body, self._path, self._masks = header, body, path, masks
         self._allowance = Allowance(size, SMALLER)
         self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
+        self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
+        self._mask = remembered(self._read_mask)
+        self._image_files: set[Path] = set()
+        self.notes = MaskNotes()
 
     def _part(self, kind: str, index: Any) -> dict[str, Any]:
         """Part of the file by its number; a negative one would count from the end."""
@@ -129,11 +147,31 @@ class _Reader:
     def node(self, index: int) -> Node:
         """Node `index`; without a name it gets that of its mesh."""
         found = self._part("nodes", index)
-        name, meshes = str(found.get("name") or ""), []
+        name, meshes, copies = str(found.get("name") or ""), [], None
         if "mesh" in found:
             name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
             meshes = self._mesh(found["mesh"])
-        return Node(name, _matrix(found), meshes, found.get("children", ()))
+            if instancing := found.get("extensions", {}).get(_INSTANCING):
+                copies = self._copies(instancing.get("attributes", {}))
+        return Node(name, _matrix(found), meshes, found.get("children", ()), copies)
+
+    def _copies(self, attributes: dict[str, Any]) -> NDArray[np.float64] | None:
+        """Matrices (k, 4, 4) of the copies of a node's mesh; None if it has one place."""
+        named = ("TRANSLATION", "ROTATION", "SCALE")
+        indices = {name: attributes[name] for name in named if name in attributes}
+        if not indices:
+            return None
+        counts = [_natural(self._part("accessors", at)["count"]) for at in indices.values()]
+        if len({*counts}) > 1:
+            raise ValueError(f"the attributes of {_INSTANCING} have {counts} rows")
+        if counts[0] > MOST_NODES:
+            raise MeshFileError(
+                f"places a mesh {counts[0]:,} times by {_INSTANCING}, of at most {MOST_NODES:,}: "
+                "export it in parts"
+            )
+        self._allowance.take(2 * 128 * counts[0])
+        rows = {name: self._accessor(at).astype(np.float64) for name, at in indices.items()}
+        return _matrices(*(rows.get(name) for name in named))
 
     def _read_mesh(self, index: int) -> list[Mesh]:
         """One mesh of all primitives, which differ by material only."""
@@ -142,14 +180,16 @@ class _Reader:
         name = str(mesh.get("name") or self._path.stem)
         return joined(name, map(self._primitive, surfaces), self._allowance)
 
-    def _primitive(self, primitive: dict[str, Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
-        """Vertices (v, 3) and faces (f, 3)."""
+    def _primitive(self, primitive: dict[str, Any]) -> Piece:
         position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")
         packed = primitive.get("extensions", {}).get(_DRACO)
         if position is None:
-            return np.empty((0, 3)), np.empty((0, 3), np.int64)
+            return Piece(np.empty((0, 3)), np.empty((0, 3), np.int64))
         if packed and "bufferView" not in self._part("accessors", position):
-            return _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
+            mesh = _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
+            vertices = np.asarray(mesh.points).reshape(-1, 3)
+            faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+            return self._cut(Piece(vertices, faces), primitive, mesh)
         vertices = self._accessor(position)
         mode = primitive.get("mode", 4)
         # The corners, and the triangles of strips and fans, before they are checked.
@@ -159,8 +199,113 @@ class _Reader:
         if index is not None:
             corners = self._accessor(index)[:, 0].astype(np.int64)
         if mode == 4:
-            return vertices, corners[: len(corners) // 3 * 3].reshape(-1, 3)
-        return vertices, unrolled(corners) if mode == 5 else fanned(corners)
+            faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        else:
+            faces = unrolled(corners) if mode == 5 else fanned(corners)
+        return self._cut(Piece(vertices, faces), primitive)
+
+    def _cut(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
+        """Return a piece with the mask of its material; `mesh` is unpacked by Draco."""
+        number = primitive.get("material")
+        if number is None or not self._masks or not len(piece.faces):
+            return piece
+        with self.notes.instead(self._material_name(number)):
+            found = self._texture(number)
+            if found is not None:
+                texture, info = found
+                uv = self._coordinates(info, primitive, mesh)
+                return piece._replace(cutout=texture.cutout(uv, piece.faces))
+        return piece
+
+    def _material_name(self, number: Any) -> str:
+        try:
+            name = str(self._part("materials", number).get("name") or "")
+        except (ValueError, KeyError, IndexError, TypeError, AttributeError):
+            name = ""
+        return name[:80] or f"material {str(number)[:20]}"
+
+    def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
+        """Texture of a material, and its use of it; None if the material is solid."""
+        with self.notes.instead(self._material_name(number)):
+            return self._transparent(number)
+        return None
+
+    def _transparent(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
+        material = self._part("materials", number)
+        mode = material.get("alphaMode", "OPAQUE")
+        if mode not in ("MASK", "BLEND"):
+            if _extension(material, _TRANSMISSION).get("transmissionFactor", 0) > 0:
+                self.notes.glass[self._material_name(number)] = None
+            return None
+        usual, glossy = material.get("pbrMetallicRoughness", {}), _extension(material, _GLOSSY)
+        info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
+        factor = usual.get("baseColorFactor") or glossy.get("diffuseFactor") or (1, 1, 1, 1)
+        cutoff = material.get("alphaCutoff", 0.5) if mode == "MASK" else 0.5
+        passing = np.flatnonzero(np.arange(256) / 255 * factor[3] >= cutoff)
+        least = int(passing[0]) if len(passing) else 256
+        texture = {} if info is None else self._part("textures", info["index"])
+        image = -1 if info is None else _image_of(texture)
+        opacity = None if info is None else self._opacity(image)
+        if info is None or opacity is None or (mode == "BLEND" and opacity.max() < least):
+            if least > 255 or opacity is not None:
+                self.notes.glass[self._material_name(number)] = None
+            return None
+        if opacity.min() >= least:
+            return None
+        sampler = self._part("samplers", texture["sampler"]) if "sampler" in texture else {}
+        along, across = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
+        return self._mask((image, least, along, across)), info
+
+    def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
+        """Texture of an image, its least alpha that stops light, and how it goes on."""
+        image, least, along, across = key
+        opacity = self._opacity(image)
+        assert opacity is not None
+        return Texture(opacity >= least, (along, across), self._allowance)
+
+    def _read_opacity(self, index: int) -> NDArray[np.uint8] | None:
+        """Opacity of an image; None if it is opaque everywhere."""
+        image = self._part("images", index)
+        if "bufferView" in image:
+            return read_opacity(bytes(self._view(image["bufferView"])), self._allowance)
+        uri = image["uri"]
+        if uri.startswith("data:"):
+            return read_opacity(_inline(uri), self._allowance)
+        try:
+            file = file_beside(self._path, spellings(uri))
+        except MeshFileError as error:
+            raise MaskError(str(error)) from error
+        if file is None:
+            raise MaskError(f"its image {uri[-80:]!r} is not there")
+        if file not in self._image_files:
+            self._image_files.add(file)
+            self._allowance.grow(file.stat().st_size)
+        return read_opacity(file, self._allowance)
+
+    def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
+        """Texture coordinates (v, 2) of a primitive."""
+        moved = _extension(info, "KHR_texture_transform")
+        name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
+        if name not in primitive["attributes"]:
+            raise MaskError("texture coordinates are missing")
+        accessor = primitive["attributes"][name]
+        if mesh is None:
+            uv = self._accessor(accessor)
+        else:
+            packed = primitive["extensions"][_DRACO]["attributes"][name]
+            uv = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
+            if self._part("accessors", accessor).get("normalized"):
+                uv = self._normalised(uv)
+        if uv.shape[1] != 2:
+            raise MaskError("its texture coordinates are not pairs")
+        if moved:
+            # Of KHR_texture_transform: scaled, rotated anticlockwise as v grows down, moved.
+            turn = float(moved.get("rotation", 0))
+            c, s = np.cos(turn), np.sin(turn)
+            self._allowance.take(32 * len(uv))
+            uv = uv * np.array(moved.get("scale", (1, 1)), np.float64)
+            uv = uv @ np.array([[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
+        return uv
 
     def _read_accessor(self, index: int) -> NDArray[Any]:
         """Numbers (count, width) of an accessor; those of a buffer are not copied."""
@@ -182,11 +327,14 @@ class _Reader:
             rows = self._array(changed, where, sparse["count"], 1)[:, 0]
             numbers = numbers.copy()
             numbers[rows] = self._array(values, kind, sparse["count"], width)
-        if accessor.get("normalized") and kind.kind in "iu":
-            self._allowance.take(8 * numbers.size)
-            # glTF 2.0, 3.6.2.2
-            return np.maximum(numbers / np.iinfo(kind).max, -1.0)
-        return numbers
+        return self._normalised(numbers) if accessor.get("normalized") else numbers
+
+    def _normalised(self, numbers: NDArray[Any]) -> NDArray[Any]:
+        """Fractions that integers stand for; glTF 2.0, 3.6.2.2."""
+        if numbers.dtype.kind not in "iu":
+            return numbers
+        self._allowance.take(8 * numbers.size)
+        return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
 
     def _array(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
         """Numbers (count, width) of a buffer view, from `at['byteOffset']` on."""
@@ -212,9 +360,7 @@ class _Reader:
                 raise MeshFileError("has a buffer without content, as packed files have: unpack it")
             content = self._body
         elif uri.startswith("data:"):
-            kind, _, text = uri.partition(",")
-            content = unquote_to_bytes(text)
-            content = base64.b64decode(content) if kind.endswith(";base64") else content
+            content = _inline(uri)
         else:
             content = self._beside(uri)
         if len(content) < buffer["byteLength"]:
@@ -225,23 +371,39 @@ class _Reader:
         return content
 
     def _read_beside(self, uri: str) -> bytes:
-        """Read a buffer file: names are escaped by the standard, but not by all programs."""
-        folder = self._path.parent.resolve()
-        targets = [folder / name for name in (uri.strip(), unquote(uri.strip()))]
-        if not all(target.resolve().is_relative_to(folder) for target in targets):
+        """Read a buffer file."""
+        try:
+            target = file_beside(self._path, spellings(uri))
+        except MeshFileError as error:
+            raise MeshFileError(f"{error}: export it as .glb, in one file") from error
+        if target is None:
             raise MeshFileError(
-                f"takes data from {uri[:80]!r}, but only files in its own folder are read: "
-                "export it as .glb, in one file"
+                f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "
+                "as .glb"
             )
-        for target in targets:
-            if target.is_file():  # reading a pipe would wait for ever
-                content = target.read_bytes()
-                self._allowance.grow(len(content))
-                return content
-        raise MeshFileError(
-            f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export as "
-            ".glb"
-        )
+        content = target.read_bytes()
+        self._allowance.grow(len(content))
+        return content
+
+
+def _inline(uri: str) -> bytes:
+    """Content of a data URI."""
+    kind, _, text = uri.partition(",")
+    content = unquote_to_bytes(text)
+    return base64.b64decode(content) if kind.endswith(";base64") else content
+
+
+def _extension(part: dict[str, Any], name: str) -> dict[str, Any]:
+    found: dict[str, Any] = part.get("extensions", {}).get(name, {})
+    return found
+
+
+def _image_of(texture: dict[str, Any]) -> int:
+    """Return the number of a texture's image, of those in formats that can be read."""
+    index = texture.get("source", _extension(texture, "EXT_texture_webp").get("source"))
+    if index is None:
+        raise MaskError("its image is in a format that cannot be read")
+    return _natural(index)
 
 
 def _natural(number: Any) -> int:
@@ -255,21 +417,40 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
     """Matrix (4, 4) of a node, from its columns or from translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
-    rotation = np.array(node.get("rotation", (0, 0, 0, 1)), np.float64)
-    x, y, z, w = rotation / np.linalg.norm(rotation)
-    turn = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
-    out = np.eye(4)
-    out[:3, :3] = turn * np.array(node.get("scale", (1, 1, 1)), np.float64)
-    out[:3, 3] = node.get("translation", (0, 0, 0))
+    rows = (
+        np.array([node[name]], np.float64) if name in node else None
+        for name in ("translation", "rotation", "scale")
+    )
+    matrices = _matrices(*rows)
+    return np.eye(4) if matrices is None else matrices[0]
+
+
+def _matrices(
+    translation: NDArray[np.float64] | None,
+    rotation: NDArray[np.float64] | None,
+    scale: NDArray[np.float64] | None,
+) -> NDArray[np.float64] | None:
+    """Matrices (k, 4, 4) of translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
+    rows = next((one for one in (translation, rotation, scale) if one is not None), None)
+    if rows is None:
+        return None
+    out = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rotation is not None:
+        x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
+        out[:, :3, :3] = np.array([
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]).transpose(2, 0, 1)  # fmt: skip
+    if scale is not None:
+        out[:, :3, :3] *= scale[:, None]
+    if translation is not None:
+        out[:, :3, 3] = translation
     return out
 
 
-def _unpacked(data: bytes, allowance: Allowance) -> tuple[NDArray[Any], NDArray[np.int64]]:
-    """Vertices and faces that are packed with Draco."""
+def _unpacked(data: bytes, allowance: Allowance) -> Any:
+    """Mesh that is packed with Draco."""
     try:
         import DracoPy
     except ImportError as error:
@@ -277,8 +458,7 @@ def _unpacked(data: bytes, allowance: Allowance) -> tuple[NDArray[Any], NDArray[
             f"is packed with {_DRACO}: install DracoPy to read it, or export without it"
         ) from error
     allowance.take(24 * sum(_draco_counts(data)))
-    mesh = DracoPy.decode(data)
-    return np.asarray(mesh.points).reshape(-1, 3), np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+    return DracoPy.decode(data)
 
 
 def _draco_counts(data: bytes) -> tuple[int, int]:

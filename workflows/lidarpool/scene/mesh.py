@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from functools import cached_property
-from itertools import product
 from typing import Any
 
 import numpy as np
@@ -83,10 +82,9 @@ class Mesh:
         _check_cutouts(self.name, self.cutouts, len(faces))
 
     @cached_property
-    def box(self) -> NDArray[np.float64]:
-        """Corners of its bounding box, (8, 3)."""
-        low, high = self.vertices.min(axis=0), self.vertices.max(axis=0)
-        return np.array(list(product(*zip(low, high, strict=True))))
+    def bounds(self) -> NDArray[np.float64]:
+        """Lowest and highest corner of its vertices, (2, 3)."""
+        return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
     def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""

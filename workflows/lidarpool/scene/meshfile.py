@@ -6,6 +6,7 @@ import codecs
 import logging
 import re
 from collections.abc import Callable, Sequence
+from itertools import product
 from pathlib import Path
 from typing import Literal
 
@@ -16,7 +17,7 @@ from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError, prefixed
 from ..base.vocabulary import UNITS_M
-from ..base.words import did_you_mean
+from ..base.words import did_you_mean, printable
 from .dae import read_dae
 from .gltf import read_gltf
 from .instances import Instance
@@ -28,17 +29,19 @@ from .transform import UP_AXES, Transform
 
 # A reader gets the content of a file and its path. It raises MeshFileError for unsupported content,
 # and any error for a broken file. All are our own; their modules say why no library is used.
-_READERS: dict[str, Callable[[bytes, Path], Content]] = {
+_MASKED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether to read masks
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".obj": read_obj,
+}
+_READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".stl": read_stl,
     ".ply": read_ply_mesh,
     ".off": read_off,
     ".dae": read_dae,
     ".3mf": read_3mf,
 }
-SUFFIXES = tuple(_READERS)
+SUFFIXES = (*_MASKED, *_READERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -47,7 +50,8 @@ OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 FARTHEST_M = 1e8
 _HEAD = 200  # bytes of a file that such a comment is in
-_LETTERS = 200  # of a name, or of what a reader says
+
+Opacity = Literal["mask", "ignore"]
 
 _log = logging.getLogger(__name__)
 
@@ -59,6 +63,7 @@ def load_meshes(
     unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
     up_axis: Literal[tuple(UP_AXES)] | None = None,  # type: ignore[valid-type]
     transform: Transform | None = None,
+    opacity: Opacity = "mask",
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
 ) -> tuple[Mesh | Instance, ...]:
@@ -79,8 +84,12 @@ def load_meshes(
         else Z-up.
     transform
         Placement in the world, in metres, after unit and up axis.
+    opacity
+        With "mask", light passes where the image of a material is transparent (.glb, .gltf, .obj).
+        With "ignore", triangles are solid, and no image is read.
     tell
-        Called with a line on objects left out; by default this module's logger warns.
+        Called with a line on objects left out, on masks that cannot be read, or on materials that
+        may be glass; by default this module's logger warns.
     axes
         Called with a line on axes that a file did not state, or that were turned; by default this
         module's logger has it, as a warning if the scene seems to lie on its side.
@@ -100,7 +109,7 @@ def load_meshes(
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
-            content = _read_whole(path, data)
+            content = _read_whole(path, data, opacity)
         except LidarpoolError as error:
             raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
@@ -111,6 +120,8 @@ def load_meshes(
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
+    for note in content.notes:
+        tell(f"{path} {note}")
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, meshes, axes)
     return meshes
@@ -152,13 +163,17 @@ def _lies(content: Content, meshes: Sequence[Mesh | Instance]) -> str:
     return ""
 
 
-def _read_whole(path: Path, data: bytes) -> Content:
+def _read_whole(path: Path, data: bytes, opacity: Opacity) -> Content:
     """Read any file: returns at least one mesh, or raises LidarpoolError."""
     try:
         for beginning, what in _FOREIGN.items():
             if re.match(beginning, data):
                 raise MeshFileError(what)
-        content = _READERS[path.suffix.lower()](data, path)
+        suffix = path.suffix.lower()
+        if suffix in _MASKED:
+            content = _MASKED[suffix](data, path, opacity == "mask")
+        else:
+            content = _READERS[suffix](data, path)
         if not content.meshes:
             if content.skipped:
                 raise MeshFileError("has no triangles that are not scaled to zero")
@@ -176,7 +191,7 @@ def _read_whole(path: Path, data: bytes) -> Content:
     except Exception as error:
         # Readers raise whatever they stumble over: ValueError, IndexError, KeyError, BadZipFile,
         # ParseError, struct.error, …
-        reason = _printable(str(error)) or type(error).__name__
+        reason = printable(str(error)) or type(error).__name__
         raise LidarpoolError(
             f"{path} is broken or cut short ({reason}): export it again."
         ) from error
@@ -238,7 +253,7 @@ def _other_format(path: Path, data: bytes) -> str:
 
 def _placed(one: Mesh | Instance, stem: str, places: Sequence[Transform]) -> Mesh | Instance:
     """Object in the world, with a name that is safe for terminals and files."""
-    name = _printable(one.name) or _printable(stem)
+    name = printable(one.name) or printable(stem)
     for place in places:
         one = one.moved(name, place.linear, place.offset)
     reach = np.abs(_corners(one)).max()
@@ -253,11 +268,6 @@ def _placed(one: Mesh | Instance, stem: str, places: Sequence[Transform]) -> Mes
 def _corners(one: Mesh | Instance) -> NDArray[np.float64]:
     """Points that an object lies between, in the world."""
     if isinstance(one, Mesh):
-        return one.vertices
-    return np.asarray(one.mesh.box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
-
-
-def _printable(text: str) -> str:
-    """Text from a file as one line of limited length, without control characters."""
-    kept = "".join(c if c.isprintable() else " " for c in text)
-    return " ".join(kept.split())[:_LETTERS]
+        return one.bounds
+    box = np.array(list(product(*one.mesh.bounds.T)))
+    return np.asarray(box @ one.matrix[:3, :3].T + one.matrix[:3, 3])

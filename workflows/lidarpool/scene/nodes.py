@@ -6,6 +6,7 @@ from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import chain
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,13 +14,14 @@ from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, bytes_of, memory_share
 from .instances import Instance
-from .mesh import Mesh, stacked
+from .mesh import Cutout, Mesh, stacked
 from .polygons import check_corners
 
 SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to too much
 # A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
 SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
+MOST_TRIANGLES = np.iinfo(np.int32).max  # of all places
 
 
 class MeshFileError(Exception):
@@ -38,6 +40,7 @@ class Content:
     up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
     generator: str = ""  # the program that wrote it, if known
     skipped: list[str] = field(default_factory=list)  # names of objects that nodes scale to zero
+    notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
 
 
 @dataclass
@@ -48,6 +51,8 @@ class Node:
     matrix: NDArray[np.float64]  # (4, 4), from its coordinates to those of its parent
     meshes: Sequence[Mesh] = ()  # in its coordinates; the same objects wherever a mesh is used
     children: Iterable[Hashable] = ()  # keys of the nodes in it
+    # (k, 4, 4), to its coordinates: its meshes are in all these places; None for one
+    copies: NDArray[np.float64] | None = None
 
 
 class Place(NamedTuple):
@@ -67,29 +72,36 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
     Raises
     ------
     MeshFileError
-        If nodes contain each other without end, or some hundred thousand times.
+        If nodes contain each other without end, or there are some hundred thousand places.
     """
     node_of = cache(node_of)
     placed, begun = [], 0
     stack = [(key, np.eye(4), "") for key in reversed(list(roots))]
     while stack:
         key, above, name = stack.pop()
-        begun += 1
         node = node_of(key)
-        matrix, name = above @ node.matrix, node.name or name
-        placed += [Place(mesh, matrix, name or mesh.name or stem) for mesh in node.meshes]
-        stack += [(child, matrix, name) for child in reversed(list(node.children))]
+        begun += 1 if node.copies is None else 1 + len(node.copies)
         # A few lines can make any number of nodes.
         if begun + len(stack) > MOST_NODES:
             raise MeshFileError(
-                f"has nodes that contain each other, more than {MOST_NODES:,} in all: export it "
-                "again"
+                f"has nodes that contain each other, or copies, more than {MOST_NODES:,} in all: "
+                "export it in parts"
             )
+        matrix, name = above @ node.matrix, node.name or name
+        places = [matrix] if node.copies is None else matrix @ node.copies
+        placed += [
+            Place(mesh, place, name or mesh.name or stem)
+            for place in places
+            for mesh in node.meshes
+        ]
+        stack += [(child, matrix, name) for child in reversed(list(node.children))]
     return placed
 
 
 def settled(placed: Sequence[Place]) -> Content:
     """Make instances of meshes that many places share, and copy the others to their places.
+
+    Meshes with masks are not copied either, since each copy would have a part of its own.
 
     Raises
     ------
@@ -99,19 +111,32 @@ def settled(placed: Sequence[Place]) -> Content:
     objects: list[Mesh | Instance] = []
     content = Content(objects)
     uses = Counter(mesh for mesh, _, _ in placed)
-    shared = {mesh for mesh, n in uses.items() if (n - 1) * len(mesh.faces) >= SHARED_TRIANGLES}
+    shared = {
+        mesh
+        for mesh, n in uses.items()
+        if (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
+    }
     own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, _, _ in placed if mesh not in shared]
     if sum(own) > memory_share():
         raise MeshFileError(
             f"places {len(own):,} objects, which would take {bytes_of(sum(own))}, of at most "
             f"{bytes_of(memory_share())}, a quarter of the memory: {SMALLER}"
         )
-    for mesh, matrix, name in placed:
-        if not np.isfinite(matrix).all() or not np.array_equal(matrix[3], [0, 0, 0, 1]):
-            raise MeshFileError(
-                f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
-            )
-        rank = np.linalg.matrix_rank(matrix[:3, :3])
+    triangles = sum(n * len(mesh.faces) for mesh, n in uses.items())
+    if triangles > MOST_TRIANGLES:
+        raise MeshFileError(
+            f"places {len(placed):,} objects of {triangles:,} triangles in all, of at most "
+            f"{MOST_TRIANGLES:,}: {SMALLER}"
+        )
+    matrices = np.array([matrix for _, matrix, _ in placed]).reshape(-1, 4, 4)
+    good = np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
+    if not good.all():
+        _, matrix, name = placed[int(good.argmin())]
+        raise MeshFileError(
+            f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
+        )
+    ranks = np.linalg.matrix_rank(matrices[:, :3, :3])
+    for (mesh, matrix, name), rank in zip(placed, ranks.tolist(), strict=True):
         if rank < 2:
             content.skipped.append(name)
         elif mesh in shared and rank == 3:
@@ -121,28 +146,46 @@ def settled(placed: Sequence[Place]) -> Content:
     return content
 
 
-def joined(
-    name: str, parts: Iterable[tuple[NDArray[np.float64], NDArray[np.int64]]], allowance: Allowance
-) -> list[Mesh]:
-    """Join several (vertices, faces) to one mesh; none without faces.
+class Piece(NamedTuple):
+    """Triangles of a mesh, all opaque or all with one mask."""
+
+    vertices: NDArray[Any]  # (v, 3)
+    faces: NDArray[np.int64]  # (f, 3)
+    cutout: Cutout | None = None
+
+
+def joined(name: str, pieces: Iterable[Piece], allowance: Allowance) -> list[Mesh]:
+    """Join pieces to one mesh, those with masks last; none without faces.
 
     Raises
     ------
     ValueError
         If a face refers to a missing vertex; LidarpoolError if it takes more than allowed.
     """
-    kept = [_own(vertices, faces, allowance) for vertices, faces in parts if len(faces)]
-    return [Mesh(name, *stacked(kept))] if kept else []
+    solid: list[Piece] = []
+    masked: dict[int, list[Piece]] = {}  # {id of a mask: its pieces}
+    for piece in pieces:
+        if len(piece.faces):
+            own = _own(piece, allowance)
+            cut = own.cutout
+            (solid if cut is None else masked.setdefault(id(cut.mask), [])).append(own)
+    if not solid and not masked:
+        return []
+    cutouts = []
+    for some in masked.values():
+        cuts = [piece.cutout for piece in some if piece.cutout]
+        cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
+    ordered = [(one.vertices, one.faces) for one in chain(solid, *masked.values())]
+    return [Mesh(name, *stacked(ordered), tuple(cutouts))]
 
 
-def _own(
-    vertices: NDArray[np.float64], faces: NDArray[np.int64], allowance: Allowance
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Vertices and faces, without unused vertices if many parts may share all of them."""
+def _own(piece: Piece, allowance: Allowance) -> Piece:
+    """Return a piece without unused vertices, if many pieces may share all of them."""
+    vertices, faces, cutout = piece
     check_corners(faces, len(vertices))
-    allowance.take(faces.nbytes)
+    allowance.take(faces.nbytes + (0 if cutout is None else cutout.uv.nbytes))
     if faces.size < len(vertices):
         used, faces = np.unique(faces, return_inverse=True)
         vertices, faces = vertices[used], faces.reshape(-1, 3)
     allowance.take(24 * len(vertices))  # in double precision
-    return vertices, faces
+    return Piece(vertices, faces, cutout)

@@ -19,9 +19,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from .mesh import Mesh
+from ..base.words import as_text
+from .masks import MaskNotes
+from .mesh import Cutout, Mesh
+from .mtl import Materials, ObjTexture
 from .nodes import Content, MeshFileError
-from .polygons import triangulated
+from .polygons import check_corners, triangulated
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
@@ -42,39 +45,67 @@ class _Polygons:
         self.corners.extend(corners)
         self.sizes.append(len(corners))
 
-    def mesh(self, name: str, vertices: Float) -> list[Mesh]:
-        """As `_mesh`."""
-        return _mesh(
-            name,
-            vertices,
-            np.frombuffer(self.corners, np.int64),
-            np.frombuffer(self.sizes, np.int64),
-        )
+    def faces(self, vertices: Float) -> Int:
+        """Triangles (t, 3)."""
+        return triangulated(vertices, _ints(self.corners), _ints(self.sizes))
 
 
-def _mesh(name: str, vertices: Float, corners: Int, sizes: Int) -> list[Mesh]:
-    """One mesh of polygons, with the vertices that it uses; none without polygons."""
-    faces = triangulated(vertices, corners, sizes)
+def _ints(numbers: array[int]) -> Int:
+    return np.frombuffer(numbers, np.int64)
+
+
+def _mesh(name: str, vertices: Float, faces: Int, cutouts: tuple[Cutout, ...] = ()) -> list[Mesh]:
+    """One mesh of triangles, with the vertices that it uses; none without triangles."""
     if not len(faces):
         return []
     used, own = np.unique(faces, return_inverse=True)
-    return [Mesh(name, vertices[used], own.reshape(-1, 3))]
+    return [Mesh(name, vertices[used], own.reshape(-1, 3), cutouts)]
 
 
 # -- .obj ----------------------------------------------------------------------------------------
 
+_MOST = 1 << 62  # texture coordinates that a number may name
 
-def read_obj(data: bytes, path: Path) -> Content:
+
+@dataclass
+class _Object(_Polygons):
+    """An object: its opaque polygons, and those with masks."""
+
+    masked: dict[bytes, _Masked] = field(default_factory=dict)  # {material: polygons}
+
+
+@dataclass
+class _Masked(_Polygons):
+    """Polygons of one material, with the texture coordinates of each corner, from 0."""
+
+    places: array[int] = field(default_factory=lambda: array("q"))
+
+    def triangles(self, vertices: Float) -> tuple[Int, Int]:
+        """Vertices (t, 3) and texture coordinates (t, 3) of triangles."""
+        corners = _ints(self.corners)
+        check_corners(corners, len(vertices))
+        own = triangulated(vertices[corners], np.arange(len(corners)), _ints(self.sizes))
+        return corners[own], _ints(self.places)[own]
+
+
+def read_obj(data: bytes, path: Path, masks: bool = True) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
-    Objects are in order of their first face; materials do not divide them.
+    Objects are in order of their first face; materials do not divide them. Without `masks`,
+    triangles are solid, and neither materials nor images are read.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
-    numbers = array("d")
-    parts = {path.stem: _Polygons()}
-    part = parts[path.stem]
+    notes = MaskNotes()
+    textures: dict[bytes, ObjTexture] = {}  # {material: its mask}
+    if masks and (libraries := _obj_names(b"mtllib", text)):
+        textures = Materials(path, len(data), notes).textures(
+            libraries, _obj_names(b"usemtl", text)
+        )
+    numbers, coordinates = array("d"), array("d")
+    parts = {path.stem: _Object()}
+    part, material = parts[path.stem], b""
     for line in text.split(b"\n"):
         key, _, rest = line.lstrip(b" ").partition(b" ")
         if key == b"v":
@@ -83,11 +114,63 @@ def read_obj(data: bytes, path: Path) -> Content:
                 raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
             numbers.extend(map(float, words))
         elif key == b"f":
-            part.add(_obj_corners(rest.partition(b"#")[0], len(numbers) // 3, line))
+            rest = rest.partition(b"#")[0]
+            corners = _obj_corners(rest, len(numbers) // 3, line)
+            if material in textures and len(corners) > 2:
+                masked = part.masked.setdefault(material, _Masked())
+                masked.add(corners)
+                masked.places.extend(_obj_places(rest, len(coordinates) // 2))
+            else:
+                part.add(corners)
         elif key == divider:
-            part = parts.setdefault(_text(rest.strip()) or path.stem, _Polygons())
+            part = parts.setdefault(as_text(rest.strip()) or path.stem, _Object())
+        elif key == b"usemtl":
+            material = rest.strip()
+        elif key == b"vt" and textures:
+            coordinates.extend(_obj_coordinates(rest))
     vertices = np.frombuffer(numbers).reshape(-1, 3)
-    return Content([mesh for name, part in parts.items() for mesh in part.mesh(name, vertices)])
+    uv = np.frombuffer(coordinates).reshape(-1, 2)
+    meshes = []
+    for name, part in parts.items():
+        faces, cutouts = [part.faces(vertices)], []
+        for material, masked in part.masked.items():
+            own, places = masked.triangles(vertices)
+            cutout = None
+            if len(own):
+                with notes.instead(as_text(material)):
+                    cutout = textures[material].cutout(uv, places)
+            if cutout is None:
+                faces.insert(0, own)
+            else:
+                faces.append(own)
+                cutouts.append(cutout)
+        meshes += _mesh(name, vertices, np.concatenate(faces), tuple(cutouts))
+    return Content(meshes, notes=notes.lines())
+
+
+def _obj_names(key: bytes, text: bytes) -> list[bytes]:
+    """Find what follows a word at the beginning of lines, each once and in order."""
+    found = re.findall(rb"^ *%s +(.*)$" % key, text, re.MULTILINE)
+    return list(dict.fromkeys(name.strip() for name in found))
+
+
+def _obj_coordinates(rest: bytes) -> list[float]:
+    """Two texture coordinates; NaN where there is no number."""
+    try:
+        u, v = [*map(float, rest.partition(b"#")[0].split()[:2]), 0.0][:2]
+    except ValueError:
+        u = v = np.nan
+    return [u, v]
+
+
+def _obj_places(rest: bytes, count: int) -> list[int]:
+    """Texture coordinates of a face's corners, from 0, or below; `count` are known so far."""
+    words = [word.split(b"/") for word in rest.split()]
+    try:
+        numbers = [min(int(word[1]), _MOST) for word in words]
+    except (IndexError, ValueError):
+        return [-1] * len(words)
+    return [number - 1 if number >= 0 else max(-1, count + number) for number in numbers]
 
 
 def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
@@ -103,16 +186,8 @@ def _obj_corners(rest: bytes, count: int, line: bytes) -> list[int]:
     return [number - 1 for number in numbers]
 
 
-def _text(name: bytes) -> str:
-    """Name in UTF-8, or in Latin-1 from old programs."""
-    try:
-        return name.decode("utf-8")
-    except UnicodeDecodeError:
-        return name.decode("latin-1")
-
-
 def _shown(line: bytes) -> str:
-    return _text(line.strip()[:60])
+    return as_text(line.strip()[:60])
 
 
 # -- .off ----------------------------------------------------------------------------------------
@@ -149,7 +224,8 @@ def read_off(data: bytes, path: Path) -> Content:
         if not 0 <= size < len(line):
             raise ValueError(f"a face of {size} corners has {len(line) - 1}")
         polygon.add(list(map(int, line[1 : size + 1])))
-    return Content(polygon.mesh(path.stem, np.frombuffer(numbers).reshape(-1, 3)))
+    vertices = np.frombuffer(numbers).reshape(-1, 3)
+    return Content(_mesh(path.stem, vertices, polygon.faces(vertices)))
 
 
 # -- .stl ----------------------------------------------------------------------------------------
@@ -179,7 +255,7 @@ def read_stl(data: bytes, path: Path) -> Content:
         vertices = np.array(list(map(float, chain.from_iterable(words)))).reshape(-1, 3)
         if len(vertices) != 3 * len(re.findall(rb"\bendfacet", body, re.IGNORECASE)):
             raise ValueError("a facet is not a triangle")
-        meshes += _stl_mesh(_text(head.strip()) or path.stem, vertices)
+        meshes += _stl_mesh(as_text(head.strip()) or path.stem, vertices)
     return Content(meshes)
 
 
@@ -228,7 +304,7 @@ def read_ply_mesh(data: bytes, path: Path) -> Content:
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
         raise ValueError("vertex indices of faces are not whole numbers")
-    return Content(_mesh(path.stem, vertices, corners, sizes))
+    return Content(_mesh(path.stem, vertices, triangulated(vertices, corners, sizes)))
 
 
 def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:

@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
+from ..sensor import Pose
 from .actors import Actor
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
-from .meshfile import load_meshes
+from .meshfile import Opacity, load_meshes
 from .shapes import seed_objects
 from .transform import Transform
 
@@ -112,6 +113,7 @@ class Scene:
         unit: str | None = None,
         up_axis: str | None = None,
         transform: Transform | None = None,
+        opacity: Opacity = "mask",
     ) -> Scene:
         """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf.
 
@@ -128,13 +130,18 @@ class Scene:
         transform
             Placement of the mesh in the world, in metres, after unit and up axis: a
             `lidarpool.scene.transform.Transform`.
+        opacity
+            With "mask", light passes where the image of a material is transparent (.glb, .gltf,
+            .obj). With "ignore", triangles are solid, and no image is read.
 
         Raises
         ------
         LidarpoolError
             If the file cannot be read completely, or has no triangles.
         """
-        return cls.from_meshes(load_meshes(path, unit=unit, up_axis=up_axis, transform=transform))
+        return cls.from_meshes(
+            load_meshes(path, unit=unit, up_axis=up_axis, transform=transform, opacity=opacity)
+        )
 
     @classmethod
     @checked
@@ -203,7 +210,9 @@ class Scene:
         origin = local_origin(np.concatenate(ends))
         if instances is not None and origin.any():
             transforms = transforms - np.pad(origin[:, None], ((0, 0), (3, 0)))
+            bounds = instances.bounds - origin
             instances = replace(instances, transforms=transforms)
+            vars(instances)["bounds"] = bounds  # which take time
         return cls(
             vertices=vertices - origin,
             faces=faces.astype(np.int32),
@@ -231,10 +240,36 @@ class Scene:
         object.__setattr__(scene, "actors", found)
         return scene
 
+    def moved(self, owner: int, pose: Pose) -> Scene:
+        """Return the same scene with the instances of an object at a pose of their mesh's axes.
+
+        They keep their scale; the pose is in local coordinates.
+        """
+        assert self.instances is not None
+        scene = copy(self)
+        for made_before in ("bounds", "object_bounds", "footprints"):
+            vars(scene).pop(made_before, None)
+        moved = self.instances.moved(owner, np.array(pose.position), pose.rotation)
+        object.__setattr__(scene, "instances", moved)
+        return scene
+
     @property
     def all_names(self) -> tuple[str, ...]:
         """Names of all objects, actors after the others."""
+        if not self.actors:
+            return self.names
         return unique_names((*self.names, *(actor.name for actor in self.actors)))
+
+    @property
+    def masked(self) -> tuple[str, ...]:
+        """Names of the objects that stop light only in part, in order."""
+        owners = set()
+        if (shared := self.instances) is not None:
+            cut = np.array([part.mask is not None for part in shared.parts])
+            owners = set(shared.owner[cut[shared.part]].tolist())
+        own = len(self.names)
+        owners |= {own + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
+        return tuple(name for i, name in enumerate(self.all_names) if i in owners)
 
     @property
     def triangles(self) -> int:
@@ -312,12 +347,18 @@ class Scene:
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
         """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
+        ends = self._own_bounds
+        if self.instances:
+            ends = np.concatenate([ends, self.instances.bounds.reshape(-1, 3)])
+        return np.stack([ends.min(axis=0), ends.max(axis=0)])
+
+    @cached_property
+    def _own_bounds(self) -> NDArray[np.float64]:
+        """Bounds of `faces` alone: (2, 3), or (0, 3) if there are none."""
         there = np.zeros(len(self.vertices), np.bool_)
         there[self.faces] = True
         used = self.vertices[there]
-        if self.instances:
-            used = np.concatenate([used, self.instances.bounds.reshape(-1, 3)])
-        return np.stack([used.min(axis=0), used.max(axis=0)])
+        return np.stack([used.min(axis=0), used.max(axis=0)]) if len(used) else used
 
     @cached_property
     def object_bounds(self) -> NDArray[np.float64]:

@@ -1,24 +1,22 @@
-"""Scenes as mesh files, through trimesh."""
+"""Scenes as mesh files."""
 
 from __future__ import annotations
 
 import os
+from itertools import groupby
 from pathlib import Path
-from typing import Any
 
-import numpy as np
 import trimesh
-from trimesh.exchange.gltf import export_glb
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from ..base.errors import LidarpoolError, explained
 from .drawn import Drawn
+from .glb_file import glb_of
 from .instances import Instance
-from .mesh import Mesh
-from .meshfile import GENERATOR, OWN
+from .mesh import stacked
+from .meshfile import OWN
 from .scene import Scene
-from .transform import UP_AXES
 
 SUFFIXES = (".ply", ".glb", ".obj")
 
@@ -26,10 +24,11 @@ SUFFIXES = (".ply", ".glb", ".obj")
 def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
-    A .ply holds one object without a name; .glb and .obj keep objects and names. All store metres;
-    .glb is Y-up, by its standard, the others are Z-up. Coordinates are those of the world; .ply and
-    .glb have single precision. A comment, or the generator of .glb, tells `load_meshes` who wrote
-    it. An existing file is replaced only by a complete one.
+    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks are kept in
+    .glb only: in the others, triangles are solid. All store metres; .glb is Y-up, by its standard,
+    the others are Z-up. Coordinates are those of the world; .ply and .glb have single precision. A
+    comment, or the generator of .glb, tells `load_meshes` who wrote it. An existing file is
+    replaced only by a complete one.
 
     Raises
     ------
@@ -76,29 +75,12 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         data = bytes(export_ply(whole, vertex_normal=False))
         head, _, rest = data.partition(b"\ncomment ")
         return head + f"\ncomment {OWN}\n".encode() + rest.partition(b"\n")[2]
-    # UP_AXES["y"] turns Y-up to Z-up; its transpose turns back.
-    turn = UP_AXES["y"].T if suffix == ".glb" else np.eye(3)
-    turned = np.eye(4)
-    turned[:3, :3] = turn
+    if suffix == ".glb":
+        return glb_of(scene)
     objects = trimesh.Scene()
-    shared: dict[Mesh, str] = {}  # {mesh of instances: name of its geometry}
-    for one in scene.meshes():
-        matrix = None
-        if isinstance(one, Instance) and suffix == ".glb":
-            mesh, matrix = one.mesh, turned @ one.matrix @ turned.T
-        else:
-            mesh = one.flat() if isinstance(one, Instance) else one
-        if mesh not in shared:
-            geometry = trimesh.Trimesh(mesh.vertices @ turn.T, mesh.faces, process=False)
-            shared[mesh] = mesh.name
-            objects.add_geometry(geometry, one.name, mesh.name, transform=matrix)
-        else:
-            objects.graph.update(one.name, geometry=shared[mesh], matrix=matrix)
-    if suffix == ".obj":
-        text = export_obj(objects, include_normals=False, include_texture=False)
-        return f"# {OWN}\n{text}".encode()
-
-    def name_the_writer(tree: dict[str, Any]) -> None:  # trimesh's own files are often not Y-up
-        tree["asset"]["generator"] = GENERATOR
-
-    return bytes(export_glb(objects, include_normals=False, tree_postprocessor=name_the_writer))
+    for name, parts in groupby(scene.meshes(), lambda one: one.name):
+        flat = [one.flat() if isinstance(one, Instance) else one for one in parts]
+        vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
+        objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
+    text = export_obj(objects, include_normals=False, include_texture=False)
+    return f"# {OWN}\n{text}".encode()

@@ -88,7 +88,7 @@ class Transform:
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Transform:
         """Make a transform of a homogeneous (4, 4) matrix whose last row is 0 0 0 1."""
-        array = np.asarray(matrix, dtype=np.float64)
+        array = as_array("transform", matrix)
         if array.shape != (4, 4) or not np.array_equal(array[3], [0, 0, 0, 1]):
             raise LidarpoolError(
                 "A transform matrix has four rows of four numbers, the last one 0 0 0 1; "

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
+from fnmatch import fnmatchcase, translate
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -74,6 +75,14 @@ class Material:
         return any(name == pattern or fnmatchcase(name, pattern) for pattern in self.objects)
 
 
+def rows_named(pattern: str, names: Sequence[str]) -> NDArray[np.intp]:
+    """Rows of names that are a name, or fit it as a pattern with * and ?."""
+    if not any(sign in pattern for sign in "*?["):
+        return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
+    fits = re.compile(translate(pattern)).match
+    return np.array([r for r, name in enumerate(names) if name == pattern or fits(name)], np.intp)
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
     """Materials of objects: each array has one value for each."""
@@ -93,33 +102,35 @@ class MaterialTable:
         LidarpoolError
             If a name fits no object, or there are materials and an object has none.
         """
-        for pattern in (one for material in materials for one in material.objects):
-            if not any(Material(pattern).named(name) for name in names):
-                raise LidarpoolError(
-                    f"materials names {pattern!r}, but no object has that name."
-                    + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
-                )
-        default = Material("*")
-        rows = [next((m for m in reversed(materials) if m.named(name)), None) for name in names]
-        without = [name for name, row in zip(names, rows, strict=True) if row is None]
-        if without and materials:
-            more = f" and {len(without) - 1} more" if without[1:] else ""
+        last = np.full(len(names), -1)  # for each object the last material that names it
+        for number, material in enumerate(materials):
+            for pattern in material.objects:
+                rows = rows_named(pattern, names)
+                if not len(rows):
+                    raise LidarpoolError(
+                        f"materials names {pattern!r}, but no object has that name."
+                        + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
+                    )
+                last[rows] = number
+        without = np.flatnonzero(last < 0)
+        if len(without) and materials:
+            more = f" and {len(without) - 1} more" if without[1:].size else ""
             raise LidarpoolError(
-                f"materials: no entry names the object {without[0]!r}{more}: begin with one for "
-                'all the others, such as {objects: "*"}.'
+                f"materials: no entry names the object {names[without[0]]!r}{more}: begin with one "
+                'for all the others, such as {objects: "*"}.'
             )
-        found = [row or default for row in rows]
+        found = [*materials, Material("*")]  # the last is of all, if there are no materials
         scattered = [
             (REFLECTANCE if m.transparent == "none" else 0.0) if m.reflectance is None
             else m.reflectance
             for m in found
         ]  # fmt: skip
         return cls(
-            np.array(scattered, np.float64),
-            np.array([m.retro for m in found], np.bool_),
-            np.array([m.transparent == "pass" for m in found], np.bool_),
-            np.array([m.transparent == "mirror" for m in found], np.bool_),
-            np.array([m.semantic_class for m in found], np.uint16),
+            np.array(scattered, np.float64)[last],
+            np.array([m.retro for m in found], np.bool_)[last],
+            np.array([m.transparent == "pass" for m in found], np.bool_)[last],
+            np.array([m.transparent == "mirror" for m in found], np.bool_)[last],
+            np.array([m.semantic_class for m in found], np.uint16)[last],
         )
 
     @property

@@ -46,15 +46,7 @@ class Pose:
         """Rotation from sensor to scene axes, (3, 3); None without rotation."""
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
-        angles = np.radians([self.yaw_deg, self.pitch_deg, self.roll_deg])
-        (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
-        return np.array(
-            [
-                [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
-                [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
-                [-sp, cp * sr, cp * cr],
-            ]
-        )
+        return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
 
     def then(self, mount: Pose) -> Pose:
         """Pose of something mounted at `mount` in the axes of this one."""
@@ -78,6 +70,20 @@ class Pose:
         else:  # straight up or down: yaw and roll have the same axis
             yaw, roll = np.arctan2(-rotation[0, 1], rotation[1, 1]), 0.0
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
+
+
+def rotations_of(angles_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), as of `Pose`; or of one."""
+    angles = np.radians(angles_deg.T)
+    (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
+    made = np.array(
+        [
+            [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
+            [sy * cp, sy * sp * sr + cy * cr, sy * sp * cr - cy * sr],
+            [-sp, cp * sr, cp * cr],
+        ]
+    )
+    return made if made.ndim == 2 else np.ascontiguousarray(np.moveaxis(made, 2, 0))
 
 
 def pose_of(name: str, given: Any) -> Pose:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -14,7 +14,7 @@ from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from .calibrations import said
-from .trajectory import Pose, Track, quaternions_of
+from .trajectory import Track, quaternions_of, rotations_of
 
 TrajectoryFormat = Literal["tum", "kitti", "csv"]
 Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
@@ -100,7 +100,7 @@ def _numbers(text: str, columns: int | None = None, **options: Any) -> NDArray[n
     """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
-        raise ValueError("it has no poses")
+        raise ValueError("it has no rows of numbers")
     rows = np.loadtxt(lines, ndmin=2, **options)
     if columns is not None and rows.shape[1:] != (columns,):
         raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
@@ -116,40 +116,67 @@ def _rotations(given: NDArray[np.float64]) -> NDArray[np.float64]:
 
 def _table(text: str, names: dict[str, str]) -> tuple[Any, Any, Any]:
     """Seconds, positions and quaternions, or None, of a table with a header."""
+
+    def needed(found: Container[str]) -> tuple[str, ...]:
+        clock = "time_ns" if "time_ns" in found and "time_s" not in found else "time_s"
+        return (clock, *_PLACE, *(_TURNS[0] if any(n in found for n in _TURNS[0]) else ()))
+
+    known = ("time_s", "time_ns", *_PLACE, *_TURNS[0], *_TURNS[1])
+    at = columns_of_table(text, names, known, needed)
+    seconds = at["time_s"] if "time_s" in at else at["time_ns"] / 1e9
+    places = np.stack([at[name] for name in _PLACE], axis=1)
+    if _TURNS[0][0] in at:
+        return seconds, places, np.stack([at[name] for name in _TURNS[0]], axis=1)
+    if not any(name in at for name in _TURNS[1]):
+        return seconds, places, None
+    angles = [at.get(name, np.zeros(len(seconds))) for name in _TURNS[1]]
+    return seconds, places, quaternions_from_degrees(np.stack(angles, axis=1))
+
+
+def columns_of_table(
+    text: str,
+    names: Mapping[str, str],
+    known: Sequence[str],
+    needed: Callable[[Container[str]], Sequence[str]],
+) -> dict[str, NDArray[np.float64]]:
+    """Columns (k,) of a table with a header, by their names here; others are left out.
+
+    Parameters
+    ----------
+    names
+        {name here: name in the file}, where they differ.
+    known
+        All names here.
+    needed
+        Returns those that a table must have which has some columns.
+
+    Raises
+    ------
+    ValueError
+        If a column is missing, or what it holds are no numbers.
+    """
     lines = text.splitlines()
     # Remarks may come first, and some programs write # before the header as well.
     first = next((i for i, line in enumerate(lines) if any(m in line for m in _MARKS)), 0)
     mark = next((mark for mark in _MARKS if mark in lines[first]), ",")
     head = [name.strip().strip('"') for name in lines[first].split(mark)]
-    known = ("time_s", "time_ns", *_PLACE, *_TURNS[0], *_TURNS[1])
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"columns names {unknown[0]!r}; possible names are {', '.join(known)}")
     at = {
         name: head.index(names.get(name, name)) for name in known if names.get(name, name) in head
     }
-    clock = next((name for name in known[:2] if name in at), "time_s")
-    quaternion = any(name in at for name in _TURNS[0])
-    needed = (clock, *_PLACE, *(_TURNS[0] if quaternion else ()))
-    if missing := [names.get(n, n) for n in {**dict.fromkeys(needed), **names} if n not in at]:
+    must = {**dict.fromkeys(needed(at)), **names}
+    if missing := [names.get(name, name) for name in must if name not in at]:
         raise ValueError(f"it has no column {missing[0]!r}; it has {', '.join(head)}")
     used = list(at.values())  # others may hold text
     rest = "\n".join(lines[first + 1 :])
     rows = _numbers(rest, delimiter=mark, quotechar='"', usecols=used)
-    at = {name: number for number, name in enumerate(at)}
-    seconds = rows[:, at[clock]] / (1e9 if clock == "time_ns" else 1.0)
-    places = rows[:, [at[name] for name in _PLACE]]
-    if quaternion:
-        return seconds, places, rows[:, [at[name] for name in _TURNS[0]]]
-    if not any(name in at for name in _TURNS[1]):
-        return seconds, places, None
-    angles = [rows[:, at[n]] if n in at else np.zeros(len(rows)) for n in _TURNS[1]]
-    return seconds, places, quaternions_from_degrees(np.stack(angles, axis=1))
+    return dict(zip(at, rows.T, strict=True))
 
 
 def quaternions_from_degrees(angles: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternions (k, 4) of yaw, pitch and roll in degrees (k, 3), as of `Pose`."""
-    turns = [Pose((0, 0, 0), *row).rotation for row in angles.tolist()]
-    return quaternions_of(np.array([np.eye(3) if turn is None else turn for turn in turns]))
+    return quaternions_of(rotations_of(angles))
 
 
 def _from_camera(track: Track) -> Track:

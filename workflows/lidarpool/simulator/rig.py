@@ -14,7 +14,7 @@ from raybeam import Pattern
 
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import ScanSpec, Survey, Trajectory
+from ..sensor import Pose, ScanSpec, Survey, Trajectory
 from .echoes import PATTERN_RAYS, EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
 from .returns import BatchReturns
@@ -79,6 +79,21 @@ class Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
+        return rig
+
+    def moved(self, owner: int, pose: Pose) -> Rig:
+        """Return the same rig with the instances of an object at a pose, see `Scene.moved`.
+
+        The trees are shared: this rig must not cast any more, and no cast may be under way.
+        """
+        rig = copy(self)
+        rig.scene = self.scene.moved(owner, pose)
+        shared = rig.scene.instances
+        assert shared is not None
+        rows = np.flatnonzero(shared.owner == owner)
+        rig._surfaces = self._surfaces.moved(rig.scene, rows)
+        rig._world.place(rig._surfaces, shared, rows)
+        rig._echoes = EchoCaster(rig._world, rig.scene, rig.survey, rig._surfaces)
         return rig
 
     @property

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
+from itertools import compress
 from typing import Annotated, Any
 
 import numpy as np
@@ -114,7 +116,14 @@ class Scanner:
         except ValueError as error:  # of threads or device
             raise LidarpoolError(str(error)) from error
         self._actors = list(scene.actors)
-        self._lock = threading.Lock()
+        self._numbers = {name: number for number, name in enumerate(scene.all_names)}
+        # Objects of which all triangles are in instances.
+        self._movable = np.zeros(len(scene.names), np.bool_)
+        if scene.instances is not None:
+            self._movable[scene.instances.owner] = True
+            self._movable[scene.face_object] = False
+        # Sweeps share the caster, and copies are moved in it.
+        self._lock, self._casts, self._moves = threading.Condition(), 0, 0
 
     def __repr__(self) -> str:
         rig = self._rig
@@ -158,16 +167,17 @@ class Scanner:
             If the trajectory, or that of an actor, does not last as long as the sweep.
         """
         path = _path(pose)
-        rig, specs, late_ns = self._specs(number, start_s)
-        begin_ns, end_ns = _span_ns(rig, specs)
-        if end_ns > path.duration_ns:
-            raise LidarpoolError(
-                f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and the "
-                f"trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier (start_s), or "
-                "take a longer one."
-            )
-        check_trajectory(path)
-        returns = rig.returns(specs, path, late_ns)
+        with self._casting() as rig:
+            specs, late_ns = _specs(rig, number, start_s)
+            begin_ns, end_ns = _span_ns(rig, specs)
+            if end_ns > path.duration_ns:
+                raise LidarpoolError(
+                    f"The sweep would last from {begin_ns / 1e9:.6g} to {end_ns / 1e9:.6g} s, and "
+                    f"the trajectory lasts {path.duration_ns / 1e9:.6g} s: begin earlier "
+                    "(start_s), or take a longer one."
+                )
+            check_trajectory(path)
+            returns = rig.returns(specs, path, late_ns)
         survey = rig.survey
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
         table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
@@ -203,65 +213,103 @@ class Scanner:
             rotate.
         """
         positions, rotations = _placed(poses)
-        rig, specs, _ = self._specs(number, start_s)
-        if not len(positions):
-            firings = specs[-1].firings[1] - specs[0].firings[0]
-            return np.empty((0, firings, specs[0].channels), np.float32)
-        rays = sum(spec.ray_count for spec in specs)
-        try:
-            made = check_poses(positions, rotations, rays, rays * len(positions), None)
-        except ValueError as error:
-            raise LidarpoolError(str(error)) from error
-        return rig.ranges(specs, made.positions, made.rotations)
+        with self._casting() as rig:
+            specs, _ = _specs(rig, number, start_s)
+            if not len(positions):
+                firings = specs[-1].firings[1] - specs[0].firings[0]
+                return np.empty((0, firings, specs[0].channels), np.float32)
+            rays = sum(spec.ray_count for spec in specs)
+            try:
+                made = check_poses(positions, rotations, rays, rays * len(positions), None)
+            except ValueError as error:
+                raise LidarpoolError(str(error)) from error
+            return rig.ranges(specs, made.positions, made.rotations)
 
     @checked
     def move(self, name: str, pose: Pose | Trajectory | Sequence[float]) -> None:
-        """Place an actor; sweeps that have begun see it where it was.
+        """Place an actor or a copy; sweeps that have begun see it where it was.
 
         Parameters
         ----------
         name
-            Of the actor.
+            Of an actor, or of an object that is an `Instance` in the scene, such as a copy of a
+            scenario.
         pose
-            Where it stands from now on, or a trajectory that it follows from time 0 on. In the
-            scene's local coordinates.
+            Where it stands from now on: of its mesh's own axes, in the scene's local coordinates.
+            An instance keeps its scale. An actor may also get a trajectory, which it follows from
+            time 0 on.
 
         Raises
         ------
         LidarpoolError
-            If there is no such actor.
+            If there is no such actor or instance, or an instance would move during a sweep.
         """
         path = _path(pose)
         scene = self._rig.scene
-        actors = scene.all_names[len(scene.names) :]
-        if name not in actors:
-            hint = did_you_mean(name, actors) or f" There are {', '.join(actors[:5]) or 'none'}."
-            if name in scene.names:
-                hint = " It is part of the scene, which stands still: make it an Actor."
-            raise LidarpoolError(f"There is no actor {name!r}.{hint}")
-        number = actors.index(name)
+        standing = len(scene.names)
+        number = self._numbers.get(name, -1)
+        if 0 <= number < standing and self._movable[number]:
+            if path.moves:
+                raise LidarpoolError(
+                    f"{name!r} is an Instance, which stands still during a sweep: give a pose, or "
+                    "make it an Actor."
+                )
+            self._move_instance(number, path.pose(0))
+            return
+        if number < standing:
+            names = [*list(self._numbers)[standing:], *compress(scene.names, self._movable)]
+            hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
+            if number >= 0:
+                hint = (
+                    " It is part of the scene, which stands still: make it an Actor or an Instance."
+                )
+            raise LidarpoolError(f"There is no actor or instance {name!r}.{hint}")
         with self._lock:
-            self._actors[number] = replace(self._actors[number], trajectory=path)
+            self._actors[number - standing] = replace(
+                self._actors[number - standing], trajectory=path
+            )
             self._rig = self._rig.with_actors(tuple(self._actors))
 
-    def _specs(self, number: int, start_s: float | None) -> tuple[Rig, list[ScanSpec], float]:
-        """Rig as it is now, scans of a turn, and how late it is, nanoseconds."""
-        rig = self._rig
-        sensor = rig.survey.sensor
-        steps = sensor.steps_of_turn(number)
-        if steps.stop > SCANS_MOST:
-            raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
-        late_ns = 0
-        if start_s is not None:
-            late_ns = round(start_s * 1e9 - sensor.turn_ns(number))
-        specs = [
-            ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels) for step in steps
-        ]
-        begin_ns, end_ns = _span_ns(rig, specs)
-        for actor in rig.scene.actors:
-            if actor.trajectory.moves:
-                actor.check(begin_ns, end_ns)
-        return rig, specs, late_ns
+    def _move_instance(self, number: int, pose: Pose) -> None:
+        with self._lock:
+            self._moves += 1  # sweeps that have not begun wait
+            try:
+                self._lock.wait_for(lambda: not self._casts)
+                self._rig = self._rig.moved(number, pose)
+            finally:
+                self._moves -= 1
+                self._lock.notify_all()
+
+    @contextmanager
+    def _casting(self) -> Iterator[Rig]:
+        """Rig as it is now; meanwhile instances stay where they are."""
+        with self._lock:
+            self._lock.wait_for(lambda: not self._moves)
+            self._casts += 1
+            rig = self._rig
+        try:
+            yield rig
+        finally:
+            with self._lock:
+                self._casts -= 1
+                self._lock.notify_all()
+
+
+def _specs(rig: Rig, number: int, start_s: float | None) -> tuple[list[ScanSpec], float]:
+    """Return the scans of a turn, and how late it is, nanoseconds."""
+    sensor = rig.survey.sensor
+    steps = sensor.steps_of_turn(number)
+    if steps.stop > SCANS_MOST:
+        raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+    late_ns = 0
+    if start_s is not None:
+        late_ns = round(start_s * 1e9 - sensor.turn_ns(number))
+    specs = [ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels) for step in steps]
+    begin_ns, end_ns = _span_ns(rig, specs)
+    for actor in rig.scene.actors:
+        if actor.trajectory.moves:
+            actor.check(begin_ns, end_ns)
+    return specs, late_ns
 
 
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:

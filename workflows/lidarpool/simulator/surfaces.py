@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..scene.instances import Instances
 from ..scene.scene import Scene
 from ..sensor import Trajectory
 from ..sensor.materials import Material, MaterialTable, at_right_angles
@@ -47,18 +46,14 @@ class Surfaces:
         owned = [scene.face_object, np.repeat(owners, moving), np.zeros(1, np.int32)]
         self._owners = np.concatenate(owned)
         if shared is not None:
-            self._turn_normals(shared)
+            self._turns = _turns(shared.transforms)
 
-    def _turn_normals(self, shared: Instances) -> None:
-        """Prepare what takes the normals of parts to those of instances."""
-        self._turns = np.linalg.inv(shared.transforms[:, :, :3]).transpose(0, 2, 1)  # (n, 3, 3)
-
-    def moved(self, scene: Scene) -> Surfaces:
-        """Return the same with the scene's instances in other places."""
+    def moved(self, scene: Scene, rows: NDArray[np.intp]) -> Surfaces:
+        """Return the same with some of the scene's instances in other places."""
+        assert scene.instances is not None
         made = copy(self)
-        made._scene = scene
-        if scene.instances is not None:
-            made._turn_normals(scene.instances)
+        made._scene, made._turns = scene, self._turns.copy()
+        made._turns[rows] = _turns(scene.instances.transforms[rows])
         return made
 
     def _found(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
@@ -155,3 +150,8 @@ class Surfaces:
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
         return len(self._owners) - 1 + np.cumsum([0, *sizes[:-1]])
+
+
+def _turns(transforms: Real) -> Real:
+    """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
+    return np.asarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)

@@ -87,13 +87,10 @@ class World:
             self._actors.append(_Cast(actor, faces, options, casters))
             faces += len(actor.mesh.faces)
 
-    def place(self, surfaces: Surfaces, shared: Instances) -> None:
-        """Move instances to other places."""
-        before = self._shared
-        assert before is not None
+    def place(self, surfaces: Surfaces, shared: Instances, rows: NDArray[np.intp]) -> None:
+        """Move some instances to where they are now; no scan may be under way."""
         first = self._caster.instance_count - len(shared)
-        changed = (shared.transforms != before.transforms).any(axis=(1, 2))
-        for row in np.flatnonzero(changed):
+        for row in rows:
             self._caster.move(first + int(row), shared.transforms[row])
         self._surfaces, self._shared = surfaces, shared
 

@@ -1,0 +1,239 @@
+"""Copies of a mesh in many places: from a list, from a table, or at random on surfaces."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import RayCaster, available_backends
+
+from ..base.allowance import check_fits
+from ..base.errors import LidarpoolError
+from ..base.words import counted, did_you_mean
+from ..scene.drawn import Drawn
+from ..scene.instances import Instance
+from ..scene.mesh import Mesh
+from ..scene.scene import Scene
+from ..sensor.calibrations import said
+from ..sensor.materials import rows_named
+from ..sensor.trajectory import rotations_of
+from ..sensor.trajectory_files import columns_of_table
+from .sections import COPIES_MOST, CopiesSection, Scatter
+
+DRAWN = 1 << 14  # places that are drawn at a time
+DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
+DRAWS_LEAST = 1 << 21
+
+_PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
+_SCALES = ("scale_x", "scale_y", "scale_z")
+
+Float = NDArray[np.float64]
+
+
+class Standing:
+    """What one can stand on in a scene: the triangles of some objects that face up.
+
+    Of several above a place the highest counts. None is a scene without triangles.
+    """
+
+    def __init__(self, scene: Scene | None, objects: NDArray[np.intp] | None = None) -> None:
+        self._scene, self._objects = scene, objects
+
+    def only(self, names: Sequence[str]) -> Standing:
+        """Return the same of some objects; LidarpoolError if there is nothing to stand on."""
+        scene = self._scene
+        if scene is None:
+            raise LidarpoolError("there is nothing to stand on: the scene has no files.")
+        rows = [rows_named(name, scene.names) for name in names]
+        for name, found in zip(names, rows, strict=True):
+            if not len(found):
+                hint = (
+                    did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
+                )
+                raise LidarpoolError(
+                    f"scatter.surfaces names {name!r}, but no object has that name.{hint}"
+                )
+        found = np.unique(np.concatenate(rows))
+        made = self if len(found) == len(scene.names) else Standing(scene, found)
+        if not len(made._tops[0]):
+            raise LidarpoolError(f"nothing of {', '.join(map(repr, names))} faces up.")
+        return made
+
+    @cached_property
+    def _tops(self) -> tuple[Float, NDArray[np.int32]]:
+        """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
+        assert self._scene is not None
+        drawn = Drawn.of(self._scene).scene
+        corners, owner = drawn.vertices[drawn.faces], drawn.face_object
+        if self._objects is not None:
+            own = np.isin(owner, self._objects)
+            corners, owner = corners[own], owner[own]
+        (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
+        up = ax * by - ay * bx > 0
+        return corners[up], owner[up]
+
+    @cached_property
+    def _caster(self) -> RayCaster:
+        # Never CUDA, whose context would stay in this process.
+        backend = "numpy" if available_backends()["embree"] else "embree"
+        corners = self._tops[0].reshape(-1, 3)
+        return RayCaster(corners, np.arange(len(corners)).reshape(-1, 3), backend)
+
+    @property
+    def rectangle(self) -> Float:
+        """Lowest and highest x and y, world metres: (4,)."""
+        assert self._scene is not None
+        x, y = self._tops[0][..., :2].reshape(-1, 2).T
+        at = self._scene.origin[[0, 1, 0, 1]]
+        return np.array([x.min(), y.min(), x.max(), y.max()]) + at
+
+    @cached_property
+    def owners(self) -> NDArray[np.int32]:
+        """Objects that have triangles here."""
+        return np.unique(self._tops[1])
+
+    def under(self, places: Float) -> tuple[Float, NDArray[np.int32]]:
+        """Heights below places (n, 2), world metres, nan for none; and their objects, -1."""
+        heights, objects = np.full(len(places), np.nan), np.full(len(places), -1, np.int32)
+        if self._scene is None or not len(self._tops[0]):
+            return heights, objects
+        corners, owner = self._tops
+        origin, top = self._scene.origin, float(corners[..., 2].max()) + 1.0
+        origins = np.column_stack([places - origin[:2], np.full(len(places), top)])
+        hits = self._caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
+        on = hits.hit
+        heights[on] = top - hits.distance[on] + origin[2]
+        objects[on] = owner[hits.triangle[on]]
+        return heights, objects
+
+
+def copies_of(
+    entry: CopiesSection, mesh: Mesh, standing: Standing, table: Path | None
+) -> list[Instance]:
+    """Place the copies of an entry; `table` is where its table is.
+
+    Raises
+    ------
+    LidarpoolError
+        If a table cannot be read, a place has no surface to stand on, or there is no room.
+    """
+    if entry.scatter is not None:
+        places, angles, scales = _scattered(entry.scatter, entry.name, standing)
+    else:
+        if entry.table is not None and table is not None:
+            places, angles, scales = _of_table(table, entry.table.columns)
+        else:
+            places = np.array([(*one.position, np.nan)[:3] for one in entry.at])
+            angles = np.array([[getattr(one, name) for name in _ANGLES] for one in entry.at])
+            scales = np.array([one.scale for one in entry.at])
+        low = np.flatnonzero(np.isnan(places[:, 2]))
+        if len(low):
+            places[low, 2], _ = standing.under(places[low, :2])
+        if len(low := np.flatnonzero(np.isnan(places[:, 2]))):
+            x, y = places[low[0], :2].tolist()
+            raise LidarpoolError(
+                f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
+                f"on ({counted(len(low), 'copy', 'copies')}): give z."
+            )
+        if not scales.all():
+            raise LidarpoolError("a scale of 0 would flatten the mesh.")
+    matrices = np.tile(np.eye(4), (len(places), 1, 1))
+    matrices[:, :3, :3] = rotations_of(angles) * scales[:, None]
+    matrices[:, :3, 3] = places
+    return Instance.several(mesh, matrices, entry.name)
+
+
+def _of_table(path: Path, columns: dict[str, str]) -> tuple[Float, Float, Float]:
+    """Places, z nan if there is none, angles in degrees, and scales of a table: (n, 3) each."""
+    try:
+        check_fits(path)
+        text = path.read_text("utf-8-sig")
+        if not text.strip():
+            raise ValueError("it is empty")
+        known = (*_PLACE, *_ANGLES, "scale", *_SCALES)
+        at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
+        if "scale" in at and any(name in at for name in _SCALES):
+            raise ValueError("it has both scale and scales of axes: leave one out in columns")
+        if wrong := next((name for name in at if not np.isfinite(at[name]).all()), None):
+            raise ValueError(f"its column {columns.get(wrong, wrong)!r} has a nan or inf")
+    except (OSError, ValueError, LidarpoolError) as error:
+        raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
+    count = len(at["x"])
+    if count > COPIES_MOST:
+        raise LidarpoolError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
+
+    def some(names: Sequence[str], default: Any) -> Float:
+        return np.stack([at.get(name, np.full(count, default)) for name in names], axis=1)
+
+    scales = some(("scale",) * 3 if "scale" in at else _SCALES, 1.0)
+    return some(_PLACE, np.nan), some(_ANGLES, 0.0), scales
+
+
+def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Float, Float, Float]:
+    """Places, angles in degrees and scales of copies at random: (n, 3) each.
+
+    Places are drawn in a rectangle and kept if the highest surface there is one of those named:
+    only sums, products and comparisons, so that all machines draw the same.
+    """
+    own = standing.only(given.surfaces)
+    x0, y0, x1, y1 = own.rectangle if given.within is None else given.within
+    # The name, so that trees and rocks of one seed are not at the same places.
+    seeds = [given.seed, *name.encode()]
+    draw = np.random.Generator(np.random.PCG64([0, *seeds]))
+    room = _Room(given.spacing_m)
+    found: list[Float] = []
+    drawn = 0
+    while len(found) < given.count:
+        if drawn > max(DRAWS_LEAST, DRAWS_MOST * given.count):
+            raise LidarpoolError(
+                f"only {len(found):,} of {given.count:,} found room on {', '.join(given.surfaces)} "
+                f"within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to {y1:.6g}: take fewer, a smaller "
+                "spacing_m, or other surfaces."
+            )
+        block = draw.random((DRAWN, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
+        heights, objects = standing.under(block)
+        on = np.flatnonzero(np.isin(objects, own.owners))
+        if not drawn and not len(on):  # they are under a roof: draw the same again without it
+            standing = own
+            heights, objects = standing.under(block)
+            on = np.flatnonzero(objects >= 0)
+        drawn += DRAWN
+        for row in on:
+            x, y = block[row].tolist()
+            if room.takes(x, y):
+                found.append(np.array([x, y, heights[row]]))
+                if len(found) == given.count:
+                    break
+    looks = np.random.Generator(np.random.PCG64([1, *seeds])).random((given.count, 2))
+    yaw = 360.0 * looks[:, 0] if given.yaw_deg is None else np.full(given.count, given.yaw_deg)
+    least, largest = given.scale
+    scales = least + looks[:, 1] * (largest - least)
+    angles = np.column_stack([yaw, np.zeros((given.count, 2))])
+    return np.array(found), angles, np.repeat(scales[:, None], 3, axis=1)
+
+
+class _Room:
+    """Places that are taken, each with so much room around it."""
+
+    def __init__(self, spacing_m: float) -> None:
+        self._apart = spacing_m
+        self._taken: dict[tuple[int, int], list[tuple[float, float]]] = {}  # {cell: places}
+
+    def takes(self, x: float, y: float) -> bool:
+        """Take a place, if no other is too near."""
+        apart = self._apart
+        if not apart:
+            return True
+        column, row = int(x // apart), int(y // apart)
+        for i in (column - 1, column, column + 1):
+            for j in (row - 1, row, row + 1):
+                for u, v in self._taken.get((i, j), ()):
+                    if (x - u) * (x - u) + (y - v) * (y - v) < apart * apart:
+                        return False
+        self._taken.setdefault((column, row), []).append((x, y))
+        return True

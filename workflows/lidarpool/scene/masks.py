@@ -1,0 +1,228 @@
+"""Masks from images: where the triangles of a material stop light."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Hashable
+from dataclasses import dataclass
+from functools import cache
+from io import BytesIO
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from ..base.allowance import Allowance
+from ..base.words import printable
+from .mesh import UV_MOST, Cutout
+
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")  # Pillow has more, some run programs
+HALF = 128  # least 8-bit opacity that stops light, unless a file states another
+PIXEL_BYTES = 10  # of an image while it is decoded
+FACE_BYTES = 120  # of a triangle while its texture coordinates are made
+NAMED = 3  # materials that a note names
+
+Mask = NDArray[np.bool_]
+Wrap = Literal["repeat", "mirror", "clamp"]
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
+
+
+class MaskError(Exception):
+    """Why a mask cannot be read, as a clause."""
+
+
+def read_opacity(
+    image: Path | bytes, allowance: Allowance, *, grey: bool = False
+) -> NDArray[np.uint8] | None:
+    """Opacity of an image: its alpha channel, or else, with `grey`, its brightness.
+
+    Returns
+    -------
+    (h, w), 0 to 255; None if it has no alpha channel, or one that is opaque everywhere.
+
+    Raises
+    ------
+    MaskError
+        If it cannot be decoded, or takes more than allowed.
+    """
+    name = image.name if isinstance(image, Path) else "its image"
+    source = image if isinstance(image, Path) else BytesIO(image)
+    try:
+        # Pillow warns of images that it reads all the same, and of those that are too large.
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            warnings.simplefilter("error", Image.DecompressionBombWarning)
+            with Image.open(source, formats=FORMATS) as opened:
+                return _decoded(opened, allowance, grey)
+    except Image.UnidentifiedImageError as error:
+        raise MaskError(f"{name} is no {', '.join(FORMATS)}") from error
+    except (Image.DecompressionBombError, Image.DecompressionBombWarning, _TooLargeError) as error:
+        raise MaskError(f"{name} has too many pixels") from error
+    except Exception as error:
+        # Decoders raise whatever they stumble over: OSError, SyntaxError, struct.error, …
+        raise MaskError(f"{name} cannot be decoded") from error
+
+
+class _TooLargeError(Exception):
+    pass
+
+
+def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
+    """Cache a function, and its MaskErrors."""
+
+    @cache
+    def tried(key: K) -> V | MaskError:
+        try:
+            return read(key)
+        except MaskError as error:
+            return error
+
+    def once(key: K) -> V:
+        found = tried(key)
+        if isinstance(found, MaskError):
+            raise MaskError(str(found))
+        return found
+
+    return once
+
+
+def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np.uint8] | None:
+    if not (grey or image.has_transparency_data):
+        return None
+    pixels = image.width * image.height
+    if not allowance.fits(PIXEL_BYTES * pixels):
+        raise _TooLargeError
+    allowance.take(pixels)
+    if image.has_transparency_data:
+        alpha = np.asarray(
+            (image if "A" in image.getbands() else image.convert("RGBA")).getchannel("A")
+        )
+        if alpha.min() < 255:
+            return alpha
+    if not grey:
+        return None
+    if image.mode.startswith("I;16"):
+        return (np.asarray(image) >> 8).astype(np.uint8)
+    return np.asarray(image.convert("L"))
+
+
+class Texture:
+    """A mask, and how it goes on beyond its edges, along u and along v.
+
+    Materials should share it, since every one takes memory.
+
+    Raises
+    ------
+    MaskError
+        If it takes more than allowed.
+    """
+
+    def __init__(self, mask: Mask, wraps: tuple[Wrap, Wrap], allowance: Allowance) -> None:
+        self._wraps, self._allowance = wraps, allowance
+        _take(allowance, mask.size)
+        for axis, wrap in zip((1, 0), wraps, strict=True):
+            if wrap == "mirror":  # repeats with its mirror image
+                _take(allowance, 2 * mask.size)
+                mask = np.concatenate([mask, np.flip(mask, axis)], axis)
+        self._mask = mask
+
+    def cutout(self, coordinates: NDArray[Any], corners: NDArray[np.int64]) -> Cutout:
+        """Cut it out of triangles, as in glTF.
+
+        `coordinates` are (c, 2), and `corners` (k, 3) which of them each triangle has.
+
+        Raises
+        ------
+        MaskError
+            If they are missing, infinite, too large, or too far beyond a mask that does not repeat.
+        """
+        if not len(coordinates) or not 0 <= corners.min() <= corners.max() < len(coordinates):
+            raise MaskError("texture coordinates are missing")
+        if not self._allowance.fits(FACE_BYTES * len(corners)):
+            raise MaskError("there are too many triangles")
+        uv = coordinates[corners].astype(np.float64)
+        if not (np.abs(uv) < UV_MOST / 2).all():  # half, for what rounding adds
+            raise MaskError("texture coordinates are infinite or too large")
+        mask = self._mask
+        for column, wrap in enumerate(self._wraps):
+            if wrap == "mirror":
+                uv[..., column] /= 2
+            elif wrap == "clamp":
+                mask = self._continued(mask, uv[..., column], 1 - column)
+        return Cutout(mask, uv.astype(np.float32))
+
+    def _continued(self, mask: Mask, places: NDArray[np.float64], axis: int) -> Mask:
+        """Repeat the edges of a mask as far as `places` (k, 3), which are changed, ask for it."""
+        size = mask.shape[axis]
+        # Triangles wholly beyond an edge are in its last texels.
+        places[places.max(axis=1) <= 0] = 0.5 / size
+        places[places.min(axis=1) >= 1] = 1 - 0.5 / size
+        before = max(0, int(np.ceil(-places.min() * size)))
+        after = max(0, int(np.ceil((places.max() - 1) * size)))
+        if not before and not after:
+            return mask
+        whole = size + before + after
+        _take(self._allowance, mask.size // size * whole)
+        widths = [(0, 0), (0, 0)]
+        widths[axis] = before, after
+        places *= size / whole
+        places += before / whole
+        return np.pad(mask, widths, mode="edge")
+
+
+def _take(allowance: Allowance, count: int) -> None:
+    if not allowance.fits(count):
+        raise MaskError("its mask would be too large")
+    allowance.take(count)
+
+
+class MaskNotes:
+    """What the materials of a file have that is no mask, by their names."""
+
+    def __init__(self) -> None:
+        self.unread: dict[str, str] = {}  # {material: why its triangles are solid}
+        self.glass: dict[str, None] = {}  # in order
+        self.gone: list[str] = []  # files of materials that are not there
+
+    def instead(self, material: str) -> _Instead:
+        """Note errors within a `with` block; the triangles can be read all the same."""
+        return _Instead(self.unread, material)
+
+    def lines(self) -> list[str]:
+        """Return notes, as clauses that follow the file's name."""
+        out = []
+        if self.gone:
+            out.append(f"names materials in {_some(self.gone)}, which cannot be read: all is solid")
+        if self.unread:
+            shown = _some([f"{name} ({why})" for name, why in self.unread.items()])
+            out.append(f"has masks that cannot be read, so that these materials are solid: {shown}")
+        if self.glass:
+            out.append(
+                f"has transparent materials without holes, taken as solid: {_some([*self.glass])}; "
+                "transparent: pass, under materials, makes objects glass"
+            )
+        return out
+
+
+@dataclass
+class _Instead:
+    """Notes errors as what is wrong with a material."""
+
+    unread: dict[str, str]
+    material: str
+
+    def __enter__(self) -> None:
+        pass
+
+    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
+        if isinstance(error, Exception):
+            why = str(error) if isinstance(error, MaskError) else "it is broken"
+            self.unread.setdefault(self.material, why)
+        return isinstance(error, Exception)
+
+
+def _some(names: list[str]) -> str:
+    return ", ".join(printable(name) for name in names[:NAMED]) + ", …" * (len(names) > NAMED)

@@ -1,0 +1,180 @@
+"""Materials of Wavefront files: which images make them transparent in places."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path, PureWindowsPath
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.allowance import Allowance
+from ..base.words import as_text
+from .beside import file_beside
+from .masks import HALF, MaskError, MaskNotes, Texture, Wrap, read_opacity, remembered
+from .mesh import Cutout
+from .nodes import SMALLER, MeshFileError
+
+# Options of images: how many words follow each; -o, -s and -t have one to three numbers.
+_OPTIONS = {
+    b"-blendu": 1, b"-blendv": 1, b"-boost": 1, b"-mm": 2, b"-texres": 1, b"-clamp": 1, b"-bm": 1,
+    b"-imfchan": 1, b"-type": 1, b"-cc": 1, b"-o": 3, b"-s": 3, b"-t": 3,
+}  # fmt: skip
+_NUMBERS = (b"-o", b"-s", b"-t")
+_WITHOUT_ALPHA = (".jpg", ".jpeg")
+_MOST_BYTES = 1 << 26  # of a file of materials
+
+
+@dataclass
+class _Image:
+    """An image of a material, as a line names it."""
+
+    name: str
+    options: dict[bytes, list[bytes]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, words: bytes) -> _Image:
+        """Read the line after its first word."""
+        options: dict[bytes, list[bytes]] = {}
+        rest = words.strip()
+        while (option := rest.split(maxsplit=1)[:1]) and option[0].lower() in _OPTIONS:
+            key = option[0].lower()
+            rest = rest[len(key) :].lstrip()
+            given = options.setdefault(key, [])
+            for _ in range(_OPTIONS[key]):
+                word = next(iter(rest.split(maxsplit=1)), b"")
+                if key in _NUMBERS and not re.fullmatch(rb"[-+.\deE]+", word):
+                    break
+                given.append(word)
+                rest = rest[len(word) :].lstrip()
+        return cls(as_text(rest), options)
+
+    def numbers(self, option: bytes, usual: float) -> NDArray[np.float64]:
+        """Two numbers of an option."""
+        given = [float(word) for word in self.options.get(option, [])]
+        return np.array((given + [usual] * 2)[:2])
+
+
+@dataclass
+class ObjTexture:
+    """The mask of a material."""
+
+    texture: Texture
+    scale: NDArray[np.float64]  # (2,)
+    offset: NDArray[np.float64]
+
+    def cutout(self, vt: NDArray[np.float64], corners: NDArray[np.int64]) -> Cutout:
+        """As `Texture.cutout`, but v of the coordinates (c, 2) grows upwards."""
+        u, v = (vt * self.scale + self.offset).T
+        return self.texture.cutout(np.column_stack([u, 1 - v]), corners)
+
+
+class Materials:
+    """Masks of the materials of a .obj file, each read once.
+
+    Masks are the images `map_d`, or else the alpha channels of `map_Kd`. Constant opacities, `d`
+    and `Tr`, count for nothing: some programs write one for the other.
+    """
+
+    def __init__(self, mesh: Path, size: int, notes: MaskNotes) -> None:
+        self._mesh, self._notes, self._allowance = mesh, notes, Allowance(size, SMALLER)
+        self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
+
+    def textures(
+        self, libraries: Sequence[bytes], used: Sequence[bytes]
+    ) -> dict[bytes, ObjTexture]:
+        """Masks of the used materials that have one, from files named by the lines `libraries`."""
+        images: dict[bytes, dict[bytes, _Image]] = {}
+        for data in self._files(libraries):
+            images |= _read_mtl(data)
+        found: dict[bytes, ObjTexture] = {}
+        for name in used:
+            if name in images:
+                with self._notes.instead(as_text(name)):
+                    if texture := self._texture(as_text(name), images[name]):
+                        found[name] = texture
+        return found
+
+    def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
+        """Content of the files that lines name: each one, or several between spaces."""
+        read: set[Path | None] = set()
+        for names in map(as_text, libraries):
+            for name in [names] if self._file(names) else names.split():
+                path = self._file(name)
+                if path not in read:
+                    read.add(path)
+                    try:
+                        yield self._content(path)
+                    except OSError:
+                        self._notes.gone.append(name)
+
+    def _content(self, path: Path | None) -> bytes:
+        if path is None or path.stat().st_size > _MOST_BYTES:
+            raise FileNotFoundError
+        return path.read_bytes()
+
+    def _file(self, name: str) -> Path | None:
+        """File of a name, or of its last part if it leads elsewhere, to another machine say."""
+        paths = PureWindowsPath(name)
+        for one in (name, paths.as_posix(), paths.name):
+            with suppress(MeshFileError, OSError, ValueError, RuntimeError):
+                if one and (found := file_beside(self._mesh, [one])):
+                    return found
+        return None
+
+    def _texture(self, name: str, images: dict[bytes, _Image]) -> ObjTexture | None:
+        colour = images.get(b"map_kd")
+        image = images.get(b"map_d", colour)
+        if image is None:
+            return None
+        if image is colour and image.name.lower().endswith(_WITHOUT_ALPHA):
+            return None
+        # Some programs name the same image twice: then its brightness is its colour's.
+        grey = image is not colour and not (colour and colour.name == image.name)
+        base, gain = map(float, image.options.get(b"-mm", (0, 1)))
+        clamped = [word.lower() for word in image.options.get(b"-clamp", [])] == [b"on"]
+        texture = self._mask((image.name, grey, base, gain, clamped))
+        if isinstance(texture, Texture):
+            return ObjTexture(texture, image.numbers(b"-s", 1), image.numbers(b"-o", 0))
+        if texture == "glass":
+            self._notes.glass[name] = None
+        return None
+
+    def _read_mask(
+        self, key: tuple[str, bool, float, float, bool]
+    ) -> Texture | Literal["solid", "glass"]:
+        """Mask of an image, or what it makes of a material."""
+        name, grey, base, gain, clamped = key
+        opacity = self._opacity((name, grey))
+        if opacity is None:
+            return "solid"
+        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
+        if mask.all() or not mask.any():
+            return "solid" if mask.all() else "glass"
+        wrap: Wrap = "clamp" if clamped else "repeat"
+        return Texture(mask, (wrap, wrap), self._allowance)
+
+    def _read_opacity(self, key: tuple[str, bool]) -> NDArray[np.uint8] | None:
+        name, grey = key
+        path = self._file(name)
+        if path is None:
+            raise MaskError(f"its image {name[-80:]!r} is not there")
+        self._allowance.grow(path.stat().st_size)
+        return read_opacity(path, self._allowance, grey=grey)
+
+
+def _read_mtl(data: bytes) -> dict[bytes, dict[bytes, _Image]]:
+    """Images of the materials that have any: {material: {b"map_d": image}}."""
+    images: dict[bytes, dict[bytes, _Image]] = {}
+    name = b""
+    for line in data.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
+        key, _, rest = line.strip().partition(b" ")
+        if key == b"newmtl":
+            name = rest.strip()
+        elif key.lower() in (b"map_d", b"map_kd") and rest.strip():
+            images.setdefault(name, {})[key.lower()] = _Image.of(rest)
+    return images
