@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -82,7 +81,6 @@ def car(model: Model) -> Mesh:
     return Mesh(model.name, *stacked([_body(model), *wheels]))
 
 
-@cache
 def all_cars() -> tuple[Mesh, ...]:
     """Make a car of each of `MODELS`."""
     return tuple(car(model) for model in MODELS)

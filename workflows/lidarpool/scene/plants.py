@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -100,7 +99,6 @@ def tree(species: Species, seed: int = 0, root_m: float = 0.1) -> Mesh:
     return Mesh(species.name, *stacked(parts))
 
 
-@cache
 def all_trees(seed: int, root_m: float) -> tuple[Mesh, ...]:
     """Make a tree of each of `SPECIES`."""
     return tuple(tree(species, seed, root_m) for species in SPECIES)
