@@ -56,6 +56,11 @@ def test_trees_stand_on_ground_that_is_not_steep():
     assert again.instances.transforms.tobytes() == scene.instances.transforms.tobytes()
 
 
+@pytest.mark.parametrize(("triangles", "side"), [(2, 100.0), (2_000, 1e7)])
+def test_trees_on_terrains_of_any_size(triangles, side):
+    assert len(terrain(triangles, 0, side, trees=20).names) == 21
+
+
 @pytest.mark.parametrize(("side", "room"), [(30.0, "0"), (100.0, r"\d+")])
 def test_more_trees_than_fit(side, room):
     with pytest.raises(LidarpoolError, match=rf"has room for {room} trees, not 900: make it"):

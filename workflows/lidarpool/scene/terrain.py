@@ -29,7 +29,8 @@ _STEEPEST = np.tan(np.radians(40.0))
 _ROOT_M = 0.6
 _EDGE_M = 5.0  # of the terrain, without trees
 _GLADE_M = 12.0  # without trees around the middle, where a sensor stands by default
-_WOODS_M, _DENSER = 120.0, 5.0  # size of woods; how much denser than between them, as an exponent
+# Size of woods, and in cells at least; how much denser than between them, as an exponent.
+_WOODS_M, _WOOD_CELLS, _DENSER = 120.0, 20, 5.0
 
 
 @checked
@@ -102,11 +103,11 @@ def _woods(heights: Float, side_m: float, count: int, seed: int) -> list[Instanc
             f"The terrain has room for {fits.sum():,} trees, not {count:,}: make it larger, or "
             "take fewer trees."
         )
-    line = np.linspace(0, 1, cells) * side_m / _WOODS_M
+    line = np.linspace(0, 1, cells) * min(side_m / _WOODS_M, cells / _WOOD_CELLS)
     density = np.exp(_DENSER * _noise(line, line, rng)).reshape(-1) * fits
     chosen = rng.choice(len(places), count, replace=False, p=density / density.sum())
     # Conifers are higher up.
-    conifer = rng.random(count) < height[chosen] / heights.max()
+    conifer = rng.random(count) * heights.max() < height[chosen]
     kinds = np.array([species.conifer for species in SPECIES])
     kind = np.where(
         conifer, rng.choice(np.flatnonzero(kinds), count), rng.choice(np.flatnonzero(~kinds), count)
