@@ -5,8 +5,8 @@ all that either sends or receives passes here and is counted by kind of message.
 every fifth point kept and with all of them: what grows with points would show. And it is run in
 batches of one scan: what comes with each batch.
 
-Receipts: a cluster of workers in this process whose casting and storage answer at once, so that
-what is left is what driver, scheduler, pipes and database take for each part.
+Receipts: scheduler, driver and workers in processes of their own, and batches of one scan with four
+rays: what is left is what each takes for a part.
 
 Run: ``python -m benchmarks.control [--scans 20000] [--parts 2000]``
 """
@@ -14,11 +14,14 @@ Run: ``python -m benchmarks.control [--scans 20000] [--parts 2000]``
 from __future__ import annotations
 
 import argparse
+import os
+import socket
+import subprocess
+import sys
 import tempfile
-import time
 from collections import Counter
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
@@ -26,17 +29,12 @@ from unittest.mock import patch
 
 import distributed.comm.tcp as tcp
 import numpy as np
-from distributed import Client, Scheduler, SpecCluster, Worker
+import psutil
+from distributed import Client
 
-import lidarpool.pipeline.cast
 import lidarpool.pipeline.policies
-import lidarpool.pipeline.workers
 from lidarpool import Scene, Sensor, Survey, simulate
-from lidarpool.base.storage import Storage
-from lidarpool.columns.parts import PartColumns
-from lidarpool.pipeline.cast import CastBatch
-from lidarpool.pipeline.messages import samples_of_scan, summary_type
-from poolpart import Recorder
+from lidarpool.scene.actors import box
 
 # Messages that come with time and with workers, not with work.
 UPKEEP = {"heartbeat", "setup", "transfers"}
@@ -162,52 +160,58 @@ def count_batches(batches: int) -> None:
 
 
 def sustain(parts: int) -> None:
-    """Print what one driver sustains where everything else answers at once."""
-    sensor = Sensor.grid(rays_per_revolution=360, layers=1, step_deg=360)
-    what = Survey(sensor, [(0.0, 0.0, 1.0)] * parts, steps=1)
-    kind = summary_type(samples_of_scan(parts))
-    empty = {c.name: np.zeros(0, c.dtype) for c in what.stored_columns}
-
-    def cast_at_once(handle: str, first: int, stop: int, run: str = "") -> CastBatch:
-        part = PartColumns(
-            first,
-            np.zeros(stop - first, np.int64),
-            empty,
-            np.zeros(0, np.int32),
-            np.zeros(0, np.int64),
-        )
-        return CastBatch(part, np.zeros(stop - first, kind), Recorder("intersect", "GPU").done())
-
-    quiet = {"host": "127.0.0.1", "dashboard": False}
-    slots = {"GPU-0": 4, "GPU-1": 4, "LIDAR": 8}
-    workers = {
-        name: {
-            "cls": Worker,
-            "options": {"resources": {name.split("-")[0]: n}, "nthreads": n, **quiet},
-        }
-        for name, n in slots.items()
-    }
-    scheduler = {"cls": Scheduler, "options": {"port": 0, **quiet}}
+    """Print what one driver sustains: four rays and one scan a batch, each process by itself."""
+    sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=360)
+    room = Scene.from_meshes([box("Room", (8, 6, 3))])
+    what, first = (Survey(sensor, [(0.0, 0.0, 1.0)] * count, steps=1) for count in (parts, 20))
     with (
         tempfile.TemporaryDirectory() as folder,
-        SpecCluster(workers=workers, scheduler=scheduler, silence_logs=50) as cluster,
-        Client(cluster) as client,
-        patch.object(lidarpool.pipeline.workers, "intersect", cast_at_once),
+        cluster_in_processes({"GPU": 4, "LIDAR": 8}) as (client, processes),
         patch.object(lidarpool.pipeline.policies, "BATCH_RAYS", 1),
-        patch.object(Storage, "write", lambda self, name, data: None),
-        patch.object(Storage, "sees", lambda self, name, data: True),
     ):
-        began = time.perf_counter()
-        result = simulate(
-            Scene.seed(), what, client=client, backend="numpy", folder=Path(folder) / "run"
-        )
-        seconds = time.perf_counter() - began
+        simulate(room, first, client=client, backend="numpy")
+        before = processor_seconds(processes)
+        result = simulate(room, what, client=client, backend="numpy", folder=Path(folder) / "run")
+        after = processor_seconds(processes)
     rate = parts / result.survey_seconds
+    spent = (f"{name} {1000 * (after[name] - before[name]) / parts:.2f}" for name in before)
     print(
-        f"{parts:,} parts in {result.survey_seconds:.1f} s (all {seconds:.1f} s), with workers and "
-        f"scheduler in the driver's process: {rate:.0f} receipts/s, {1000 / rate:.2f} ms each; "
-        f"with 10^6 returns in a part {rate * 1e6 / 1e6:,.0f} million points/s"
+        f"{parts:,} parts in {result.survey_seconds:.1f} s: {rate:.0f} receipts/s; milliseconds of "
+        f"processor time for each: {', '.join(spent)}"
     )
+
+
+@contextmanager
+def cluster_in_processes(slots: dict[str, int]) -> Iterator[tuple[Client, dict[str, int]]]:
+    """Start a scheduler and a worker for each partition, in processes of their own.
+
+    Gives a client, and the number of each process by name; the client's process is the driver.
+    """
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+    quiet = ["--no-dashboard"]
+    host, port = address.removeprefix("tcp://").split(":")
+    commands = {"scheduler": ["scheduler", "--host", host, "--port", port]}
+    for name, count in slots.items():
+        resources = ["--nthreads", str(count), "--resources", f"{name}={count}"]
+        commands[name] = ["worker", address, "--no-nanny", *resources]
+    with ExitStack() as stack:
+        started = {}
+        for name, command in commands.items():
+            process = subprocess.Popen(
+                [sys.executable, "-m", "dask", *command, *quiet], stderr=subprocess.DEVNULL
+            )
+            stack.callback(process.wait)
+            stack.callback(process.terminate)
+            started[name] = process.pid
+        client = stack.enter_context(Client(address))
+        client.wait_for_workers(len(slots))
+        yield client, {**started, "driver": os.getpid()}
+
+
+def processor_seconds(processes: dict[str, int]) -> dict[str, float]:
+    """Processor time that processes have taken, by name."""
+    return {name: sum(psutil.Process(n).cpu_times()[:2]) for name, n in processes.items()}
 
 
 def main() -> None:

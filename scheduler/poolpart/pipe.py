@@ -19,7 +19,15 @@ import asyncio
 import math
 import time
 from collections import deque
-from collections.abc import Awaitable, Callable, Collection, Iterable, Iterator, Sequence
+from collections.abc import (
+    Awaitable,
+    Callable,
+    Collection,
+    Iterable,
+    Iterator,
+    Mapping,
+    Sequence,
+)
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import islice
@@ -296,15 +304,44 @@ def forget_pipes(client: Client, names: Sequence[str]) -> None:
 
 
 def take_news(
-    client: Client, seconds: float, pipes: Collection[str], keys: Collection[str] = ()
+    client: Client,
+    seconds: float,
+    pipes: Collection[str],
+    keys: Collection[str] = (),
+    *,
+    puts: Mapping[str, Sequence[Any]] | None = None,
+    linger_s: float = 0.0,
 ) -> dict[str, list[Any]]:
     """Wait until a pipe has an item or a task has ended, and take the items of the pipes.
 
-    Pipes go by name, one at least, and tasks by key. A pipe that was closed, has failed or is gone
-    ends the wait as well, as does a task that the scheduler does not know. Returns the items by
-    pipe, of those that had some.
+    Before, put items into other pipes; all in one request, which is most of what an item costs.
+
+    Parameters
+    ----------
+    seconds
+        Longest wait.
+    pipes, keys
+        Names of pipes, one at least, and keys of tasks. A pipe that was closed, has failed or is
+        gone ends the wait as well, as does a task that the scheduler does not know.
+    puts
+        Items by pipe, whatever its capacity. Those for a pipe that has ended or is gone are lost.
+    linger_s
+        Wait so long for more once there is something, within `seconds`.
+
+    Returns
+    -------
+    The items by pipe, of those that had some.
     """
-    replies = _ask(client, _TAKE, names=list(pipes), keys=list(keys), seconds=seconds)
+    given = {name: [dumps(item) for item in items] for name, items in (puts or {}).items()}
+    replies = _ask(
+        client,
+        _TAKE,
+        names=list(pipes),
+        keys=list(keys),
+        seconds=seconds,
+        linger_s=min(linger_s, seconds),
+        puts=given,
+    )
     return {name: [*map(loads, r["answer"])] for name, r in replies.items() if r["answer"]}
 
 
@@ -446,8 +483,14 @@ class Pipes(SchedulerPlugin):
         seconds: float,
         linger_s: float = 0.0,
         keys: Sequence[str] = (),
+        puts: Mapping[str, list[bytes]] | None = None,
     ) -> Replies:
-        """Take the items of pipes, once one has any or has ended, or a task has ended."""
+        """Take the items of pipes, once one has any or has ended, or a task has ended.
+
+        Before that, put items into other pipes.
+        """
+        for name, items in (puts or {}).items():
+            self.put([name], asker, items, unbounded=True, seconds=0.0)
 
         def news() -> bool:
             tasks = (self.scheduler.tasks.get(key) for key in keys)

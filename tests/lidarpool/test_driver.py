@@ -27,7 +27,7 @@ from lidarpool.pipeline.messages import (
     samples_of_scan,
     summary_type,
 )
-from lidarpool.pipeline.policies import LATE_S, SPAN, most_under_way
+from lidarpool.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
 from lidarpool.pipeline.workers import Outcome
 from poolpart import TaskRecord, Whereabouts
 
@@ -45,8 +45,9 @@ class Workers:
     def __init__(self):
         self.slots = {"tcp://a:1": 1, "tcp://b:1": 1}
         self.silent = set()
-        self.casts = {}  # {key: (first, stop, worker, outcome)}
+        self.casts = {}  # {key: (spans, worker, outcome)}
         self.tried = Counter()  # {(first, stop): casting tasks}
+        self.most = 0  # batches of a task
         self.dropped = []
         self.released = False
         self._joined = 0
@@ -59,11 +60,12 @@ class Workers:
         free = {a: n for a, n in self.slots.items() if a not in self.silent}
         return Whereabouts(frozenset(self.slots), frozenset(self.silent), free)
 
-    def cast(self, first, stop, offer, worker):
+    def cast(self, spans, worker):
         assert worker in self.slots
-        self.tried[first, stop] += 1
-        key = f"{first}-{stop}.{offer}"
-        self.casts[key] = (first, stop, worker, Outcome.PENDING)
+        self.tried.update(spans)
+        self.most = max(self.most, len(spans))
+        key = f"{spans[0][0]}.{sum(self.tried.values())}"
+        self.casts[key] = (spans, worker, Outcome.PENDING)
         return key
 
     def outcome(self, key, what):
@@ -87,7 +89,7 @@ class Workers:
     @property
     def open(self):
         """Keys of the casting tasks that can still end."""
-        alive = [key for key, cast in self.casts.items() if cast[2] in self.slots]
+        alive = [key for key, cast in self.casts.items() if cast[1] in self.slots]
         return [key for key in alive if self.casts[key][-1] is Outcome.PENDING]
 
     def die(self, worker):
@@ -108,6 +110,7 @@ class Stages:
         self.unsorted = []
         self.inbox = []
         self.advice = 5  # scans in a batch
+        self.seconds = 0.1  # that a batch takes to cast
         self.held = {}  # {name: part that is not in storage}
         self.ended = False
         self.failure = ""
@@ -164,21 +167,25 @@ class Stages:
             self._sent = stop
 
     def collect(self, order, held_at=""):
-        """Write the part of an order, or hold it; a batch that is not there is reported."""
+        """Write the parts of an order, or hold them; a task that is not there is reported."""
         there = order.worker in self._workers.slots and order.key in self._workers.casts
-        if not there:
-            return ColumnsLost(order.key)
-        data = f"scans {order.first} to {order.stop}".encode()
+        return (
+            [self._part(*span, name, held_at) for span, name in order.parts]
+            if there
+            else [ColumnsLost(order.key)]
+        )
+
+    def _part(self, first, stop, name, held_at):
+        data = f"scans {first} to {stop}".encode()
         if held_at:
-            self.held[order.name] = data
+            self.held[name] = data
         else:
-            self._storage.write(order.name, data)
-        summaries = np.zeros(order.stop - order.first, SUMMARY)
-        summaries["hits"] = range(order.first, order.stop)
-        record = TaskRecord("intersect", "GPU", "a", ("GPU",), 0.0, 0.1, order.stop - order.first)
+            self._storage.write(name, data)
+        summaries = np.zeros(stop - first, SUMMARY)
+        summaries["hits"] = range(first, stop)
+        record = TaskRecord("intersect", "GPU", "a", ("GPU",), 0.0, self.seconds, stop - first)
         return Receipt(
-            order.first, order.stop, order.name, 1, len(data), 1, (), summaries.tobytes(),
-            record, held_at,
+            first, stop, name, 1, len(data), 1, (), summaries.tobytes(), record, held_at,
         )  # fmt: skip
 
     def sort(self):
@@ -228,7 +235,7 @@ class Run:
                 self.workers.end(key)
             for orders in self.stages.orders.values() if idle != "collect" else ():
                 while orders:
-                    self.stages.inbox.append(self.stages.collect(orders.popleft()))
+                    self.stages.inbox += self.stages.collect(orders.popleft())
             if idle != "sort":
                 self.stages.sort()
         raise AssertionError("it does not come to that")
@@ -324,19 +331,20 @@ def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(
     run.until(lambda: run.committed)
     run.until(lambda: any(run.stages.orders.values()), idle="collect")
     order = next(order for orders in run.stages.orders.values() for order in orders)
+    ((span, name),) = order.parts
     first = run.stages.collect(order)  # ready, and stopped before it is sent
     for orders in run.stages.orders.values():
         orders.clear()
     clock.now += LATE_S + 1
     run.step()
-    run.until(lambda: order.first in run.db.parts)
-    assert run.workers.tried[order.first, order.stop] == 2
+    run.until(lambda: span[0] in run.db.parts)
+    assert run.workers.tried[span] == 2
     before = len(run.committed)
-    written = run.storage.read(order.name)
-    run.storage.write(order.name, written)  # as its collector does when it wakes up
-    run.stages.inbox += [first, first, ColumnsLost(order.key)]
+    written = run.storage.read(name)
+    run.storage.write(name, written)  # as its collector does when it wakes up
+    run.stages.inbox += [*first, *first, ColumnsLost(order.key)]
     run.step()
-    assert len(run.committed) == before and run.db.part_of(order.first).name == order.name
+    assert len(run.committed) == before and run.db.part_of(span[0]).name == name
     run.end()
     assert len(run.storage.sizes()) == len(run.committed)
 
@@ -345,21 +353,22 @@ def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(
 def test_what_is_lost_on_its_way_is_cast_again(run, how):
     run.until(lambda: any(run.stages.orders.values()), idle="collect")
     order = next(orders for orders in run.stages.orders.values() if orders).popleft()
-    answer = run.stages.collect(order, held_at=GONE)
+    ((span, _),) = order.parts
+    answers = run.stages.collect(order, held_at=GONE)
     run.stages.held.clear()  # the worker has died
-    run.stages.inbox.append(answer if how == "held" else ColumnsLost(order.key))
+    run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key)]
     run.step()
-    assert order.first not in run.db.parts
+    assert span[0] not in run.db.parts
     run.end()
-    assert run.workers.tried[order.first, order.stop] == 2
+    assert run.workers.tried[span] == 2
 
 
 def test_parts_of_a_worker_that_does_not_see_the_storage_are_written_by_the_driver(run):
     run.until(lambda: any(run.stages.orders.values()), idle="collect")
     order = next(orders for orders in run.stages.orders.values() if orders).popleft()
-    run.stages.inbox.append(run.stages.collect(order, held_at="tcp://far:1"))
+    run.stages.inbox += run.stages.collect(order, held_at="tcp://far:1")
     run.step()
-    assert order.name in run.storage.sizes() and not run.stages.held
+    assert order.parts[0][1] in run.storage.sizes() and not run.stages.held
     run.end()
     (note,) = run.driver.notes
     assert note.startswith(f"tcp://far:1 of partition LIDAR cannot see {run.storage.url}")
@@ -397,30 +406,59 @@ def test_a_generator_that_is_started_again_repeats_nothing(run):
     assert set(run.workers.tried.values()) == {1}
 
 
+def test_small_batches_are_cast_and_collected_several_at_a_time(run):
+    run.stages.advice, run.stages.seconds = 1, TASK_SECONDS / 3.5
+    run.until(lambda: run.committed)
+    run.until(lambda: len(run.at(Place.WAITING)) >= 10, idle="cast")
+    run.end()
+    assert run.workers.most == 3 and len(run.committed) == SCANS
+    assert set(run.workers.tried.values()) == {1}
+
+
 @pytest.mark.parametrize("stage", ["intersect", "collect"])
-def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
-    poison, deaths = 23, 0
-    run.stages.advice = 20
+def test_a_scan_that_kills_its_workers_is_found_among_small_batches(run, stage):
+    run.stages.advice, run.stages.seconds = 1, 0.001
+    run.until(lambda: len(run.committed) > 5)
+    with pytest.raises(LidarpoolError, match=rf"^scan 40 kills the worker that runs stage {stage}"):
+        run.until(striking(run, stage, 40))
+    assert run.db.missing(0, SCANS)[0] == (40, 41)
+
+
+def striking(run, stage, poison, deaths=None):
+    """Let a scan kill whoever has it."""
+
+    def has(spans):
+        return any(first <= poison < stop for first, stop in spans)
 
     def strike():
-        nonlocal deaths
+        killed = 0
         for key in run.workers.open if stage == "intersect" else ():
-            first, stop, worker, _ = run.workers.casts[key]
-            if first <= poison < stop and worker in run.workers.slots:
+            spans, worker, _ = run.workers.casts[key]
+            if has(spans) and worker in run.workers.slots:
                 run.workers.die(worker)
-                deaths += 1
+                killed += 1
         for name, orders in run.stages.orders.items() if stage == "collect" else ():
-            if any(order.first <= poison < order.stop for order in orders):
+            if any(has([span for span, _ in order.parts]) for order in orders):
                 run.stages.die(name)
-                deaths += 1
+                killed += 1
+        if deaths is not None:
+            deaths.append(killed)
         return False
+
+    return strike
+
+
+@pytest.mark.parametrize("stage", ["intersect", "collect"])
+def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
+    poison, deaths = 23, []
+    run.stages.advice = 20
 
     message = rf"^scan {poison} kills the worker that runs stage {stage}: 3 workers died, one after"
     with pytest.raises(LidarpoolError, match=message):
-        run.until(strike)
+        run.until(striking(run, stage, poison, deaths))
     # Twice with the whole batch, once alone, once with its piece, and three times by itself.
     pieces = 20 // -(-20 // PIECES)
-    assert pieces == 10 and deaths == 2 + 1 + 1 + 3
+    assert pieces == 10 and sum(deaths) == 2 + 1 + 1 + 3
     assert run.db.missing(0, SCANS) == [(poison, poison + 1)]
     assert [frame.scan for frame in run.frames] == list(range(poison))
 
@@ -452,7 +490,7 @@ def test_batches_under_way_are_bounded_whoever_is_slow(run):
             if key != oldest.key:
                 run.workers.end(key)
         for order in chain.from_iterable(run.stages.orders.values()):
-            run.stages.inbox.append(run.stages.collect(order))
+            run.stages.inbox += run.stages.collect(order)
         for orders in run.stages.orders.values():
             orders.clear()
     assert run.driver.batches.span <= max(SPAN * most, SCANS) and run.frames == []
@@ -471,14 +509,15 @@ def test_a_run_that_is_stopped_leaves_nothing(run):
 def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance):
     run = Run(tmp_path_factory.mktemp("run"))
     run.stages.advice = chance.choice((1, 4, 7))
+    run.stages.seconds = chance.choice((0.1, 0.01))
     late = []  # what collectors have to say that were only stopped
 
     def collect():
         orders = chance.choice(list(run.stages.orders.values()))
         if orders:
-            answer = run.stages.collect(orders.popleft())
+            answers = run.stages.collect(orders.popleft())
             where = chance.choice((run.stages.inbox, run.stages.inbox, late))
-            where.extend([answer] * chance.choice((1, 1, 2)))
+            where.extend(answers * chance.choice((1, 1, 2)))
 
     def cast():
         if run.workers.open:
@@ -487,7 +526,7 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
 
     def lose_stage():
         name = chance.choice(["generate", "sort", *run.stages.orders])
-        late.extend(map(run.stages.collect, run.stages.die(name)))
+        late.extend(chain.from_iterable(map(run.stages.collect, run.stages.die(name))))
 
     def lose_worker():
         run.workers.die(chance.choice(list(run.workers.slots)))

@@ -16,8 +16,11 @@ from lidarpool.pipeline.policies import (
     LATE_S,
     SPAN,
     SUSPECT_DEATHS,
+    TASK_BATCHES,
+    TASK_SECONDS,
     Loss,
     Verdict,
+    batches_per_task,
     handovers,
     late_after_s,
     loss,
@@ -46,7 +49,7 @@ def waiting(count, first=10):
 
 
 def numbers(chosen):
-    return [(one.first, where) for one, where in chosen]
+    return [(one.first, where) for task, where in chosen for one in task]
 
 
 # -- size ----------------------------------------------------------------------------------------
@@ -83,6 +86,28 @@ def test_the_worker_with_the_least_work_for_its_slots_gets_the_next_batch():
     chosen = offers([casting(0, A), casting(1, B), *waiting(9)], slots, most=99)
     assert numbers(chosen)[:3] == [(10, B), (11, B), (12, A)]
     assert Counter(where for _, where in chosen) == {A: AHEAD - 1, B: 3 * AHEAD - 1}
+
+
+def sizes(there, per_task=4):
+    return [len(task) for task, _ in offers(there, {A: 1, B: 1}, 99, per_task)]
+
+
+def test_small_batches_share_tasks_and_wait_for_others_where_nobody_waits_for_them():
+    assert sizes(waiting(3)) == [2, 1]  # all slots get some
+    assert sizes(waiting(10)) == [4, 4]
+    there = [casting(0, A), casting(1, B)]
+    assert sizes([*there, *waiting(3)]) == []
+    assert sizes([*there, *waiting(5)]) == [4]
+    slow = batch(0, Place.CAST, A)  # stage 4 is behind
+    assert sizes([slow, *waiting(3)]) == []
+    assert sizes([slow, *waiting(4)]) == [4]
+
+
+def test_a_task_has_as_many_batches_as_are_worth_it():
+    assert batches_per_task([]) == 1
+    assert batches_per_task([0.3, 0.2, 9.0]) == 1
+    assert batches_per_task([TASK_SECONDS / 4.5]) == 4
+    assert batches_per_task([0.0]) == TASK_BATCHES
 
 
 def test_there_are_at_most_so_many_batches_under_way():

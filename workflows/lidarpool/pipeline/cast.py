@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,8 +13,9 @@ from poolpart import Recorder, TaskRecord
 from ..base.tracing import trace
 from ..columns.parts import PartColumns
 from ..simulator.returns import BatchReturns, columns_of
+from ..simulator.rig import Rig
 from .failures import naming_scans
-from .messages import samples_of_scan, summary_type
+from .messages import Span, samples_of_scan, summary_type
 from .names import GPU, INTERSECT
 from .rigs import rig_of
 
@@ -27,10 +29,11 @@ class CastBatch:
     record: TaskRecord
 
 
-def intersect(handle: str, first: int, stop: int) -> CastBatch:
-    """Cast the rays of scans `first` to `stop` and make their columns; runs on a GPU worker.
+def intersect(handle: str, spans: Sequence[Span]) -> list[CastBatch]:
+    """Cast the rays of batches and make their columns; runs on a GPU worker.
 
-    `handle` is that of the worker's rig, which is the id of the run.
+    `spans` are the first scan and the end of each. `handle` is that of the worker's rig, which is
+    the id of the run.
 
     Raises
     ------
@@ -40,6 +43,10 @@ def intersect(handle: str, first: int, stop: int) -> CastBatch:
         If casting or a column fails, naming the scans.
     """
     rig = rig_of(handle)
+    return [_cast(rig, handle, first, stop) for first, stop in spans]
+
+
+def _cast(rig: Rig, handle: str, first: int, stop: int) -> CastBatch:
     recorder = Recorder(INTERSECT, GPU)
     scans = list(range(first, stop))
     trace("intersect.start", run=handle, stage=INTERSECT, scans=scans)

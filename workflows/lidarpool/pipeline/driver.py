@@ -48,6 +48,7 @@ from .task_book import TaskBook
 from .workers import CastingWorkers, Outcome
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
+WAIT_S = 0.02  # for news, where there is nothing else to do
 CLOSING_S = 0.001  # longest wait while the stages end
 
 
@@ -147,10 +148,12 @@ class SurveyDriver:
     def wait(self, seconds: float) -> None:
         """Wait until there may be something to do, at most so long."""
         room = policies.room(len(self.batches), self.batches.span, self._most)
+        # The pipe of stage 1 is closed after the last scan, which would end each wait.
+        wanted = room > 0 and self.generated < self.survey.scan_count
         self._stages.wait(
-            min(seconds, CLOSING_S) if self._closed else seconds,
+            min(seconds, CLOSING_S) if self._closed else max(seconds, WAIT_S),
             self._workers.pending,
-            scans=room > 0 and not self._condemned and not self._closed,
+            scans=wanted and not self._condemned and not self._closed,
         )
 
     def _receive(self) -> bool:
@@ -171,7 +174,12 @@ class SurveyDriver:
 
     @property
     def _most(self) -> int:
-        return policies.most_under_way(self._workers.slot_count, self._stages.collector_count)
+        slots, collectors = self._workers.slot_count, self._stages.collector_count
+        return policies.most_under_way(slots, collectors, self._per_task)
+
+    @property
+    def _per_task(self) -> int:
+        return policies.batches_per_task(self._seconds)
 
     def _trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
         trace(f"driver.{event}", run=self._stages.run, stage=stage, scans=list(scans), **more)
@@ -190,13 +198,15 @@ class SurveyDriver:
 
     def _offer(self) -> bool:
         """Offer waiting batches to workers that have room."""
-        chosen = policies.offers([*self.batches], self._workers.slots, self._most)
-        for batch, worker in chosen:
-            batch.offers += 1
-            batch.worker, batch.collector = worker, ""
-            batch.key = self._workers.cast(batch.first, batch.stop, batch.offers, worker)
-            batch.to(Place.CASTING, time.monotonic())
-            self._trace("submit", INTERSECT, batch.scans)
+        slots, most = self._workers.slots, self._most
+        chosen = policies.offers([*self.batches], slots, most, self._per_task)
+        for task, worker in chosen:
+            key = self._workers.cast([(batch.first, batch.stop) for batch in task], worker)
+            for batch in task:
+                batch.offers += 1
+                batch.key, batch.worker, batch.collector = key, worker, ""
+                batch.to(Place.CASTING, time.monotonic())
+                self._trace("submit", INTERSECT, batch.scans)
         return bool(chosen)
 
     def _check_casts(self) -> bool:
@@ -229,14 +239,20 @@ class SurveyDriver:
     def _again(self, batch: Batch, reason: str, place: Place = Place.WAITING) -> None:
         """Return a batch to be cast again, or only to be collected again."""
         if place is Place.WAITING:
-            self._workers.forget(batch.key)
+            self._forget(batch)
         batch.to(place, time.monotonic())
         self.offered_again += 1
         self._trace("replay", INTERSECT, batch.scans, reason=reason)
 
     def _remove(self, batch: Batch) -> None:
-        self._workers.forget(batch.key)
+        self._forget(batch)
         self.batches.remove(batch)
+
+    def _forget(self, batch: Batch) -> None:
+        """Drop a batch's casting task, unless others of the same task need it."""
+        key, batch.key = batch.key, ""
+        if all(other.key != key for other in self.batches):
+            self._workers.forget(key)
 
     # -- poison batches ----------------------------------------------------------------------
 
@@ -245,7 +261,7 @@ class SurveyDriver:
         batch.deaths[stage] += 1
         judged = policies.verdict(batch.deaths[stage], len(batch))
         if judged is Verdict.SPLIT:
-            self._workers.forget(batch.key)
+            self._forget(batch)
             self.batches.split(batch, Counter({stage: policies.SUSPECT_DEATHS}))
         elif judged is Verdict.POISON:
             self._remove(batch)
@@ -263,12 +279,15 @@ class SurveyDriver:
     def _hand_over(self) -> bool:
         """Assign batches that were cast to collectors."""
         orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
-        for batch, name in policies.handovers([*self.batches], self._stages.collectors):
-            batch.collector = name
-            batch.to(Place.COLLECTING, time.monotonic())
-            self._trace("handon", COLLECT, batch.scans)
-            part = part_name(self._mark, batch.first, batch.stop)
-            order = CollectOrder(batch.key, batch.worker, batch.first, batch.stop, part)
+        for task, name in policies.handovers([*self.batches], self._stages.collectors):
+            parts = []
+            for batch in task:
+                batch.collector = name
+                batch.to(Place.COLLECTING, time.monotonic())
+                self._trace("handon", COLLECT, batch.scans)
+                part = part_name(self._mark, batch.first, batch.stop)
+                parts.append(((batch.first, batch.stop), part))
+            order = CollectOrder(task[0].key, task[0].worker, tuple(parts))
             orders.setdefault(name, []).append(order)
         for name, messages in orders.items():
             self._stages.send(name, messages)

@@ -37,7 +37,7 @@ SETTLE_S = 2.0  # for a task that was just submitted to start
 DEATHS_MOST = 12  # deaths of one stage with nothing committed in between
 ASK_LOCK_S = 0.05
 LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
-PUT_S = 30.0  # for a pipe that is never full
+LINGER_S = 0.004  # of a wait, for more messages
 
 
 @dataclass(eq=False)
@@ -97,6 +97,7 @@ class LongStages:
         self._scans = self._pipe("scans", queue_capacity)
         self._news = self._pipe("news", 64)  # from stages 3 and 4
         self._inbox: list[Message] = []
+        self._outbox: dict[str, list[Sequence[CollectOrder | Summaries]]] = {}  # by pipe
         self._looked_at = 0.0
         self._progress = -1  # when something was last committed
         self._deaths: dict[str, list[str]] = {}  # {name: workers that have died since then}
@@ -120,11 +121,13 @@ class LongStages:
     def wait(self, seconds: float, keys: Sequence[str], *, scans: bool) -> None:
         """Wait until there are messages or one of some tasks has ended, at most so long.
 
-        The same request takes all messages, those of stage 1 only if `scans` are wanted: each
-        request costs driver and scheduler a millisecond.
+        The same request sends what was to be sent, and takes all messages, those of stage 1 only
+        if `scans` are wanted: each request costs driver and scheduler a millisecond.
         """
         pipes = [self._news.name, *([self._scans.name] if scans else [])]
-        for items in take_news(self.client, seconds, pipes, keys).values():
+        puts, self._outbox = self._outbox, {}
+        found = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=LINGER_S)
+        for items in found.values():
             self._inbox += items
 
     def receive(self) -> list[Message]:
@@ -133,11 +136,13 @@ class LongStages:
         return messages
 
     def send(self, name: str, messages: Sequence[CollectOrder | Summaries]) -> None:
-        """Send messages to a stage 3 or 4; they are lost if it is not running."""
+        """Send messages to a stage 3 or 4 with the next `wait`.
+
+        They are lost if it is not running, or is being replaced: then it gets all of it.
+        """
         task = self._tasks.get(name)
         if task is not None and task.inlet is not None:
-            with suppress(PipeFailed):  # it is being replaced, and gets all of it then
-                task.inlet.put(messages, timeout_s=PUT_S, unbounded=True)
+            self._outbox.setdefault(task.inlet.name, []).append(messages)
 
     def advise(self, scans: int) -> None:
         """Tell stage 1 how many scans an item should have."""

@@ -17,6 +17,8 @@ from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..sensor import Pose
 
+Span = tuple[int, int]  # the first scan of a batch, and its end
+
 SAMPLES_MOST = 4  # sample rays of a scan
 SAMPLES_WANTED = 400  # of a survey
 
@@ -71,13 +73,11 @@ class Summaries:
 
 @dataclass(frozen=True, slots=True)
 class CollectOrder:
-    """To stage 4: fetch the columns of scans `first` to `stop`, and write them as a part."""
+    """To stage 4: fetch the columns of batches of one casting task, and write each as a part."""
 
     key: str  # of the casting task
     worker: str  # address of the worker that has its result
-    first: int
-    stop: int
-    name: str  # of the part
+    parts: tuple[tuple[Span, str], ...]  # scans and name of each
 
 
 @dataclass(frozen=True, slots=True)

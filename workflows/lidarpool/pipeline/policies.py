@@ -6,7 +6,7 @@ Nothing here reads a clock, the cluster or the driver.
 from __future__ import annotations
 
 import statistics
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from enum import Enum
 
@@ -18,8 +18,10 @@ from .names import COLLECT, INTERSECT
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
 BATCH_RAYS = 1_000_000  # bounds a batch's memory
 BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
-AHEAD = 2  # batches offered to a worker for each of its slots, so that it need not wait
-COLLECTING = 3  # batches that a collector is given at a time
+TASK_SECONDS = 0.1  # casting time that makes a task worth its overhead
+TASK_BATCHES = 32  # batches of one task, at most
+AHEAD = 2  # tasks offered to a worker for each of its slots, so that it need not wait
+COLLECTING = 3  # tasks whose batches a collector is given at a time
 SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
 SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
 KILLS_MOST = 3  # workers that a single scan may kill, alone
@@ -41,9 +43,17 @@ def scans_per_batch(
     return max(1, min(int(BATCH_SECONDS * scans / max(seconds, 1e-6)), 2 * scans, most))
 
 
-def most_under_way(slots: int, collectors: int) -> int:
-    """Batches that may be under way."""
-    return AHEAD * slots + COLLECTING * collectors + 2
+def batches_per_task(seconds: Sequence[float]) -> int:
+    """Choose how many batches a casting task has, from the casting times of others."""
+    if not seconds:
+        return 1
+    typical = max(statistics.median(seconds), 1e-6)
+    return max(1, min(int(TASK_SECONDS / typical), TASK_BATCHES))
+
+
+def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
+    """Batches that may be under way, so many in a task."""
+    return (AHEAD * slots + COLLECTING * collectors + 2) * per_task
 
 
 def room(under_way: int, span: int, most: int) -> int:
@@ -60,43 +70,55 @@ def suspect(batch: Batch, stage: str) -> bool:
 
 
 def offers(
-    batches: Sequence[Batch], slots: Mapping[str, int], most: int
-) -> list[tuple[Batch, str]]:
+    batches: Sequence[Batch], slots: Mapping[str, int], most: int, per_task: int = 1
+) -> list[tuple[list[Batch], str]]:
     """Choose workers for waiting batches, at most so many under way in all.
 
-    The worker with the least work for its slots gets the next batch. A suspect batch gets a worker
-    for itself, and is waited for: the others must not occupy all workers. `slots` says how many
-    batches each worker casts at a time.
+    The worker with the least work for its slots gets the next task, of up to `per_task` batches;
+    of fewer only if a slot is idle and stage 4 keeps up. A suspect batch gets a worker for itself,
+    and is waited for: the others must not occupy all workers. `slots` says how many tasks each
+    worker runs at a time.
     """
     casting = [b for b in batches if b.place is Place.CASTING]
-    load = Counter(batch.worker for batch in casting)
+    load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
     left = most - sum(b.place in (Place.CAST, Place.COLLECTING) for b in batches)
-    left -= sum(load[address] for address in slots)
-    chosen: list[tuple[Batch, str]] = []
-    for batch in (b for b in batches if b.place is Place.WAITING):
-        wary = suspect(batch, INTERSECT)
+    left -= sum(b.worker in slots for b in casting)
+    waiting = deque(b for b in batches if b.place is Place.WAITING)
+    backlog = any(b.place is Place.CAST for b in batches)
+    idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
+    size = per_task if backlog else min(per_task, -(-len(waiting) // max(1, idle)))
+    chosen: list[tuple[list[Batch], str]] = []
+    while waiting:
+        wary = suspect(waiting[0], INTERSECT)
         fullness = {
             address: load[address] / (1 if wary else AHEAD * count)
             for address, count in slots.items()
             if address not in alone
         }
         address = min(fullness, key=lambda a: (fullness[a], a), default="")
-        if not address or fullness[address] >= 1:
-            if wary:
-                break
-            continue
-        if len(chosen) >= left:
+        if not address or fullness[address] >= 1 or left < 1:
             break
-        chosen.append((batch, address))
+        busy = backlog or load[address] >= slots[address]
+        if busy and not wary and min(left, len(waiting)) < per_task:
+            break  # a task that has to wait may become larger
+        task = [waiting.popleft()]
+        while not wary and waiting and len(task) < min(size, left):
+            if suspect(waiting[0], INTERSECT):
+                break
+            task.append(waiting.popleft())
+        left -= len(task)
+        chosen.append((task, address))
         load[address] += 1
         if wary:
             alone.add(address)
     return chosen
 
 
-def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[tuple[Batch, str]]:
-    """Choose collectors for batches that were cast.
+def handovers(
+    batches: Sequence[Batch], collectors: Mapping[str, str]
+) -> list[tuple[list[Batch], str]]:
+    """Choose collectors for batches that were cast, those of a task together.
 
     One on the host of the columns is preferred. A suspect batch is collected while there is no
     other in stage 4: several collectors may share a process. `collectors` has the address of the
@@ -108,15 +130,18 @@ def handovers(batches: Sequence[Batch], collectors: Mapping[str, str]) -> list[t
         ready = [] if busy else suspects[:1]
     if any(suspect(b, COLLECT) for b in busy):
         return []
-    load = Counter(batch.collector for batch in busy)
-    chosen: list[tuple[Batch, str]] = []
+    load = Counter(name for _, name in {(b.key, b.collector) for b in busy})
+    tasks: dict[str, list[Batch]] = {}
     for batch in ready:
+        tasks.setdefault(batch.key, []).append(batch)
+    chosen: list[tuple[list[Batch], str]] = []
+    for task in tasks.values():
         free = [name for name in collectors if load[name] < COLLECTING]
         if not free:
             break
-        near = [name for name in free if _host(collectors[name]) == _host(batch.worker)]
+        near = [name for name in free if _host(collectors[name]) == _host(task[0].worker)]
         name = min(near or free, key=lambda n: (load[n], n))
-        chosen.append((batch, name))
+        chosen.append((task, name))
         load[name] += 1
     return chosen
 

@@ -6,6 +6,8 @@ four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver 
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator, Sequence
 from itertools import chain
 
 from distributed import secede
@@ -30,6 +32,7 @@ from .failures import naming_scans, storing
 from .messages import CollectOrder, ColumnsLost, Receipt, ScanRange, StageStart, Summaries
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
+TELL_EVERY_S = 0.02  # receipts that follow each other so fast travel together
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
@@ -45,13 +48,18 @@ def generate(me: StageStart, survey: Survey, outlet: Pipe, first: int) -> TaskRe
     me.trace("start")
     try:
         while sent < survey.scan_count:
-            stop = min(sent + outlet.advice, survey.scan_count)
-            with naming_scans(sent, stop - 1):
-                survey.scan(stop - 1)  # raises here if a scan cannot be described
-            me.trace("put", range(sent, stop))
-            outlet.put(ScanRange(sent, stop))
-            me.trace("sent", range(sent, stop))
-            sent = stop
+            items: list[ScanRange] = []
+            at = sent
+            while at < survey.scan_count and len(items) < outlet.capacity:
+                item = ScanRange(at, min(at + outlet.advice, survey.scan_count))
+                with naming_scans(item.first, item.stop - 1):
+                    survey.scan(item.stop - 1)  # raises here if a scan cannot be described
+                items.append(item)
+                at = item.stop
+            me.trace("put", range(sent, at))
+            outlet.put_many(items)
+            me.trace("sent", range(sent, at))
+            sent = at
         outlet.close()
     except PipeFailed:
         pass
@@ -106,44 +114,66 @@ def collect(
     scans = 0
     try:
         me.trace("start")
-        seen = storage.sees(*probe)
+        there = storage if storage.sees(*probe) else None
         while True:
-            for order in chain.from_iterable(inlet.get_all()):
-                answer = _collected(me, storage if seen else None, order)
-                if isinstance(answer, Receipt):
-                    scans += order.stop - order.first
-                outlet.put(answer, unbounded=True)  # the driver limits its orders
-                me.trace("sent", range(order.first, order.stop))
+            answers: list[Receipt | ColumnsLost] = []
+            told = time.monotonic()
+            orders = [*chain.from_iterable(inlet.get_all())]
+            for answer in chain.from_iterable(_collected(me, there, o) for o in orders):
+                answers.append(answer)
+                if time.monotonic() - told > TELL_EVERY_S:
+                    scans += _send(me, outlet, answers)
+                    answers, told = [], time.monotonic()
+            scans += _send(me, outlet, answers)
     except (PipeClosed, PipeFailed):
         pass
     return recorder.done(scans)
 
 
+def _send(me: StageStart, outlet: Pipe, answers: Sequence[Receipt | ColumnsLost]) -> int:
+    """Send messages to the driver; returns how many scans are stored."""
+    outlet.put_many(answers, unbounded=True)  # the driver limits its orders
+    stored = [range(a.first, a.stop) for a in answers if isinstance(a, Receipt)]
+    for scans in stored:
+        me.trace("sent", scans)
+    return sum(map(len, stored))
+
+
 def _collected(
     me: StageStart, storage: Storage | None, order: CollectOrder
-) -> Receipt | ColumnsLost:
-    """Make a part of one batch; returns the message to the driver."""
-    scans = range(order.first, order.stop)
+) -> Iterator[Receipt | ColumnsLost]:
+    """Make the parts of a casting task; gives the messages to the driver."""
     found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
-    batch: CastBatch | None = found.get(order.key)
-    if batch is None:
-        return ColumnsLost(order.key)
-    me.trace("get", scans)
-    with naming_scans(order.first, order.stop - 1):
+    if order.key not in found:
+        yield ColumnsLost(order.key)
+        return
+    batches: dict[int, CastBatch] = {batch.part.first: batch for batch in found[order.key]}
+    for (first, stop), name in order.parts:
+        me.trace("get", range(first, stop))
+        yield _stored(me, storage, batches[first], stop, name)
+
+
+def _stored(
+    me: StageStart, storage: Storage | None, batch: CastBatch, stop: int, name: str
+) -> Receipt:
+    """Make a part of a batch."""
+    first = batch.part.first
+    scans = range(first, stop)
+    with naming_scans(first, stop - 1):
         data = pack(batch.part)
         cells = batch.part.cells
     me.trace("part", scans)
     held_at = ""
     if storage is None:
-        held_at = hold_for_driver(order.name, data)
+        held_at = hold_for_driver(name, data)
     else:
         with storing(storage):
-            storage.write(order.name, data)
+            storage.write(name, data)
         me.trace("stored", scans)
     return Receipt(
-        first=order.first,
-        stop=order.stop,
-        name=order.name,
+        first=first,
+        stop=stop,
+        name=name,
         rows=len(batch.part),
         size=len(data),
         hits=int(batch.summaries["hits"].sum()),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from enum import Enum
 from typing import Any
@@ -17,6 +17,7 @@ from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from .cast import intersect
 from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memory
+from .messages import Span
 from .names import INTERSECT
 from .rigs import RigPlan, drop_rig
 
@@ -60,7 +61,7 @@ class CastingWorkers:
         self._plan: Future | None = None  # the packed plan, on the workers
         self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
-        self._count = 0
+        self._count = self._offered = 0
         self._casts: dict[str, Future] = {}  # {key: casting task}
         self._died: list[str] = []  # workers that died while preparing, in a row
         self._looked_at = float("-inf")
@@ -87,13 +88,14 @@ class CastingWorkers:
 
     # -- casting ---------------------------------------------------------------------------
 
-    def cast(self, first: int, stop: int, offer: int, worker: str) -> str:
-        """Offer the scans from `first` to `stop` to a worker for the n-th time; returns the key."""
+    def cast(self, spans: Sequence[Span], worker: str) -> str:
+        """Offer batches to a worker as one task; returns its key."""
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
-        key = f"{INTERSECT}-{self.handle}-{first}-{stop}.{offer}"
+        self._offered += 1
+        key = f"{INTERSECT}-{self.handle}-{spans[0][0]}-{spans[-1][1]}.{self._offered}"
         self._casts[key] = self._partition.submit(
-            intersect, self.handle, first, stop, key=key, workers=worker
+            intersect, self.handle, spans, key=key, workers=worker
         )
         return key
 
