@@ -143,25 +143,37 @@ def _merged(
     cell, low = (2 * area / most) ** 0.5, points.min(axis=0)
     while True:
         at = np.floor((points - low) / cell).astype(np.int64)
-        _, merged, counts = np.unique(at, axis=0, return_inverse=True, return_counts=True)
-        faces = merged.reshape(-1)[corners].astype(np.int32)
+        _, merged, counts = np.unique(_numbered(at), return_inverse=True, return_counts=True)
+        faces = merged[corners].astype(np.int32)
         first, second, third = faces.T
         flat = (first == second) | (second == third) | (third == first)
         wide = np.flatnonzero(~flat)
         _, owner, same = np.unique(
-            np.sort(faces[wide], axis=1), axis=0, return_index=True, return_inverse=True
+            _numbered(np.sort(faces[wide], axis=1)), return_index=True, return_inverse=True
         )
         if len(owner) <= most:
             break
         cell *= 1.3
     vertices = np.stack(
-        [np.bincount(merged.reshape(-1), axis) / counts for axis in points.T], axis=1
+        [np.bincount(merged, axis) / counts for axis in points.T], axis=1
     )
     kept = wide[owner]
     stands = np.full(len(faces), -1, np.int64)
-    stands[wide] = same.reshape(-1)
+    stands[wide] = same
     near = np.full(len(vertices), -1, np.int64)  # a triangle at each vertex
     near[faces[kept].ravel()] = np.repeat(np.arange(len(kept)), 3)
     small = np.flatnonzero(flat)
     stands[small] = near[faces[small]].max(axis=1)
     return vertices, faces, kept, stands
+
+
+def _numbered(rows: NDArray[Any]) -> NDArray[np.int64]:
+    """Numbers (n,) of rows of natural numbers (n, 3), in their order: sorted fast, unlike rows."""
+    number = np.zeros(len(rows), np.int64)
+    for column in rows.T.astype(np.int64):
+        small = [
+            np.unique(one, return_inverse=True)[1] if one.max(initial=0) >= 1 << 31 else one
+            for one in (number, column)
+        ]
+        number = small[0] * (int(small[1].max(initial=0)) + 1) + small[1]
+    return number
