@@ -154,9 +154,7 @@ def _merged(
         if len(owner) <= most:
             break
         cell *= 1.3
-    vertices = np.stack(
-        [np.bincount(merged, axis) / counts for axis in points.T], axis=1
-    )
+    vertices = np.stack([np.bincount(merged, axis) / counts for axis in points.T], axis=1)
     kept = wide[owner]
     stands = np.full(len(faces), -1, np.int64)
     stands[wide] = same
