@@ -99,7 +99,7 @@ def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
         assert row["hits"]["ranges"] == pytest.approx(row["hits"]["cast"], abs=1e-9)
         assert row["hits"]["open3d"] == pytest.approx(row["hits"]["cast"], abs=2e-3)
     said = capsys.readouterr().out
-    assert "mujoco: not installed" in said and said.count("the bar of 1.3 x the cast is") == 3
+    assert "mujoco-lidar: not installed" in said and said.count("the bar of 1.3 x the cast is") == 3
 
 
 def test_planning(capsys):
