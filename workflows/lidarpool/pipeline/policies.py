@@ -75,9 +75,10 @@ def offers(
     """Choose workers for waiting batches, at most so many under way in all.
 
     The worker with the least work for its slots gets the next task, of up to `per_task` batches;
-    of fewer only if a slot is idle and stage 4 keeps up. A suspect batch gets a worker for itself,
-    and is waited for: the others must not occupy all workers. `slots` says how many tasks each
-    worker runs at a time.
+    of fewer only if a slot is idle and stage 4 keeps up. A batch with which a worker has died gets
+    a task for itself, or its neighbours would share the blame for the next one. A suspect batch
+    gets a worker for itself, and is waited for: the others must not occupy all workers. `slots`
+    says how many tasks each worker runs at a time.
     """
     casting = [b for b in batches if b.place is Place.CASTING]
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
@@ -99,13 +100,12 @@ def offers(
         address = min(fullness, key=lambda a: (fullness[a], a), default="")
         if not address or fullness[address] >= 1 or left < 1:
             break
+        blamed = bool(waiting[0].deaths)
         busy = backlog or load[address] >= slots[address]
-        if busy and not wary and min(left, len(waiting)) < per_task:
+        if busy and not blamed and min(left, len(waiting)) < per_task:
             break  # a task that has to wait may become larger
         task = [waiting.popleft()]
-        while not wary and waiting and len(task) < min(size, left):
-            if suspect(waiting[0], INTERSECT):
-                break
+        while not blamed and waiting and not waiting[0].deaths and len(task) < min(size, left):
             task.append(waiting.popleft())
         left -= len(task)
         chosen.append((task, address))
@@ -120,9 +120,9 @@ def handovers(
 ) -> list[tuple[list[Batch], str]]:
     """Choose collectors for batches that were cast, those of a task together.
 
-    One on the host of the columns is preferred. A suspect batch is collected while there is no
-    other in stage 4: several collectors may share a process. `collectors` has the address of the
-    worker of each.
+    Those with which a collector has died come alone. A collector on the host of the columns is
+    preferred. A suspect batch is collected while there is no other in stage 4: several collectors
+    may share a process. `collectors` has the address of the worker of each.
     """
     ready = [b for b in batches if b.place is Place.CAST]
     busy = [b for b in batches if b.place is Place.COLLECTING]
@@ -131,9 +131,10 @@ def handovers(
     if any(suspect(b, COLLECT) for b in busy):
         return []
     load = Counter(name for _, name in {(b.key, b.collector) for b in busy})
-    tasks: dict[str, list[Batch]] = {}
+    tasks: dict[tuple[str, int], list[Batch]] = {}
     for batch in ready:
-        tasks.setdefault(batch.key, []).append(batch)
+        alone = batch.first if batch.deaths[COLLECT] else -1
+        tasks.setdefault((batch.key, alone), []).append(batch)
     chosen: list[tuple[list[Batch], str]] = []
     for task in tasks.values():
         free = [name for name in collectors if load[name] < COLLECTING]
