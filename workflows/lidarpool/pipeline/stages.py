@@ -32,7 +32,7 @@ from .failures import naming_scans, storing
 from .messages import CollectOrder, ColumnsLost, Receipt, ScanRange, StageStart, Summaries
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
-TELL_EVERY_S = 0.02  # receipts that follow each other so fast travel together
+TELL_EVERY_S = 0.02  # messages that follow each other so fast travel together
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
@@ -49,17 +49,21 @@ def generate(me: StageStart, survey: Survey, outlet: Pipe, first: int) -> TaskRe
     try:
         while sent < survey.scan_count:
             items: list[ScanRange] = []
-            at = sent
-            while at < survey.scan_count and len(items) < outlet.capacity:
-                item = ScanRange(at, min(at + outlet.advice, survey.scan_count))
+            until = time.monotonic() + TELL_EVERY_S
+            while not items or (
+                sent < survey.scan_count
+                and len(items) < outlet.capacity
+                and time.monotonic() < until
+            ):
+                item = ScanRange(sent, min(sent + outlet.advice, survey.scan_count))
                 with naming_scans(item.first, item.stop - 1):
                     survey.scan(item.stop - 1)  # raises here if a scan cannot be described
+                me.trace("put", range(item.first, item.stop))
                 items.append(item)
-                at = item.stop
-            me.trace("put", range(sent, at))
+                sent = item.stop
             outlet.put_many(items)
-            me.trace("sent", range(sent, at))
-            sent = at
+            for item in items:
+                me.trace("sent", range(item.first, item.stop))
         outlet.close()
     except PipeFailed:
         pass
