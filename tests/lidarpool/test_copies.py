@@ -254,7 +254,14 @@ def test_what_cannot_be_is_told_in_a_line(build, folder, name):
 
 
 def test_nothing_to_stand_on(build):
-    with pytest.raises(LidarpoolError, match="nothing to stand on: the scene has no files"):
+    with pytest.raises(LidarpoolError, match="nothing to stand on: add scene.files"):
         build(TREE | {"scatter": {"count": 1}}, scene={"files": []})
     with pytest.raises(LidarpoolError, match="give z"):
         build(TREE | {"at": [[0, 0]]}, scene={"files": []})
+
+
+def test_lists_stand_on_a_ground_that_reaches_under_them(build):
+    _, scene = build(
+        TREE | {"at": [[5, 5], [50, 5]]}, scene={"files": [], "ground": {"height_m": 1}}
+    )
+    assert scene.bounds[0, 2] + scene.origin[2] == 1

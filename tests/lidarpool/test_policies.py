@@ -108,6 +108,7 @@ def test_a_task_has_as_many_batches_as_are_worth_it():
     assert batches_per_task([0.3, 0.2, 9.0]) == 1
     assert batches_per_task([TASK_SECONDS / 4.5]) == 4
     assert batches_per_task([0.0]) == TASK_BATCHES
+    assert batches_per_task([0.0], BATCH_RAYS // 5) == 5
 
 
 def test_there_are_at_most_so_many_batches_under_way():

@@ -3,7 +3,7 @@
 import re
 import urllib.error
 import urllib.request
-from html import escape
+from html import unescape
 
 import pytest
 from distributed import Client, get_worker
@@ -29,7 +29,7 @@ def rows_of(url):
     text = get(url)[2]
     rows = re.findall(r"<tr>(<td>.*?)</tr>", text)
     cells = [re.findall(r"<td>(.*?)</td>", row) for row in rows]
-    return {first: others for first, *others in cells}
+    return {unescape(first): others for first, *others in cells}
 
 
 def work(_=None):

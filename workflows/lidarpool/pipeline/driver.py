@@ -179,7 +179,9 @@ class SurveyDriver:
 
     @property
     def _per_task(self) -> int:
-        return policies.batches_per_task(self._seconds)
+        rays = self.survey.ray_count // self.survey.scan_count
+        largest = rays * max(map(len, self.batches), default=1)
+        return policies.batches_per_task(self._seconds, largest)
 
     def _trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
         trace(f"driver.{event}", run=self._stages.run, stage=stage, scans=list(scans), **more)
@@ -316,6 +318,9 @@ class SurveyDriver:
                 self._learn(receipt.record)
             for batch in self.batches.within(receipt.first, receipt.stop):
                 self._remove(batch)
+                for other in self.batches.at(Place.COLLECTING):  # those behind it had to wait
+                    if other.collector == batch.collector and other.since >= batch.since:
+                        other.since = time.monotonic()
         if new:
             self._send_summaries(new)
             self._on_parts(new)

@@ -43,12 +43,16 @@ def scans_per_batch(
     return max(1, min(int(BATCH_SECONDS * scans / max(seconds, 1e-6)), 2 * scans, most))
 
 
-def batches_per_task(seconds: Sequence[float]) -> int:
-    """Choose how many batches a casting task has, from the casting times of others."""
+def batches_per_task(seconds: Sequence[float], rays: int = 1) -> int:
+    """Choose how many batches of so many rays a casting task has, from the casting times of others.
+
+    All of its batches are in a worker's memory at a time.
+    """
     if not seconds:
         return 1
     typical = max(statistics.median(seconds), 1e-6)
-    return max(1, min(int(TASK_SECONDS / typical), TASK_BATCHES))
+    most = min(TASK_BATCHES, BATCH_RAYS // max(1, rays))
+    return max(1, min(int(TASK_SECONDS / typical), most))
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:

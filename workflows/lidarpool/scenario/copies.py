@@ -25,6 +25,7 @@ from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
 from .sections import COPIES_MOST, CopiesSection, Scatter
 
+SCALE_LEAST = 1e-6
 DRAWN = 1 << 14  # places that are drawn at a time
 DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
 DRAWS_LEAST = 1 << 21
@@ -48,7 +49,10 @@ class Standing:
         """Return the same of some objects; LidarpoolError if there is nothing to stand on."""
         scene = self._scene
         if scene is None:
-            raise LidarpoolError("there is nothing to stand on: the scene has no files.")
+            raise LidarpoolError(
+                "there is nothing to stand on: add scene.files, or scene.ground and a rectangle "
+                "(within)."
+            )
         rows = [rows_named(name, scene.names) for name in names]
         for name, found in zip(names, rows, strict=True):
             if not len(found):
@@ -140,8 +144,11 @@ def copies_of(
                 f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
                 f"on ({counted(len(low), 'copy', 'copies')}): give z."
             )
-        if not scales.all():
-            raise LidarpoolError("a scale of 0 would flatten the mesh.")
+        if (np.abs(scales) < SCALE_LEAST).any():
+            raise LidarpoolError(
+                f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
+                f"at least {SCALE_LEAST:g}."
+            )
     matrices = np.tile(np.eye(4), (len(places), 1, 1))
     matrices[:, :3, :3] = rotations_of(angles) * scales[:, None]
     matrices[:, :3, 3] = places

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -236,6 +237,13 @@ class Scenario(Section):
             wrong.append("give both planning.start and planning.target, or neither.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
+        copies = [entry.name for entry in self.scene.copies]
+        named = Counter([*copies, *(entry.name for entry in self.actors)])
+        if twice := next((name for name in copies if named[name] > 1), None):
+            wrong.append(
+                f"{twice!r} is the name of two entries of scene.copies and actors: give each its "
+                "own."
+            )
         if self.sensors and (self.sensor != SensorSection() or self.mount):
             wrong.append("give either sensor and mount, or sensors, each with a mount.")
         mistakes.lines += [f"{self._source}: {words}" for words in wrong]
@@ -347,12 +355,16 @@ class Scenario(Section):
         return out
 
     def _scattered_in(self) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
-        """Rectangles that copies are scattered in, [[x0, y0], [x1, y1]]."""
+        """Corners of where copies are scattered, and places of lists, each (n, 2)."""
         scattered = [entry.scatter for entry in self.scene.copies if entry.scatter is not None]
-        return [np.reshape(one.within, (2, 2)) for one in scattered if one.within is not None]
+        listed = [[one.position[:2] for one in entry.at] for entry in self.scene.copies]
+        return [
+            *(np.reshape(one.within, (2, 2)) for one in scattered if one.within is not None),
+            *(np.array(places, np.float64) for places in listed if places),
+        ]
 
     def _ground(self, scene: Scene | None) -> Mesh:
-        """Two triangles under a scene, and under the rectangles that copies are scattered in."""
+        """Two triangles under a scene, and under where copies are scattered or listed."""
         section = self.scene.ground
         assert section is not None
         ends = [] if scene is None else [(scene.bounds + scene.origin)[:, :2]]
@@ -389,7 +401,7 @@ class Scenario(Section):
             # After the last that is for it: a later one, for a single copy, counts there.
             after = max((k for k, m in enumerate(made) if m.named(entry.name)), default=-1)
             of = made[after] if after >= 0 else Material("*")
-            objects, numbered = [entry.name], f"{escape(entry.name)}.[0-9]*"
+            objects, numbered = [escape(entry.name)], f"{escape(entry.name)}.[0-9]*"
             if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
                 objects.append(numbered)
             made.insert(after + 1, replace(of, objects=objects, semantic_class=semantic_class))

@@ -168,7 +168,8 @@ class Scatter(Section):
 
     count: Annotated[int, told("how many", ge=1, le=COPIES_MOST)]
     surfaces: Annotated[  # not "on", which YAML takes for true
-        TextOrTexts, told("names of the objects to stand on, with * and ?; by default all")
+        TextOrTexts,
+        told("names of the objects to stand on, with * and ?; by default all", min_length=1),
     ] = ("*",)
     within: Annotated[
         Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False)] | None,

@@ -132,6 +132,7 @@ class _Reader:
     ) -> None:
         self._header, self._body, self._path, self._masks = header, body, path, masks
         self._allowance = Allowance(size, SMALLER)
+        self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
         self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
@@ -150,7 +151,9 @@ class _Reader:
         name, meshes, copies = str(found.get("name") or ""), [], None
         if "mesh" in found:
             name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
-            meshes = self._mesh(found["mesh"])
+            # Some programs write a mesh for each node, all of the same accessors.
+            content = json.dumps(self._part("meshes", found["mesh"])["primitives"], sort_keys=True)
+            meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
             if instancing := found.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
         return Node(name, _matrix(found), meshes, found.get("children", ()), copies)

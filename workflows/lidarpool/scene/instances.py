@@ -12,10 +12,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.arguments import checked_fields
+from ..base.errors import LidarpoolError
 from ..sensor import Pose
 from .mesh import Mesh
 from .transform import Transform
 
+# Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
+FARTHEST_M = 1e8
 BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
 
 Float = NDArray[np.float64]
@@ -55,6 +58,7 @@ class Instance:
         placed = given if isinstance(given, Transform) else Transform.from_matrix(given)
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = placed.linear, placed.offset
+        check_near(matrix[:3, 3])
         object.__setattr__(self, "transform", matrix)
         object.__setattr__(self, "name", self.name or self.mesh.name)
 
@@ -62,7 +66,8 @@ class Instance:
     def several(cls, mesh: Mesh, transforms: Float, name: str) -> list[Instance]:
         """Instances of a mesh at (n, 4, 4), checked all at once; LidarpoolError as of one."""
         linear = transforms[:, :3, :3]
-        if not np.isfinite(transforms).all() or (np.linalg.matrix_rank(linear) < 3).any():
+        well = np.isfinite(transforms).all() and (np.abs(transforms[:, :3, 3]) <= FARTHEST_M).all()
+        if not well or (np.linalg.matrix_rank(linear) < 3).any():
             for matrix in transforms:
                 cls(mesh, matrix, name)
         made = [object.__new__(cls) for _ in transforms]
@@ -85,6 +90,15 @@ class Instance:
     def flat(self) -> Mesh:
         """Its triangles where they are."""
         return self.mesh.moved(self.name, self.matrix[:3, :3], self.matrix[:3, 3])
+
+
+def check_near(position: Float) -> None:
+    """Check that a place (3,) is on Earth; LidarpoolError if it is farther than `FARTHEST_M`."""
+    if not (np.abs(position) <= FARTHEST_M).all():
+        raise LidarpoolError(
+            f"An instance cannot be at {np.asarray(position).tolist()}: give metres within "
+            f"{FARTHEST_M:g} of zero."
+        )
 
 
 class Part(NamedTuple):
@@ -180,6 +194,7 @@ class Instances:
 
     def moved(self, owner: int, position: Float, rotation: Float | None) -> Instances:
         """Return them with those of an object in another place, at their present scale."""
+        check_near(position)
         rows = np.flatnonzero(self.owner == owner)
         transforms = self.transforms.copy()
         turn = np.eye(3) if rotation is None else rotation

@@ -20,7 +20,7 @@ from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean, printable
 from .dae import read_dae
 from .gltf import read_gltf
-from .instances import Instance
+from .instances import FARTHEST_M, Instance
 from .mesh import Mesh
 from .nodes import Content, MeshFileError
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
@@ -47,8 +47,6 @@ UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
 OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
 
-# Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
-FARTHEST_M = 1e8
 _HEAD = 200  # bytes of a file that such a comment is in
 
 Opacity = Literal["mask", "ignore"]
