@@ -254,7 +254,7 @@ def test_what_cannot_be_is_told_in_a_line(build, folder, name):
 
 
 def test_nothing_to_stand_on(build):
-    with pytest.raises(LidarpoolError, match="nothing to stand on: add scene.files"):
+    with pytest.raises(LidarpoolError, match=r"nothing to stand on: add scene\.files"):
         build(TREE | {"scatter": {"count": 1}}, scene={"files": []})
     with pytest.raises(LidarpoolError, match="give z"):
         build(TREE | {"at": [[0, 0]]}, scene={"files": []})
