@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from contextlib import suppress
 
@@ -12,6 +13,9 @@ from ..plan import trial  # noqa: F401
 from . import stages  # noqa: F401
 
 keep_freed_memory()
+# A worker that starts tidies up the folders of those that have ended, at the same time as their
+# nannies, and would call what it does not find an error.
+logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # if it cannot be loaded, a check says why
     from raybeam import embree_kernels
 
