@@ -2,23 +2,29 @@
 
 from .backend import BackendUnavailable
 from .caster import RayCaster
+from .device import DeviceHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
 from .opacity import Opacity
 from .pattern import Pattern
 from .poses import Motion
 from .registry import available_backends, backend_build
+from .scan import Scan, check_scan
 
 __all__ = [
     "BackendUnavailable",
+    "DeviceHits",
     "Hits",
     "Instance",
     "Mesh",
     "Motion",
     "Opacity",
+    "Outbox",
     "Pattern",
     "RayCaster",
+    "Scan",
     "ScanReturns",
     "available_backends",
     "backend_build",
+    "check_scan",
 ]

@@ -89,6 +89,8 @@ class EchoCaster:
         # Whether each ray that hits something has one return.
         several = survey.returns.subrays > 1 or survey.noise.loses
         self._one_each = surfaces.materials.plain and not several
+        noisy = survey.noise.angle_deg or survey.noise.range_m or survey.noise.range_per_m
+        self.plain = self._one_each and not noisy  # whether its returns are the caster's hits
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.bounds).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,9 +12,11 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..columns.parts import PartColumns
+from ..columns.table import Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
+from .device import DeviceReturns
 from .echoes import Echoes
 from .motion import Poses, products, turned
 from .surfaces import Surfaces
@@ -46,6 +50,24 @@ class BatchReturns:
 
     def __len__(self) -> int:
         return len(self.found.ray)
+
+    @property
+    def hits(self) -> NDArray[np.int64]:
+        """Returns of each scan, kept or not: (scans,)."""
+        return self.found.hits
+
+    @property
+    def tally(self) -> NDArray[np.int64]:
+        """Returns of each counter of the scene, kept or not."""
+        return np.asarray(self.found.tally)
+
+    def column(self, column: Column) -> NDArray[Any]:
+        """Values of a column."""
+        return column.make(self)
+
+    def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions of some returns (k,): (k, 3)."""
+        return self.positions[rows]
 
     # -- the ray -----------------------------------------------------------------------------
 
@@ -253,13 +275,13 @@ class BatchReturns:
         return self._surfaces.materials.semantic_class[self.object]
 
 
-def columns_of(found: list[BatchReturns]) -> PartColumns:
+def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
     """Make the columns of consecutive scans, and count the hits of each triangle."""
     columns = {
-        column.name: _joined([column.make(returns) for returns in found])
+        column.name: _joined([returns.column(column) for returns in found])
         for column in found[0].survey.stored_columns
     }
-    tally = np.sum([np.asarray(returns.found.tally) for returns in found], axis=0)
+    tally = np.sum([returns.tally for returns in found], axis=0)
     triangles = np.flatnonzero(tally)
     return PartColumns(
         found[0].specs[0].scan,

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from ..scene.scene import Scene
 from ..sensor import Trajectory
 from ..sensor.materials import Material, MaterialTable, at_right_angles
+from .motion import products
 
 BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 
@@ -42,9 +43,9 @@ class Surfaces:
         self._begins = plain + np.cumsum([0, *sizes])
         moving = [len(actor.mesh.faces) for actor in scene.actors]
         owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
-        # Objects of the triangles of faces and of actors; the last is none.
+        # Objects of the triangles of faces and of actors; the last is of no triangle.
         owned = [scene.face_object, np.repeat(owners, moving), np.zeros(1, np.int32)]
-        self._owners = np.concatenate(owned)
+        self.owners = np.concatenate(owned)
         if shared is not None:
             self._turns = _turns(shared.transforms)
 
@@ -77,11 +78,13 @@ class Surfaces:
             rows, on, which = self._found(triangle)
             local = rows[on] - self._begins[which]
             rows[on] = self._first_normal[shared.part[which]] + local
-        for axis, out in zip(self._unit_normals, normals, strict=True):
+        for axis, out in zip(self.unit_normals, normals, strict=True):
             out[:] = axis.take(rows)
         if shared is not None and len(on):
-            turned = np.einsum("nij,jn->in", self._turns[which], normals[:, on])
-            normals[:, on] = turned / np.linalg.norm(turned, axis=0)
+            # In one order of rounding, that of columns.cu.
+            turns = self._turns[which].transpose(1, 2, 0)
+            x, y, z = (products(row, normals[:, on]) for row in turns)
+            normals[:, on] = [x, y, z] / np.sqrt((x * x + y * y) + z * z)
         objects = self.objects(triangle) if ways else None
         for number, way in enumerate(ways, self._standing):
             rows = np.flatnonzero(objects == number)
@@ -91,14 +94,35 @@ class Surfaces:
                 normals[:, rows] = turned.T
         return normals.T
 
+    def bodies(self) -> tuple[NDArray[np.int64], Real]:
+        """Return what is known of the bodies of the static scene as a whole.
+
+        Returns
+        -------
+        bodies
+            (b, 3): of the scene's faces, if there are any, and of each instance: its first
+            triangle, its object, which is -1 if `owners` has that of each triangle, and the row of
+            its first normal in `unit_normals`.
+        turns
+            (b, 3, 3): matrices that take its normals to the scene's axes, but for their length.
+        """
+        own = [(0, -1, 0)] if len(self._scene.faces) else []
+        shared = self._scene.instances
+        if shared is None:
+            return np.array(own, np.int64), np.eye(3)[None]
+        firsts = self._first_normal[shared.part]
+        rows = np.stack([self._begins[:-1], shared.owner, firsts], axis=1)
+        turns = np.concatenate([np.broadcast_to(np.eye(3), (len(own), 3, 3)), self._turns])
+        return np.concatenate([np.reshape(own, (-1, 3)), rows]).astype(np.int64), turns
+
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
         """Objects of triangles (n,)."""
         shared = self._scene.instances
         if shared is None:
-            return self._owners[triangle]
+            return self.owners[triangle]
         rows, on, which = self._found(triangle)
         rows[on] = -1
-        objects = self._owners[rows]
+        objects = self.owners[rows]
         objects[on] = shared.owner[which]
         return objects
 
@@ -122,7 +146,7 @@ class Surfaces:
         return np.asarray(scattered * at_right_angles(distance, extinction))
 
     @cached_property
-    def _unit_normals(self) -> NDArray[np.float32]:
+    def unit_normals(self) -> NDArray[np.float32]:
         """Unit normals of all triangles, one row for each axis, the fastest layout: (3, f).
 
         Those of actors follow the scene's, and those of the parts of instances follow them.
@@ -149,7 +173,7 @@ class Surfaces:
         """Where the normals of each part of instances begin."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
-        return len(self._owners) - 1 + np.cumsum([0, *sizes[:-1]])
+        return len(self.owners) - 1 + np.cumsum([0, *sizes[:-1]])
 
 
 def _turns(transforms: Real) -> Real:

@@ -71,13 +71,13 @@ class World:
         self._begins: NDArray[np.int32] | None = None  # of each body of the caster
         faces = len(scene.faces)
         if self._shared is None:
-            self._caster = RayCaster(scene.vertices, scene.faces, **options)
+            self.caster = RayCaster(scene.vertices, scene.faces, **options)
         else:
             own = [Instance(Mesh(scene.vertices, scene.faces))] if faces else []
             meshes = [_mesh_of(part) for part in self._shared.parts]
             placed = zip(self._shared.part, self._shared.transforms, strict=True)
             shared = [Instance(meshes[part], matrix) for part, matrix in placed]
-            self._caster = RayCaster.of([*own, *shared], **options)
+            self.caster = RayCaster.of([*own, *shared], **options)
             begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
             self._begins = np.append([0] * bool(own), begins).astype(np.int32)
             faces += self._shared.triangles
@@ -89,15 +89,25 @@ class World:
 
     def place(self, surfaces: Surfaces, shared: Instances, rows: NDArray[np.intp]) -> None:
         """Move some instances to where they are now; no scan may be under way."""
-        first = self._caster.instance_count - len(shared)
+        first = self.caster.instance_count - len(shared)
         for row in rows:
-            self._caster.move(first + int(row), shared.transforms[row])
+            self.caster.move(first + int(row), shared.transforms[row])
         self._surfaces, self._shared = surfaces, shared
+
+    @property
+    def counters(self) -> NDArray[np.int64] | None:
+        """Counters of the caster's instances for `RayCaster.visit`, as in `Scene.counters`."""
+        if self._shared is None:
+            return None
+        own = self.caster.instance_count - len(self._shared)
+        faces = int(self._begins[own]) if self._begins is not None else 0
+        rows = np.stack([faces + np.arange(len(self._shared)), np.zeros(len(self._shared))], axis=1)
+        return np.concatenate([np.array([[0, 1]] * own).reshape(-1, 2), rows]).astype(np.int64)
 
     @property
     def backend(self) -> str:
         """Name of the backend in use."""
-        return self._caster.backend
+        return self.caster.backend
 
     def scan(
         self,
@@ -117,10 +127,10 @@ class World:
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
         }  # fmt: skip
         if self._begins is None and not self._actors:
-            return self._caster.scan(
+            return self.caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
-        found = self._caster.scan(pattern, **common)
+        found = self.caster.scan(pattern, **common)
         if self._begins is not None:
             found = replace(found, triangle=found.triangle + self._begins[found.instance])
         ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
