@@ -43,9 +43,10 @@ class CudaBackend(Backend):
     """
 
     name: ClassVar[str] = "cuda"
-    # Rays: some 430 MB on the device. Grid, sums of hits and indices into a chunk's arrays stay far
-    # below 2**31; only the number of a ray needs 64 bits.
-    chunk: ClassVar[int] = 1 << 22
+    # Rays: some 300 MB on the device, and while columns are copied again as much. Grid, sums of
+    # hits and indices into a chunk's arrays stay far below 2**31; only the number of a ray needs
+    # 64 bits.
+    chunk: ClassVar[int] = 1 << 21
 
     @classmethod
     def missing(cls) -> str:
