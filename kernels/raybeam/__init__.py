@@ -2,7 +2,7 @@
 
 from .backend import BackendUnavailable
 from .caster import RayCaster
-from .device import DeviceHits, Outbox
+from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
 from .opacity import Opacity
@@ -19,6 +19,7 @@ __all__ = [
     "Mesh",
     "Motion",
     "Opacity",
+    "OtherHits",
     "Outbox",
     "Pattern",
     "RayCaster",

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from .backend import Backend, BackendUnavailable
 from .cuda_backend import CudaBackend
-from .device import DeviceHits
+from .device import DeviceHits, OtherHits
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
@@ -301,7 +301,8 @@ class RayCaster:
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
-        counters: NDArray[np.int64] | None = None,
+        counters: tuple[NDArray[np.int64], int] | None = None,
+        others: OtherHits | None = None,
     ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
         """Cast a scan, and use its hits on the CUDA device where they are.
 
@@ -313,8 +314,12 @@ class RayCaster:
             Called with the kept hits of some rays after the other, in ray order, on the caster's
             device. Its arrays may be used after the call.
         counters
-            int64 (instances, 2), if the scan has a tally: hits of triangle t of instance i count in
-            row ``counters[i, 0] + counters[i, 1] * t``. None for the rows of `ScanReturns.tally`.
+            Table and length of the scan's tally. The table is int64 (instances, 2): hits of
+            triangle t of instance i count in row ``table[i, 0] + table[i, 1] * t``. None for the
+            rows of `ScanReturns.tally`.
+        others
+            Hits that replace those of the caster that are farther. They count as an instance more
+            than there are: with a tally, the table of the counters needs a row for them.
 
         Returns
         -------
@@ -333,4 +338,4 @@ class RayCaster:
             raise BackendUnavailable(
                 f"Hits of backend {self.backend!r} are on no device: use scan, or backend='cuda'."
             )
-        return engine.visit(scan, use, counters)
+        return engine.visit(scan, use, counters, others)

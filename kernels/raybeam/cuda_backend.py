@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .device import DeviceHits
+from .device import DeviceHits, OtherHits
 from .hits import Part, ScanReturns, joined
 from .instances import Scene
 from .layout import lay_out, lay_out_places
@@ -86,6 +86,7 @@ class CudaBackend(Backend):
             self._meshes = tuple(_sent(cupy, table) for table in given)
             nothing = (_sent(cupy, np.zeros(2, np.int64)), np.int32(0))
             self._uncounted = (*nothing, cupy.zeros(1, np.int64))
+            self._none = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
         self.place(scene)
@@ -119,7 +120,7 @@ class CudaBackend(Backend):
             limits = (np.float64(t * self._scene.frame.scale) for t in (rays.t_min, rays.t_max))
             found = self._cast("cast_table", n, (*table, np.int64(n), *limits))
             groups = Groups(np.zeros(1, np.int64), 1)
-            ray, *hits, instance = self._packed(found, 0, groups, 1.0, self._uncounted)
+            ray, *hits, instance = self._packed(found, 0, groups, 1.0, self._uncounted, self._none)
             u, v = cp.empty(len(ray)), cp.empty(len(ray))
             frame, _, instances = self._places
             scene = (self._meshes[2], frame, instances)
@@ -138,23 +139,35 @@ class CudaBackend(Backend):
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
-        counters: NDArray[np.int64] | None = None,
+        counters: tuple[NDArray[np.int64], int] | None = None,
+        others: OtherHits | None = None,
     ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
         """See `RayCaster.visit`."""
-        scene, groups, unit = self._scene, Groups(scan.groups, scan.keep_every), self._scene.frame
+        cp, scene, groups = self._cupy, self._scene, Groups(scan.groups, scan.keep_every)
         with self._device:
             counting = self._uncounted
             if scan.tally:
-                rows = scene.counters if counters is None else counters
-                faces = np.diff(scene.first_face)[scene.mesh]
-                most = int((rows[:, 0] + rows[:, 1] * (faces - 1)).max())
-                tally = self._cupy.zeros(most + 1, np.int64)
-                counting = _sent(self._cupy, rows), np.int32(1), tally
+                table, size = (scene.counters, scene.face_count) if counters is None else counters
+                counting = _sent(cp, table), np.int32(1), cp.zeros(size, np.int64)
             for start, n, rays in self._made(scan):
                 found = self._cast("cast_pattern", n, rays)
-                kept = self._packed(found, start, groups, unit.scale, counting)
-                use(DeviceHits(*kept, self._cupy, partial(self._rays, start, rays)))
+                replaced = self._replaced(found, start, n, others)
+                kept = self._packed(found, start, groups, scene.frame.scale, counting, replaced)
+                use(DeviceHits(*kept, cp, partial(self._rays, start, rays)))
             return groups.hits, counting[2].get() if scan.tally else None
+
+    def _replaced(
+        self, found: tuple[Any, Any, Any], start: int, n: int, others: OtherHits | None
+    ) -> tuple[Any, ...]:
+        """Let other hits replace those of a cast that are farther; arguments of `pack`."""
+        if others is None:
+            return self._none
+        span = slice(*np.searchsorted(others.ray, [start, start + n]))
+        tables = (others.ray[span], others.distance[span], others.triangle[span])
+        ray, metres, triangle = map(self._cupy.asarray, tables)
+        count, scale = np.int64(len(ray)), np.float64(self._scene.frame.scale)
+        self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *found[:2])
+        return metres, triangle, np.int32(len(self._scene.mesh))
 
     def _rays(self, start: int, rays: tuple[Any, ...], ray: Any) -> tuple[Any, Any]:
         """Make starts and directions of rays of a chunk, on the device."""
@@ -218,16 +231,17 @@ class CudaBackend(Backend):
         groups: Groups,
         scale: float,
         counting: tuple[Any, np.int32, Any],
+        others: tuple[Any, ...],
     ) -> tuple[Any, Any, Any, Any]:
         """Count the hits of a cast and close up those that are kept, all on the device.
 
-        Distances are divided by `scale`. `counting` are the last arguments of the kernel `pack`
-        before its results. Returns numbers of the rays, from `start` on, distances, the caller's
+        Distances are divided by `scale`. `counting` and `others` are arguments of the kernel
+        `pack`. Returns numbers of the rays, from `start` on, distances, the caller's
         triangles, and instances.
         """
         cp, n = self._cupy, len(found[1])
         # Closed up by sums in ray order, not by atomics: the same bytes on every run.
-        ends = cp.cumsum(found[1] >= 0, dtype=np.int32)
+        ends = cp.cumsum(found[1] != -1, dtype=np.int32)
         span, begins = groups.spans(start, start + n)
         cuts = np.append(0, ends[cp.asarray(np.append(begins, n) - 1)].get()).astype(np.int64)
         leave, number = groups.count(span, np.diff(cuts))
@@ -237,7 +251,7 @@ class CudaBackend(Backend):
         kept = tuple(cp.empty(int(number.sum()), kind) for kind in kinds)
         self._run(
             "pack", n, self._meshes[3], *found, ends, np.int64(n), np.float64(scale),
-            np.int64(start), cp.asarray(table.astype(np.int32)), np.int32(len(number)),
+            np.int64(start), *others, cp.asarray(table.astype(np.int32)), np.int32(len(number)),
             np.int32(min(groups.every, _MOST_INT)), *counting, *kept,
         )  # fmt: skip
         return kept

@@ -51,6 +51,25 @@ class DeviceHits:
         return self.ray.get(), self.distance.get(), self.triangle.get(), self.instance.get()
 
 
+@dataclass(frozen=True, eq=False)
+class OtherHits:
+    """Hits of a scan's rays on surfaces that the caster does not know, such as those that move.
+
+    Attributes
+    ----------
+    ray
+        uint32 (k,): number of the ray, ascending, each at most once.
+    distance
+        float64 (k,): metres.
+    triangle
+        int32 (k,): any number.
+    """
+
+    ray: NDArray[np.uint32]
+    distance: NDArray[np.float64]
+    triangle: NDArray[np.int32]
+
+
 class Outbox:
     """Copies arrays to the host in a stream of its own, while the device goes on.
 

@@ -674,8 +674,20 @@ KERNEL weigh_table(
 
 // ---- what becomes of the hits ----
 
+// Hits of other surfaces, at most one a ray, take the place of those that are farther, divided by
+// `scale`: place becomes -2 - k for hit k.
+KERNEL replace(
+    const unsigned int* __restrict__ ray, const double* __restrict__ metres, Count count,
+    Count start, double scale, const double* __restrict__ distance, int* __restrict__ place)
+{
+    const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (k >= count) return;
+    const Count i = (Count)ray[k] - start;
+    if (place[i] < 0 || metres[k] < distance[i] / scale) place[i] = -2 - (int)k;
+}
+
 // Close up the hits that are kept, in ray order: number of the ray, from `start` on, distance in
-// metres, the caller's triangle, instance.
+// metres, the caller's triangle, instance. `other_…` are those of `replace`.
 //
 // `ends` are the inclusive sums of hits up to each ray. Of each group of rays, the first kept hit
 // and every n-th after it are kept. `groups` has three rows of `group_count`: the first ray of each,
@@ -686,14 +698,18 @@ KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ instance,
     const int* __restrict__ ends, Count count, double scale, Count start,
+    const double* __restrict__ other_metres, const int* __restrict__ other_triangle,
+    int other_instance,
     const int* __restrict__ groups, int group_count, int every,
     const Count* __restrict__ counters, int counting, unsigned long long* __restrict__ tally,
     unsigned int* __restrict__ ray, double* __restrict__ metres, int* __restrict__ triangle,
     int* __restrict__ which)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i >= count || place[i] < 0) return;
-    const int face = faces[place[i]], in = NESTED ? instance[i] : 0;
+    if (i >= count || place[i] == -1) return;
+    const int row = place[i], other = -2 - row;
+    const int face = row < 0 ? other_triangle[other] : faces[row];
+    const int in = row < 0 ? other_instance : NESTED ? instance[i] : 0;
     if (counting) atomicAdd(tally + counters[2 * in] + counters[2 * in + 1] * face, 1ULL);
     int k = ends[i] - 1;
     if (every > 1) {
@@ -710,7 +726,7 @@ KERNEL pack(
         k = groups[2 * group_count + group] + k / every;
     }
     ray[k] = (unsigned int)(start + i);
-    metres[k] = distance[i] / scale;
+    metres[k] = row < 0 ? other_metres[other] : distance[i] / scale;
     triangle[k] = face;
     which[k] = in;
 }

@@ -126,14 +126,18 @@ def test_what_only_numpy_can_make_is_made_of_the_hits(name, scenes, backend):
     assert not isinstance(next(rigs[0].cast(0, 1)), DeviceReturns)
 
 
-def test_actors_are_met(scenes, backend):
-    actor = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 2], [[6, -3, 0.5], [6, 7, 0.5]]))
-    scene, survey = scenes["plain"].with_actors((actor,)), MADE["on the move"]
-    got, want = (
-        cast_between(Rig(scene, survey, name), survey, (0, survey.scan_count))
-        for name in (backend, "numpy")
+@pytest.mark.parametrize("scene", ["plain", "instances", "both"])
+@pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
+def test_columns_of_actors(scene, name, scenes, backend):
+    """One drives through the other, and both past what stands."""
+    ways = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
+    actors = tuple(
+        Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(ways)
     )
-    assert got == want
+    survey = replace(MADE[name], materials=[*MATERIALS, Material("Car*", 0.7, 40)])
+    if scene == "plain":
+        survey = replace(survey, materials=())
+    same(scenes[scene].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
 
 
 @pytest.mark.parametrize("card", ["75", "120"])

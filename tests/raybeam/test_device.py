@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from tests.raybeam.test_scan import case_of
 
-from raybeam import BackendUnavailable, Instance, Mesh, Pattern, RayCaster, check_scan
+from raybeam import BackendUnavailable, Instance, Mesh, OtherHits, Pattern, RayCaster, check_scan
 
 CASE = case_of("on the move, lever arms")
 PATTERN = Pattern(CASE["directions"], CASE["origins"])
@@ -30,7 +30,7 @@ def vase(request, kernels, shapes, monkeypatch):
     return caster
 
 
-def visited(caster, scan, counters=None):
+def visited(caster, scan, counters=None, others=None):
     """Rays, distances, triangles and instances, and origins and directions, by the device."""
     found, rays = [], []
 
@@ -39,7 +39,7 @@ def visited(caster, scan, counters=None):
         rays.append([np.asarray(a.get()) for a in hits.rays()])
         assert len(hits) == len(found[-1][0])
 
-    counted = caster.visit(scan, use, counters)
+    counted = caster.visit(scan, use, counters, others)
     joined = [np.concatenate(parts, axis=-1) for parts in zip(*found, strict=True)]
     return joined, [np.concatenate(parts, axis=1) for parts in zip(*rays, strict=True)], *counted
 
@@ -63,9 +63,32 @@ def test_a_visit_sees_what_a_scan_returns(vase, every):
 
 def test_instances_may_be_counted_as_a_whole(vase):
     one = np.stack([np.arange(vase.instance_count), np.zeros(vase.instance_count)], axis=1)
-    hits, _, counts, tally = visited(vase, scan_of(tally=True), one.astype(np.int64))
+    counters = one.astype(np.int64), vase.instance_count
+    hits, _, counts, tally = visited(vase, scan_of(tally=True), counters)
     assert tally.tolist() == np.bincount(hits[3], minlength=vase.instance_count).tolist()
     assert counts.tolist() == [tally.sum()]
+
+
+def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
+    rng = np.random.default_rng(5)
+    ray = np.flatnonzero(rng.random(2000) < 0.3).astype(np.uint32)
+    others = OtherHits(ray, rng.uniform(0, 3, len(ray)), rng.integers(0, 9, len(ray), np.int32))
+    many = vase.instance_count
+    table = np.array([[0, 1]] * many + [[vase.face_count, 1]])
+    scan = scan_of(tally=True, keep_every=2)
+    counters = table, vase.face_count + 9
+    (ray, distance, triangle, instance), _, counts, tally = visited(vase, scan, counters, others)
+    own = vase._engine.scan(scan_of())
+    found = {r: (d, t, i) for r, d, t, i in zip(*(a.tolist() for a in (
+        own.ray, own.distance, own.triangle, own.instance)), strict=True)}  # fmt: skip
+    for r, d, t in zip(others.ray, others.distance, others.triangle, strict=True):
+        found[int(r)] = min(found.get(r, (np.inf, 0, 0)), (d, t, many), key=lambda hit: hit[0])
+    want = [(r, *found[r]) for r in sorted(found)]
+    assert counts.tolist() == [len(want)]
+    assert [*zip(ray, distance, triangle, instance, strict=True)] == want[::2]
+    assert 100 < sum(i == many for *_, i in want) < len(want) - 100
+    rows = [t + vase.face_count * (i == many) for _, _, t, i in want]
+    assert tally.tolist() == np.bincount(rows, minlength=counters[1]).tolist()
 
 
 def test_other_backends_have_no_device(shapes):

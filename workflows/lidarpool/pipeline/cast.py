@@ -12,8 +12,9 @@ from poolpart import Recorder, TaskRecord
 
 from ..base.tracing import trace
 from ..columns.parts import PartColumns
+from ..simulator.batch import columns_of
 from ..simulator.device import DeviceReturns
-from ..simulator.returns import BatchReturns, columns_of
+from ..simulator.returns import BatchReturns
 from ..simulator.rig import Rig
 from .failures import naming_scans
 from .messages import Span, samples_of_scan, summary_type

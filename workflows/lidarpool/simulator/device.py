@@ -1,13 +1,15 @@
 """Columns that are made on the CUDA device: only kept values cross the bus, in the types of files.
 
 The formulas are those of `BatchReturns`, with the same bits. A survey with a column that only NumPy
-can make, sub-rays, noise, actors or haze takes the hits to the host instead.
+can make, sub-rays, noise or haze takes the hits to the host instead. Hits on actors are found by
+`World`; the device merges them with its own, and NumPy makes their energies, for which it needs the
+actors' poses.
 """
 
 from __future__ import annotations
 
 import importlib.resources
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -20,7 +22,9 @@ from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+from .echoes import Echoes
 from .motion import Poses
+from .returns import BatchReturns
 from .surfaces import Surfaces
 from .world import World
 
@@ -65,20 +69,22 @@ class DeviceReturns:
 class DeviceColumns:
     """Casts plain surveys and makes their columns on the device."""
 
-    def __init__(self, world: World, survey: Survey, surfaces: Surfaces) -> None:
-        self._world, self.survey, self._surfaces = world, survey, surfaces
+    def __init__(self, world: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
+        self._world, self._scene, self._surfaces = world, scene, surfaces
+        self.survey = survey
         self.wanted = [column for column in _MADE if column in survey.stored_columns]
+        self.energies = [column for column in self.wanted if column.name in _ENERGIES]
+        self.bodies, self._turns = surfaces.bodies()
         self._sent: tuple[Any, ...] | None = None
 
     @staticmethod
-    def can_make(world: World, scene: Scene, survey: Survey) -> bool:
+    def can_make(world: World, survey: Survey) -> bool:
         """Whether all of a survey's columns are made on a device, given one return for each ray."""
         names = {column.name for column in survey.stored_columns}
         known = {*(column.name for column in _MADE), *_EQUAL}
         clear = not any(survey.extinction(carried.sensor) for carried in survey.carried)
         return (
             world.caster.on_device
-            and not scene.actors
             and survey.coordinates == "world"
             and all(column in TABLE.values() for column in survey.stored_columns)
             and names <= known
@@ -95,25 +101,57 @@ class DeviceColumns:
     ) -> DeviceReturns:
         """Cast scans, see `Rig.returns`."""
         survey, sensor = self.survey, self.survey.carried[specs[0].sensor].sensor
-        every = survey.keep_every
+        every, reach = survey.keep_every, (sensor.min_range_m, sensor.max_range_m)
         scan = check_scan(
-            pattern, **poses.given, window=window, t_min=sensor.min_range_m,
-            t_max=sensor.max_range_m, keep_every=every, groups=groups, tally=True,
+            pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
+            keep_every=every, groups=groups, tally=True,
         )  # fmt: skip
-        making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
-        hits, tally = self._world.caster.visit(scan, making.make, self._world.counters)
+        others = self._world.on_actors(pattern, poses, window, reach) if poses.ways else None
+        if others is not None:  # rows of the actors' body
+            others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
+        most = -(-len(scan) // every) + len(groups)
+        making = _Making(self, specs, groups, most, moves=others is not None)
+        caster, counters = self._world.caster, self._world.counters()
+        hits, tally = caster.visit(scan, making.make, counters, others)
         assert tally is not None
-        return DeviceReturns(survey, specs, -(-hits // every), hits, tally, making.done())
+        columns = making.done()
+        if making.moving:
+            rows, *found = map(np.concatenate, zip(*making.moving, strict=True))
+            here = specs, pattern, window[0], poses
+            small = self._of_hits(*here, *found)
+            for column in self.energies:
+                columns[column.name][rows] = column.make(small)
+        return DeviceReturns(survey, specs, -(-hits // every), hits, tally, columns)
+
+    def _of_hits(
+        self,
+        specs: list[ScanSpec],
+        pattern: Pattern,
+        start: int,
+        poses: Poses,
+        ray: NDArray[np.uint32],
+        distance: NDArray[np.float64],
+        triangle: NDArray[np.int32],
+    ) -> BatchReturns:
+        """Make returns of some hits, for columns that NumPy makes."""
+        one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
+        triangle = triangle + np.int32(self.bodies[-1, 0])
+        counts = np.zeros(len(specs), np.int64)
+        found = Echoes(
+            ray, distance, triangle, counts, None, none,
+            energy=None, number=one, returns=one, reported=distance,
+        )  # fmt: skip
+        return BatchReturns(
+            self._scene, self.survey, self._surfaces, specs, found, pattern, start, poses
+        )
 
     def sent(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""
         if self._sent is None:
             surfaces, materials = self._surfaces, self._surfaces.materials
-            shines = any(column.name in _ENERGIES for column in self.wanted)
-            normals = surfaces.unit_normals if shines else np.zeros((3, 1), np.float32)
-            bodies, turns = surfaces.bodies()
+            normals = surfaces.unit_normals if self.energies else np.zeros((3, 1), np.float32)
             tables = (
-                bodies, surfaces.owners, normals, turns, materials.reflectance,
+                self.bodies, surfaces.owners, normals, self._turns, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
             self._sent = tuple(map(cupy.asarray, tables))
@@ -124,11 +162,19 @@ class _Making:
     """Columns of a batch on their way from the device to the host."""
 
     def __init__(
-        self, maker: DeviceColumns, specs: list[ScanSpec], groups: NDArray[np.int64], most: int
+        self,
+        maker: DeviceColumns,
+        specs: list[ScanSpec],
+        groups: NDArray[np.int64],
+        most: int,
+        moves: bool,
     ) -> None:
-        self._maker, self._specs, self._groups, self._most = maker, specs, groups, most
+        self._maker, self._specs, self._groups = maker, specs, groups
+        self._most, self._moves = most, moves
         self._begun: _Begun | None = None
         self._made = 0
+        # Rows of hits on actors, their rays, distances and triangles, if they have energies.
+        self.moving: list[tuple[NDArray[Any], ...]] = []
 
     def make(self, hits: DeviceHits) -> None:
         """Make the columns of some hits, and send them to the host."""
@@ -144,6 +190,11 @@ class _Making:
         begun.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), (*found, *begun.given, *made.values()))
         rows = slice(self._made, self._made + len(hits))
         begun.outbox.send([(made[column], out[rows]) for column, out in begun.out.items()])
+        if self._maker.energies and self._moves:
+            on = cp.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
+            given = (on, hits.ray[on], hits.distance[on], hits.triangle[on])
+            at, ray, distance, triangle = (array.get() for array in given)
+            self.moving.append((self._made + at, ray, distance, triangle))
         self._made += len(hits)
 
     def done(self) -> dict[str, NDArray[Any]]:
@@ -157,7 +208,7 @@ class _Making:
         """Send what the kernel reads besides hits."""
         maker, specs = self._maker, self._specs
         survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, turns, reflectance, retro, classes = maker.sent(cupy)
+        bodies, owners, normals, turns, *materials, classes = maker.sent(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         outbox = Outbox(cupy)
         given = (
@@ -167,7 +218,7 @@ class _Making:
             cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
             np.int32(sensor.channels), np.int64(specs[0].start_ns),
             bodies, owners, normals, np.int64(normals.shape[1]), turns,
-            reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
+            *materials, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
             np.float64(NEAREST_M), classes,
         )  # fmt: skip
         out = {column: outbox.room(self._most, column.dtype) for column in maker.wanted}

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import Any
 
@@ -11,12 +10,10 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..columns.parts import PartColumns
 from ..columns.table import Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
-from .device import DeviceReturns
 from .echoes import Echoes
 from .motion import Poses, products, turned
 from .surfaces import Surfaces
@@ -273,24 +270,3 @@ class BatchReturns:
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
         return self._surfaces.materials.semantic_class[self.object]
-
-
-def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
-    """Make the columns of consecutive scans, and count the hits of each triangle."""
-    columns = {
-        column.name: _joined([returns.column(column) for returns in found])
-        for column in found[0].survey.stored_columns
-    }
-    tally = np.sum([returns.tally for returns in found], axis=0)
-    triangles = np.flatnonzero(tally)
-    return PartColumns(
-        found[0].specs[0].scan,
-        _joined([returns.counts for returns in found]),
-        columns,
-        triangles.astype(np.int32),
-        tally[triangles].astype(np.int64),
-    )
-
-
-def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
-    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

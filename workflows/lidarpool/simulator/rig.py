@@ -99,9 +99,9 @@ class Rig:
 
     def _see(self) -> None:
         """Make what depends on where the surfaces are."""
-        given = self._world, self.survey, self._surfaces
-        self._echoes = EchoCaster(self._world, self.scene, self.survey, self._surfaces)
-        able = self._echoes.plain and DeviceColumns.can_make(self._world, self.scene, self.survey)
+        given = self._world, self.scene, self.survey, self._surfaces
+        self._echoes = EchoCaster(*given)
+        able = self._echoes.plain and DeviceColumns.can_make(self._world, self.survey)
         self._device = DeviceColumns(*given) if able else None
 
     @property

@@ -95,25 +95,30 @@ class Surfaces:
         return normals.T
 
     def bodies(self) -> tuple[NDArray[np.int64], Real]:
-        """Return what is known of the bodies of the static scene as a whole.
+        """Return what bodies the triangles belong to, in the order of a world's ray caster.
 
         Returns
         -------
         bodies
-            (b, 3): of the scene's faces, if there are any, and of each instance: its first
-            triangle, its object, which is -1 if `owners` has that of each triangle, and the row of
-            its first normal in `unit_normals`.
+            (b, 3): the scene's faces, if there are any, each instance, and all actors as one. Of
+            each its first triangle, its object, or -1 if `owners` has that of each triangle, and
+            the row of its first normal in `unit_normals`. Rows of the actors begin behind those of
+            the scene's faces.
         turns
             (b, 3, 3): matrices that take its normals to the scene's axes, but for their length.
         """
-        own = [(0, -1, 0)] if len(self._scene.faces) else []
-        shared = self._scene.instances
-        if shared is None:
-            return np.array(own, np.int64), np.eye(3)[None]
-        firsts = self._first_normal[shared.part]
-        rows = np.stack([self._begins[:-1], shared.owner, firsts], axis=1)
-        turns = np.concatenate([np.broadcast_to(np.eye(3), (len(own), 3, 3)), self._turns])
-        return np.concatenate([np.reshape(own, (-1, 3)), rows]).astype(np.int64), turns
+        plain, actors = self._begins[[0, -1]]
+        one = np.eye(3)[None]
+        bodies: list[Any] = [[[actors - plain, -1, 0]]]
+        turns = [one]
+        if (shared := self._scene.instances) is not None:
+            firsts = self._first_normal[shared.part]
+            bodies.insert(0, np.stack([self._begins[:-1], shared.owner, firsts], axis=1))
+            turns.insert(0, self._turns)
+        if plain:
+            bodies.insert(0, [[0, -1, 0]])
+            turns.insert(0, one)
+        return np.concatenate(bodies).astype(np.int64), np.concatenate(turns)
 
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
         """Objects of triangles (n,)."""

@@ -18,6 +18,7 @@ from raybeam import (
     Instance,
     Mesh,
     Opacity,
+    OtherHits,
     Pattern,
     RayCaster,
     ScanReturns,
@@ -69,7 +70,7 @@ class World:
     def __init__(self, scene: Scene, surfaces: Surfaces, **options: Any) -> None:
         self._surfaces, self._shared = surfaces, scene.instances
         self._begins: NDArray[np.int32] | None = None  # of each body of the caster
-        faces = len(scene.faces)
+        self._faces = faces = len(scene.faces)
         if self._shared is None:
             self.caster = RayCaster(scene.vertices, scene.faces, **options)
         else:
@@ -94,15 +95,12 @@ class World:
             self.caster.move(first + int(row), shared.transforms[row])
         self._surfaces, self._shared = surfaces, shared
 
-    @property
-    def counters(self) -> NDArray[np.int64] | None:
-        """Counters of the caster's instances for `RayCaster.visit`, as in `Scene.counters`."""
-        if self._shared is None:
-            return None
-        own = self.caster.instance_count - len(self._shared)
-        faces = int(self._begins[own]) if self._begins is not None else 0
-        rows = np.stack([faces + np.arange(len(self._shared)), np.zeros(len(self._shared))], axis=1)
-        return np.concatenate([np.array([[0, 1]] * own).reshape(-1, 2), rows]).astype(np.int64)
+    def counters(self) -> tuple[NDArray[np.int64], int]:
+        """Return counters of bodies as `RayCaster.visit` takes them, see `Scene.counters`."""
+        shared = 0 if self._shared is None else len(self._shared)
+        own = self.caster.instance_count - shared
+        rows = [[0, 1]] * own + [[self._faces + number, 0] for number in range(shared)]
+        return np.array([*rows, [shared, 1]], np.int64), self._surfaces.counters
 
     @property
     def backend(self) -> str:
@@ -161,23 +159,36 @@ class World:
         reach: tuple[float, float],
     ) -> tuple[NDArray[np.int64], Float, NDArray[np.int32]]:
         """Rays, distances and triangles of all hits, those on actors among them."""
-        start, stop = window
-        t_min, t_max = reach
-        distance = np.full(stop - start, np.inf)
-        triangle = np.full(stop - start, -1, np.int32)
+        rays = window[1] - window[0]
+        distance = np.full(rays, np.inf)
+        triangle = np.full(rays, -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
-        cells = _Cells(pattern, poses, start, stop)
-        for actor, way in zip(self._actors, poses.ways, strict=True):
-            ray = cells.near(actor, way, t_max)
-            if not len(ray):
-                continue
-            origins, directions = poses.rays(pattern, ray, start)
-            moved = way.poses(0, poses.times(ray))
-            rows, t, face = actor.hits(origins, directions, moved, t_min, t_max)
-            nearer = t < distance[ray[rows]]
-            distance[ray[rows[nearer]]], triangle[ray[rows[nearer]]] = t[nearer], face[nearer]
+        moving = self.on_actors(pattern, poses, window, reach)
+        nearer = moving.distance < distance[moving.ray]
+        there = moving.ray[nearer]
+        distance[there], triangle[there] = moving.distance[nearer], moving.triangle[nearer]
         ray = np.flatnonzero(triangle >= 0)
         return ray, distance[ray], triangle[ray]
+
+    def on_actors(
+        self, pattern: Pattern, poses: Poses, window: tuple[int, int], reach: tuple[float, float]
+    ) -> OtherHits:
+        """Find the nearest hits of rays on actors, whether something stands before them or not."""
+        cells = _Cells(pattern, poses, *window)
+        found = []
+        for actor, way in zip(self._actors, poses.ways, strict=True):
+            ray = cells.near(actor, way, reach[1])
+            if len(ray):
+                origins, directions = poses.rays(pattern, ray, window[0])
+                moved = way.poses(0, poses.times(ray))
+                rows, t, face = actor.hits(origins, directions, moved, *reach)
+                found.append((ray[rows], t, face))
+        if not found:
+            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
+        ray, t, face = map(np.concatenate, zip(*found, strict=True))
+        order = np.lexsort((t, ray))  # of equal distances, that of the first actor comes first
+        order = order[np.diff(ray[order], prepend=-1) > 0]
+        return OtherHits(ray[order].astype(np.uint32), t[order], face[order])
 
 
 def _mesh_of(part: Part) -> Mesh:
