@@ -217,7 +217,11 @@ def test_cuts_and_damage_end_in_meshes_or_in_one_clear_line(tmp_path, two_object
         ("m", "x", r"has the ending \(none\)"),
         ("m.gltf", "[" * 100_000, "no valid JSON"),
         *[
-            (f"m{suffix}", content, "broken|cut short|no triangles|is not glTF|no valid JSON")
+            (
+                f"m{suffix}",
+                content,
+                "broken|cut short|no triangles|is not glTF|no valid JSON|pip install",
+            )
             for suffix in SUFFIXES
             for content in (np.random.default_rng(5).bytes(3000), b"no mesh\n" * 20, bytes(2000))
         ],

@@ -61,7 +61,7 @@ def read_gltf(data: bytes, path: Path, masks: bool = True) -> Content:
     _check(header)
     reader = _Reader(header, body, path, len(data), masks)
     content = settled(instances(_roots(header), reader.node, path.stem))
-    content.unit_m, content.up_axis = 1.0, "y"
+    content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
     content.notes = reader.notes.lines()
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content

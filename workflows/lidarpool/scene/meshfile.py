@@ -1,4 +1,4 @@
-"""Mesh files: .glb .gltf .obj .stl .ply .off .dae .3mf, to named meshes in metres, Z-up."""
+"""Mesh files: .glb .gltf .obj .stl .ply .off .dae .3mf .usd, to named meshes in metres, Z-up."""
 
 from __future__ import annotations
 
@@ -26,9 +26,11 @@ from .nodes import Content, MeshFileError
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
 from .threemf import read_3mf
 from .transform import UP_AXES, Transform
+from .usd import read_usd
 
 # A reader gets the content of a file and its path. It raises MeshFileError for unsupported content,
-# and any error for a broken file. All are our own; their modules say why no library is used.
+# and any error for a broken file. All but read_usd are our own; their modules say why no library
+# is used.
 _MASKED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether to read masks
     ".glb": read_gltf,
     ".gltf": read_gltf,
@@ -40,6 +42,7 @@ _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".off": read_off,
     ".dae": read_dae,
     ".3mf": read_3mf,
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
 }
 SUFFIXES = (*_MASKED, *_READERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
@@ -76,10 +79,10 @@ def load_meshes(
     path
         One of `SUFFIXES`, in any case.
     unit
-        None takes the file's own (.dae, .3mf, .glb and .gltf), else metres.
+        None takes the file's own (.dae, .3mf, .usd, .glb and .gltf), else metres.
     up_axis
-        None takes the file's own (.dae), the standard's (Y-up for .glb and .gltf, Z-up for .3mf),
-        else Z-up.
+        None takes the file's own (.dae, .usd), the standard's (Y-up for .glb and .gltf, Z-up for
+        .3mf), else Z-up.
     transform
         Placement in the world, in metres, after unit and up axis.
     opacity
@@ -118,7 +121,7 @@ def load_meshes(
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
-    for note in content.notes:
+    for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
         tell(f"{path} {note}")
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, meshes, axes)
@@ -137,9 +140,9 @@ def _tell_axes(
     meshes: Sequence[Mesh | Instance],
     axes: Callable[[str], None] | None,
 ) -> None:
-    if path.suffix.lower() in (".glb", ".gltf"):
+    if content.turned and content.up_axis == "y":
         why, other = _lies(content, meshes), "z"
-        done = f"was turned from Y-up to Z-up, as glTF asks{why}"
+        done = f"was turned from Y-up to Z-up, {content.turned}{why}"
     elif path.suffix.lower() == ".obj":  # the one without axes that is Y-up as often as not
         done, why, other = "states no axes and is taken as Z-up", "", "y"
     else:
@@ -233,9 +236,10 @@ _FOREIGN = {
     rb"(?i)\s*(<!doctype html|<html)": "is a web page: download the file itself",
     rb"version https://git-lfs": "is a Git LFS pointer: get the mesh with git lfs pull",
 }
-# Beginnings by which a file of the wrong ending is recognised.
+# Beginnings by which a file of the wrong ending is recognised, and endings that suit them.
 _BEGINNINGS = {
-    ".glb": b"glTF", ".ply": b"ply", ".off": b"OFF", ".stl": b"solid ", ".3mf": b"PK\x03\x04",
+    b"glTF": (".glb",), b"ply": (".ply",), b"OFF": (".off",), b"solid ": (".stl",),
+    b"PK\x03\x04": (".3mf", ".usdz"), b"PXR-USDC": (".usdc", ".usd"), b"#usda ": (".usda", ".usd"),
 }  # fmt: skip
 
 
@@ -243,9 +247,9 @@ def _other_format(path: Path, data: bytes) -> str:
     """Name the format by which a refused file begins, in a sentence, if it is another."""
     if data.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
         return " It begins like text in UTF-16: save it as UTF-8."
-    for suffix, begins in _BEGINNINGS.items():
-        if data.startswith(begins) and suffix != path.suffix.lower():
-            return f" It begins like a {suffix} file: give it that ending."
+    for begins, suffixes in _BEGINNINGS.items():
+        if data.startswith(begins) and path.suffix.lower() not in suffixes:
+            return f" It begins like a {' or '.join(suffixes)} file: give it that ending."
     return ""
 
 

@@ -39,6 +39,8 @@ class Content:
     unit_m: float | None = None  # metres in its unit; None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
     generator: str = ""  # the program that wrote it, if known
+    turned: str = ""  # why a Y-up file is turned, if to be told
+    unit_note: str = ""  # clause on a unit that it does not state
     skipped: list[str] = field(default_factory=list)  # names of objects that nodes scale to zero
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
 

@@ -1,0 +1,334 @@
+"""OpenUSD scenes: what is shown is read, and nothing vanishes in silence."""
+
+import subprocess
+import sys
+import zipfile
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidarpool.base import allowance
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scene import nodes, usd
+from lidarpool.scene.instances import Instance
+from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.scene import Scene
+
+with_library = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
+
+METRES = 'metersPerUnit = 1\nupAxis = "Z"'
+QUAD = """
+    uniform token subdivisionScheme = "none"
+    int[] faceVertexCounts = [4]
+    int[] faceVertexIndices = [0, 1, 2, 3]
+    point3f[] points = [(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)]
+"""
+MOVED = 'double3 xformOp:translate = {}\nuniform token[] xformOpOrder = ["xformOp:translate"]\n'
+
+
+def prim(name, kind="Mesh", text=QUAD, meta=""):
+    return f'def {kind} "{name}" ({meta}\n) {{\n{text}\n}}\n'
+
+
+def write(path, *prims, stage=METRES):
+    path.write_text(f"#usda 1.0\n({stage}\n)\n" + "".join(prims))
+    return path
+
+
+def told(path, **options):
+    """Objects, and lines on what was left or turned."""
+    lines = []
+    objects = load_meshes(path, tell=lines.append, axes=lines.append, **options)
+    return objects, [line.replace(str(path), path.name) for line in lines]
+
+
+def bounds(objects):
+    return Scene.from_meshes(objects).bounds
+
+
+def test_without_the_library_the_error_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(usd, "find_spec", lambda name: None)
+    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[usd\]"\.$'):
+        load_meshes(write(tmp_path / "m.usda", prim("Quad")))
+
+
+@with_library
+def test_polygons_places_and_names(tmp_path):
+    text = QUAD.replace("[4]", "[5, 3, 3]").replace(
+        "[0, 1, 2, 3]", "[0, 1, 2, 3, 4, 0, 1, 2, 0, 1, 3]"
+    )
+    text = text.replace("(0, 3, 0)]", "(1, 1, 0), (0, 3, 0)]")  # the first is not convex
+    within = prim("Wall", text=text + "int[] holeIndices = [2]\n" + MOVED.format((1, 0, 0)))
+    world = prim("World", "Xform", within + MOVED.format((0, 0, 5)))
+    objects, lines = told(write(tmp_path / "m.usda", world, prim("Wall")))
+    assert [one.name for one in objects] == ["Wall", "Wall"]
+    assert [len(one.faces) for one in objects] == [4, 2] and lines == []
+    np.testing.assert_allclose(objects[0].bounds, [[1, 0, 5], [3, 3, 5]])
+
+
+@with_library
+@pytest.mark.parametrize(
+    ("stage", "options", "size", "words"),
+    [
+        (METRES, {}, [2, 3, 0], []),
+        ('metersPerUnit = 1\nupAxis = "Y"', {}, [2, 0, 3], ["from Y-up to Z-up, as it states"]),
+        ("", {}, [0.02, 0, 0.03], ["taken in centimetres", "to Z-up, as OpenUSD asks"]),
+        ("", {"unit": "m", "up_axis": "z"}, [2, 3, 0], []),
+    ],
+)  # fmt: skip
+def test_unit_and_axis(tmp_path, stage, options, size, words):
+    objects, lines = told(write(tmp_path / "m.usda", prim("Quad"), stage=stage), **options)
+    np.testing.assert_allclose(np.ptp(bounds(objects), axis=0), size, atol=1e-9)
+    assert len(lines) == len(words) and all(map(str.__contains__, lines, words))
+
+
+@with_library
+def test_basic_shapes_have_their_sizes(tmp_path):
+    round_ = 'double radius = 1\ndouble height = 4\nuniform token axis = "X"'
+    prims = [
+        prim("Cube", "Cube", "double size = 3"),
+        prim("Sphere", "Sphere", "double radius = 2"),
+        *(prim(kind, kind, round_) for kind in ("Cylinder", "Cone", "Capsule")),
+        prim("Plane", "Plane", 'double width = 2\ndouble length = 5\nuniform token axis = "X"'),
+        prim("Nothing", "Sphere", "double radius = 0"),
+    ]
+    objects, lines = told(write(tmp_path / "m.usda", *prims))
+    assert {one.name: np.ptp(one.bounds, axis=0).round(9).tolist() for one in objects} == {
+        "Cube": [3, 3, 3], "Sphere": [4, 4, 4], "Cylinder": [4, 2, 2], "Cone": [4, 2, 2],
+        "Capsule": [6, 2, 2], "Plane": [0, 5, 2],
+    }  # fmt: skip
+    cone = next(one for one in objects if one.name == "Cone")
+    assert cone.vertices[cone.vertices[:, 0].argmax()] == pytest.approx([2, 0, 0])
+    volumes = {
+        one.name: np.linalg.det((one.vertices - one.vertices.mean(axis=0))[one.faces]).sum() / 6
+        for one in objects
+    }
+    expected = {"Cube": 27, "Sphere": 33.51, "Cylinder": 12.57, "Cone": 4.19, "Capsule": 16.76}
+    assert volumes == pytest.approx(expected | {"Plane": 0}, rel=0.01)  # and point outwards
+    assert lines == []
+
+
+@with_library
+def test_what_is_not_shown_is_left_out_and_counted(tmp_path):
+    hidden = prim("Hidden", "Xform", 'token visibility = "invisible"\n' + prim("Quad"))
+    guide = prim("Guide", "Xform", 'uniform token purpose = "guide"\n' + prim("Quad") + prim(
+        "Drawn", text=QUAD + 'uniform token purpose = "render"'))  # fmt: skip
+    path = write(
+        tmp_path / "m.usda", hidden, guide, prim("Off", meta="active = false"),
+        prim("Curves", "BasisCurves", ""), prim("Shown", text=QUAD.replace('"none"', '"loop"')),
+        'class Mesh "Class" {' + QUAD + '}\nover "Over" {' + prim("Quad") + "}\n",
+    )  # fmt: skip
+    objects, lines = told(path)
+    assert [one.name for one in objects] == ["Drawn", "Shown"]
+    assert lines == [
+        "m.usda is read without 1 invisible, 1 BasisCurves, 1 of purpose proxy or guide",
+        "m.usda subdivides 1 mesh: taken as modelled, coarse",
+    ]
+
+
+@with_library
+def test_moving_prims_are_taken_at_the_first_time(tmp_path):
+    moving = MOVED.replace(" = {}", ".timeSamples = {{1: (1, 0, 0), 3: (9, 0, 0)}}").format()
+    camera = prim("Rig", "Xform", moving + prim("Camera", "Camera", ""))
+    car = prim("Car", "Xform", moving + prim("Body"))
+    stage = METRES + "\nstartTimeCode = 2\nendTimeCode = 3"
+    objects, lines = told(write(tmp_path / "m.usda", camera, car, stage=stage))
+    assert bounds(objects)[0, 0] == 5
+    assert lines == ["m.usda moves 1 object: taken at the first time, and still"]
+    objects, _ = told(write(tmp_path / "m.usda", car))
+    assert bounds(objects)[0, 0] == 1
+
+
+def copied(count, extra=""):
+    """Two kinds of tree in so many places, below a forest that is moved."""
+    places = ", ".join(f"({10 * i}, 0, 0)" for i in range(count))
+    text = f"""
+    int[] protoIndices = {[i % 2 for i in range(count)]}
+    point3f[] positions = [{places}]
+    rel prototypes = [</Forest/Kinds/Oak>, </Forest/Kinds/Elm>]
+    {extra}
+    """
+    kinds = 'over "Kinds" {\n' + prim("Oak", text=QUAD + MOVED.format((0, 0, 1))) + prim(
+        "Elm", "Xform", prim("Stem") + prim("Crown")) + "}\n"  # fmt: skip
+    return prim("Forest", "PointInstancer", text + kinds + MOVED.format((0, 0, 100)))
+
+
+@with_library
+def test_instancers_place_their_prototypes_only(tmp_path):
+    path = write(tmp_path / "m.usda", copied(4, "int64[] invisibleIds = [3]"))
+    objects, lines = told(path)
+    assert sorted(one.name for one in objects) == ["Crown", "Oak", "Oak", "Stem"] and not lines
+    np.testing.assert_allclose(bounds(objects), [[0, 0, 100], [22, 3, 101]])
+
+
+@with_library
+def test_prims_alike_share_one_mesh(tmp_path, monkeypatch):
+    monkeypatch.setattr(nodes, "SHARED_TRIANGLES", 1)
+    write(
+        tmp_path / "tree.usda",
+        prim("Tree", "Xform", prim("Crown")),
+        stage=METRES + '\ndefaultPrim = "Tree"',
+    )
+    tree = "references = @./tree.usda@\ninstanceable = {}"
+    grove = prim("Grove", "Xform", "".join(
+        prim(f"T{i}", "Xform", MOVED.format((i, 0, 0)), tree.format("true")) for i in range(2)
+    ))  # fmt: skip
+    write(tmp_path / "grove.usda", grove, stage=METRES + '\ndefaultPrim = "Grove"')
+    inner = "references = @grove.usda@\ninstanceable = true"  # instances in instances
+    path = write(
+        tmp_path / "m.usda",
+        *(prim(f"G{i}", "Xform", MOVED.format((0, i, 0)), inner) for i in range(3)),
+        prim("Alone", "Xform", MOVED.format((50, 0, 0)), tree.format("false")),
+    )
+    objects, _ = told(path)
+    assert all(isinstance(one, Instance) for one in objects) and len(objects) == 7
+    assert len({one.mesh for one in objects}) == 1
+    found = sorted(one.matrix[:2, 3].tolist() for one in objects)
+    assert found == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2], [50, 0]]
+
+
+@with_library
+def test_packed_scenes_are_read(tmp_path):
+    inner = write(tmp_path / "in.usda", prim("Quad"))
+    main = write(tmp_path / "main.usda", prim("A", "", "", "references = @./in.usda@</Quad>"))
+    path = tmp_path / "m.usdz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in (main, inner):
+            # Content begins at multiples of 64 bytes.
+            info = zipfile.ZipInfo(file.name)
+            room = 30 + len(file.name) + 4
+            info.extra = (
+                b"\x99\x99"
+                + (pad := -(archive.fp.tell() + room) % 64).to_bytes(2, "little")
+                + bytes(pad)
+            )
+            archive.writestr(info, file.read_bytes())
+        main.unlink(), inner.unlink()
+    objects, lines = told(path)
+    assert len(objects[0].faces) == 2 and not lines
+
+
+@with_library
+def test_missing_and_foreign_files_are_named(tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    write(tmp_path / "outside.usda", prim("Quad"))
+    (folder / "bad.usda").write_text("junk")
+    missing = [
+        prim("A", "Xform", "", "references = @./no.usda@"),
+        prim("B", "Xform", "", "payload = @https://example.com/x.usd@"),
+        prim("C", "Xform", "", "references = @bad.usda@</Quad>"),
+    ]
+    _, lines = told(write(folder / "m.usda", prim("Quad"), *missing))
+    assert lines == [
+        "m.usda refers to what is not there or cannot be read, and lacks it: 'bad.usda', "
+        "'https:/example.com/x.usd', 'no.usda'"
+    ]
+    with pytest.raises(LidarpoolError, match=r"no triangles, and refers to .*: 'no\.usda'"):
+        load_meshes(write(folder / "m.usda", missing[0]))
+    with pytest.raises(LidarpoolError, match=r"outside\.usda', but only files in its own folder"):
+        load_meshes(
+            write(
+                folder / "m.usda", prim("A", "Xform", "", "references = @../outside.usda@</Quad>")
+            )
+        )
+    with pytest.raises(LidarpoolError, match="only files in its own folder"):
+        load_meshes(
+            write(
+                folder / "m.usda", prim("Quad"), stage=METRES + "\nsubLayers = [@../outside.usda@]"
+            )
+        )
+
+
+@with_library
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("#usda 1.0\ndef Mesh {", "is broken or cut short"),
+        ("PXR-USDC", "is broken or cut short"),
+        (QUAD.replace("[4]", "[5]"), "'Quad' has polygons of 5 corners, 4 are there"),
+        (QUAD.replace("3]", "9]"), "'Quad': faces refer to vertices 0 to 9"),
+        (QUAD.replace("(2, 0, 0)", "(nan, 0, 0)"), "NaN or infinite"),
+        ("", "holds no triangles"),
+        (MOVED.format("(1e300, 0, 0)") + QUAD, "farther than anything on Earth"),
+    ],
+)  # fmt: skip
+def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
+    path = tmp_path / "m.usd"
+    if text[:1] in "#P" and text:
+        path.write_text(text)
+    else:
+        write(path, prim("Quad", text=text))
+    with pytest.raises(LidarpoolError) as refused:
+        load_meshes(path)
+    assert message in str(refused.value) and "\n" not in str(refused.value)
+    assert capfd.readouterr() == ("", "")
+
+
+@with_library
+def test_few_lines_do_not_make_millions_of_objects(tmp_path):
+    count = nodes.MOST_NODES + 1
+    text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
+    text += f"point3f[] positions = [{'(0,0,0),' * count}]\n"
+    with pytest.raises(LidarpoolError, match="more than 200,000 prims and copies"):
+        load_meshes(write(tmp_path / "m.usda", prim("F", "PointInstancer", text)))
+    levels = "".join(
+        prim(f"L{i}", "Xform", "".join(
+            prim(f"C{k}", "Xform", "", f"references = </L{i - 1}>\ninstanceable = true")
+            for k in range(10)) if i else prim("Quad"))
+        for i in range(8)
+    )  # fmt: skip
+    with pytest.raises(LidarpoolError, match="more than 200,000 in all"):
+        load_meshes(write(tmp_path / "m.usda", levels))
+
+
+@with_library
+@pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
+def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkeypatch):
+    monkeypatch.setattr(usd, "_BASE", 0)
+    monkeypatch.setattr(usd, "memory_share", lambda: 60 * 2**20)
+    with pytest.raises(LidarpoolError, match=r"m\.usda is broken or cut short \("):
+        load_meshes(
+            write(tmp_path / "m.usda", prim("Quad", text=QUAD + f"int[] a = [{'1,' * 10**6}]"))
+        )
+    monkeypatch.undo()
+    monkeypatch.setattr(allowance, "LEAST", 1000)
+    monkeypatch.setattr(allowance, "TIMES", 0.01)
+    with pytest.raises(LidarpoolError, match="would unpack to"):
+        load_meshes(
+            write(
+                tmp_path / "m.usda",
+                prim("Quad", text=QUAD.replace("(2, 3, 0)", "(2, 3, 0)" + ", (2, 3, 0)" * 1000)),
+            )
+        )
+
+
+@with_library
+@settings(
+    max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(
+    st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.binary(min_size=1, max_size=8)),
+        min_size=1,
+        max_size=4,
+    )
+)
+def test_garbled_files_give_errors_or_meshes(tmp_path, changes):
+    path = write(tmp_path / "m.usda", copied(3), prim("Quad"))
+    binary = tmp_path / "m.usdc"
+    if not (whole := tmp_path / "whole.usdc").exists():
+        code = "import sys; from pxr import Usd; Usd.Stage.Open(sys.argv[1]).Export(sys.argv[2])"
+        subprocess.run([sys.executable, "-c", code, path, whole], check=True)
+    data = bytearray(whole.read_bytes())
+    for at, some in changes:
+        begin = int(at * len(data))
+        data[begin : begin + len(some)] = some
+    binary.write_bytes(data)
+    try:
+        assert load_meshes(binary)
+    except LidarpoolError as error:
+        assert str(error).count("\n") < 2

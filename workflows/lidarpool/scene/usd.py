@@ -1,0 +1,226 @@
+"""OpenUSD scenes, .usd .usda .usdc .usdz, through usd-core (Pixar, licence TOST-1.0).
+
+`usd_child.py` reads them in a process of its own, and says why. References to other files are
+resolved by usd-core; content from outside the scene's folder is refused.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Generator
+from contextlib import closing
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.allowance import Allowance, bytes_of, memory_share
+from ..base.words import counted
+from .actors import box
+from .mesh import Mesh
+from .nodes import (
+    MOST_NODES,
+    SMALLER,
+    Content,
+    MeshFileError,
+    Node,
+    Piece,
+    Place,
+    instances,
+    joined,
+    settled,
+)
+from .polygons import triangulated
+from .shapes import revolve
+
+_BASE = 512 * 2**20  # bytes that usd-core takes for any file
+_SEGMENTS = 64  # around spheres, cylinders, cones and capsules
+
+_Frame = tuple[dict[str, Any], list[NDArray[Any]]]
+
+
+def read_usd(data: bytes, path: Path) -> Content:
+    """Read all prims of a scene that are shown, at its first time.
+
+    Files that it refers to are read only from the folder of `path` and below.
+    """
+    if find_spec("pxr") is None:
+        raise MeshFileError('is OpenUSD, which usd-core reads: pip install "lidarpool[usd]"')
+    allowance = Allowance(len(data), SMALLER)
+    meshes: dict[int, list[Mesh]] = {}
+    stage: dict[str, Any] = {}
+    with closing(_frames(path, allowance)) as frames:
+        for frame, arrays in frames:
+            _check_files(frame.get("files", ()), path)
+            match frame["what"]:
+                case "stage":
+                    stage = frame
+                    for file in frame["files"]:
+                        allowance.grow(Path(file).stat().st_size)
+                case "mesh":
+                    meshes[frame["number"]] = _mesh(frame["name"], arrays, allowance)
+                case "shape":
+                    meshes[frame["number"]] = _shape(frame)
+                case "error":
+                    raise ValueError(frame["reason"])
+                case "too many":
+                    raise MeshFileError(
+                        f"has more than {MOST_NODES:,} prims and copies: export it in parts"
+                    )
+                case "nodes":
+                    content = settled(_places(frame, arrays, meshes, path.stem))
+                    return _told(content, stage, frame["counts"])
+    raise ValueError("usd-core read no part of it")
+
+
+def _frames(path: Path, allowance: Allowance) -> Generator[_Frame]:
+    """Read a file in a process of its own, and give what that writes."""
+    script = Path(__file__).with_name("usd_child.py")
+    memory = memory_share() + _BASE
+    # The user's plug-ins and search paths would make it another scene.
+    environment = {name: text for name, text in os.environ.items() if not name.startswith("PXR_")}
+    environment |= {"PXR_WORK_THREAD_LIMIT": "4", "OPENBLAS_NUM_THREADS": "1"}
+    with subprocess.Popen(
+        # -P: our modules must not take the place of the library's.
+        [sys.executable, "-P", script, path.absolute(), str(MOST_NODES), str(memory)],
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        cwd=path.parent,
+        env=environment,
+    ) as child:
+        assert child.stdout
+        try:
+            while line := child.stdout.readline():
+                frame, arrays = json.loads(line), []
+                for kind, shape in frame["arrays"]:
+                    size = np.dtype(kind).itemsize * math.prod(shape)
+                    allowance.take(size)
+                    arrays.append(np.frombuffer(child.stdout.read(size), kind).reshape(shape))
+                yield frame, arrays
+            code = child.wait()
+        finally:
+            child.kill()
+    why = signal.Signals(-code).name if code < 0 else f"status {code}"
+    raise ValueError(f"usd-core ended with {why}, or needs more than {bytes_of(memory)} of memory")
+
+
+def _check_files(files: list[str], path: Path) -> None:
+    """Check that all files that a scene was read from are in its folder."""
+    folder, own = path.parent.resolve(), path.resolve()
+    for file in map(Path, files):
+        if file.resolve() != own and not file.resolve().is_relative_to(folder):
+            raise MeshFileError(
+                f"takes data from {str(file)[-80:]!r}, but only files in its own folder are read; "
+                f'make one file of it: python -c "from pxr import Usd; '
+                f"Usd.Stage.Open('{path.name}').Export('{path.stem}-flat.usdc')\""
+            )
+
+
+def _mesh(name: str, arrays: list[NDArray[Any]], allowance: Allowance) -> list[Mesh]:
+    """Mesh of polygons; none without triangles."""
+    allowance.take(24 * len(arrays[2]) + 4 * 8 * len(arrays[1]))
+    sizes, corners, points, holes = arrays
+    sizes, corners = sizes.astype(np.int64), corners.astype(np.int64)
+    if (sizes < 0).any() or sizes.sum() != len(corners):
+        raise ValueError(
+            f"{name!r} has polygons of {sizes.sum():,} corners, {len(corners):,} are there"
+        )
+    if len(holes):
+        solid = np.ones(len(sizes), bool)
+        solid[holes[(holes >= 0) & (holes < len(sizes))]] = False
+        sizes, corners = sizes[solid], corners[np.repeat(solid, sizes)]
+    vertices = points.reshape(-1, 3).astype(np.float64)
+    try:
+        return joined(name, [Piece(vertices, triangulated(vertices, corners, sizes))], allowance)
+    except ValueError as error:
+        raise ValueError(f"{name!r}: {error}") from error
+
+
+def _shape(frame: dict[str, Any]) -> list[Mesh]:
+    """Mesh of a cube, sphere, cylinder, cone, capsule or plane; none if it has no size."""
+    name, kind, size = frame["name"], frame["kind"], frame["sizes"]
+    axis = "XYZ".index(size.get("axis", "Z"))
+    if min(value for value in size.values() if not isinstance(value, str)) <= 0:
+        return []
+    if kind == "Cube":
+        edge = size["size"]
+        return [box(name, (edge, edge, edge)).moved(name, np.eye(3), np.array([0, 0, -edge / 2]))]
+    if kind == "Plane":
+        along = ("width", "length") if axis == 2 else ("length", "width")
+        x, y = (size[side] / 2 for side in along)
+        corners = np.array([(-x, -y, 0), (x, -y, 0), (x, y, 0), (-x, y, 0)])
+        made = Mesh(name, corners, np.array([(0, 1, 2), (0, 2, 3)]))
+    else:
+        made = revolve(_profile(kind, size), _SEGMENTS, name)
+    # From an axis along z to its own.
+    return [Mesh(name, np.roll(made.vertices, axis + 1, axis=1), made.faces)]
+
+
+def _profile(kind: str, size: dict[str, Any]) -> NDArray[np.float64]:
+    """Radii and heights (n, 2) of a round shape."""
+    half, radius = size.get("height", 0) / 2, size["radius"]
+    if kind == "Cylinder":
+        return radius * np.array([(0, 0), (1, 0), (1, 0), (0, 0)]) + [
+            (0, -half), (0, -half), (0, half), (0, half)
+        ]  # fmt: skip
+    if kind == "Cone":
+        return np.array([(0, -half), (radius, -half), (0, half)])
+    angles = np.linspace(-np.pi / 2, np.pi / 2, _SEGMENTS // 2 + 1)
+    ball = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+    middle = _SEGMENTS // 4
+    # A capsule is a ball drawn apart at its equator.
+    lower, upper = np.array([(0, -half)]), np.array([(0, half)])
+    return np.concatenate([ball[: middle + bool(half)] + lower, ball[middle:] + upper])
+
+
+def _places(
+    frame: dict[str, Any], arrays: list[NDArray[Any]], meshes: dict[int, list[Mesh]], stem: str
+) -> list[Place]:
+    """Places of meshes, by the nodes of a scene."""
+    matrices, *copies = arrays
+
+    def node(key: Any) -> Node:
+        if isinstance(key, tuple):
+            child, array, row = key
+            return Node("", copies[array][row], (), [child])
+        name, mesh, children, copied = frame["nodes"][key]
+        children += [(child, at, row) for child, at in copied for row in range(len(copies[at]))]
+        return Node(name, matrices[key], meshes.get(mesh, ()), children)
+
+    return instances(frame["roots"], node, stem)
+
+
+def _told(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Content:
+    """Add units, axes and notes."""
+    content.unit_m, content.up_axis = stage["unit_m"], stage["up_axis"]
+    if not 0 < stage["unit_m"] < np.inf:
+        raise ValueError(f"its unit is {stage['unit_m']} metres")
+    content.turned = "as it states" if stage["up_stated"] else "as OpenUSD asks"
+    if not stage["unit_stated"]:
+        content.unit_note = "states no unit and is taken in centimetres, as OpenUSD asks"
+    moving, skinned, smooth = (counts.pop(k, 0) for k in ("moving", "skinned", "subdivided"))
+    notes = content.notes
+    if names := [name[-80:] for name in stage["missing"]]:
+        listed = ", ".join(map(repr, names[:3])) + ", …" * (len(names) > 3)
+        notes.append(f"refers to what is not there or cannot be read, and lacks it: {listed}")
+    if counts:
+        listed = ", ".join(f"{n} {kind}" for kind, n in counts.items())
+        notes.append(f"is read without {listed}")
+    if moving:
+        notes.append(f"moves {counted(moving, 'object')}: taken at the first time, and still")
+    if skinned:
+        bent = counted(skinned, "mesh", "meshes")
+        notes.append(f"bends {bent} by skeletons in instances, which is not read: taken unbent")
+    if smooth:
+        notes.append(f"subdivides {counted(smooth, 'mesh', 'meshes')}: taken as modelled, coarse")
+    if notes and not content.meshes:
+        raise MeshFileError(f"holds no triangles, and {notes[0]}")
+    return content
