@@ -253,6 +253,19 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool, monkeypatch):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000
 
 
+def test_a_scene_of_openusd_is_checked_as_shown(tmp_path, lidarpool, monkeypatch):
+    pytest.importorskip("pxr", reason="usd-core is an extra")
+    monkeypatch.chdir(tmp_path)
+    blocks = blocks_of(ROOT / "docs/how-to/openusd.md")
+    [scene] = [block for block in blocks if block.title]
+    Path(scene.title).write_text(scene.code, encoding="utf-8")
+    [shown] = [block for block in blocks if block.language == "console"]
+    [words] = commands(shown)
+    outcome = lidarpool(*words[1:])
+    assert outcome.code == 0
+    assert {*shown.code.splitlines()[1:]} <= {*outcome.out.splitlines(), *outcome.err.splitlines()}
+
+
 def counts(line: str) -> list[int]:
     """Numbers of rays, hits and the like, which are the same on all machines, nearly."""
     nouns = "triangles|objects|scans|rays|hits|points"

@@ -69,7 +69,7 @@ class MeshFile(Section):
     file: Annotated[
         str,
         told(
-            ".glb .gltf .obj .stl .ply .off .dae or .3mf, from the scenario's folder",
+            ".glb .gltf .obj .stl .ply .off .dae .3mf or .usd, from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),

@@ -115,7 +115,7 @@ class Scene:
         transform: Transform | None = None,
         opacity: Opacity = "mask",
     ) -> Scene:
-        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf.
+        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf .usd .usda .usdc .usdz.
 
         Parameters
         ----------

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pxr import Ar, Gf, Tf, Usd, UsdGeom, UsdSkel, UsdUtils
 
-LONGEST_S = 120  # from one mesh to the next; broken files may take for ever
+LONGEST_S = 300  # from one mesh to the next; broken files may take for ever
 
 _LEFT_OUT = (UsdGeom.Tokens.proxy, UsdGeom.Tokens.guide)  # purposes
 _SHOWN = (
@@ -179,8 +179,9 @@ class Scene:
         for array in arrays:
             digest.update(b"%d;" % array.size)
             digest.update(array)
-        number = self._meshes.setdefault(digest.digest(), len(self._meshes))
-        if number == len(self._meshes) - 1:
+        known = len(self._meshes)
+        number = self._meshes.setdefault(digest.digest(), known)
+        if number == known:
             self._write(frame | {"name": prim.GetName(), "number": number}, *arrays)
         return number
 
@@ -258,10 +259,10 @@ def main(path: str, most: int) -> None:
     except Tf.ErrorException as error:
         words = str(error.args[0].commentary).replace(path, os.path.basename(path))  # noqa: PTH119
         write({"what": "error", "reason": re.sub(r"pxrInternal\w+::", "", words)})
-    except ValueError as error:
-        write({"what": "error", "reason": str(error)})
     except TooManyError:
         write({"what": "too many"})
+    except Exception as error:  # of any type, as readers of broken files are
+        write({"what": "error", "reason": str(error)[:300]})
     out.flush()
     del silent
 
