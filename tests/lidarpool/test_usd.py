@@ -229,7 +229,9 @@ def test_missing_and_foreign_files_are_named(tmp_path):
     ]
     with pytest.raises(LidarpoolError, match=r"no triangles, and refers to .*: 'no\.usda'"):
         load_meshes(write(folder / "m.usda", missing[0]))
-    with pytest.raises(LidarpoolError, match=r"outside\.usda', but only files in its own folder"):
+    with pytest.raises(
+        LidarpoolError, match=r"from '\.\./outside\.usda', but only files in its own folder"
+    ):
         load_meshes(
             write(
                 folder / "m.usda", prim("A", "Xform", "", "references = @../outside.usda@</Quad>")
@@ -253,6 +255,7 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         (QUAD.replace("3]", "9]"), "'Quad': faces refer to vertices 0 to 9"),
         (QUAD.replace("(2, 0, 0)", "(nan, 0, 0)"), "NaN or infinite"),
         ("", "holds no triangles"),
+        ('#usda 1.0\n(upAxis = "up")\n' + prim("Quad"), "its upAxis is 'up'"),
         (MOVED.format("(1e300, 0, 0)") + QUAD, "farther than anything on Earth"),
     ],
 )  # fmt: skip

@@ -39,6 +39,7 @@ from .nodes import (
 )
 from .polygons import triangulated
 from .shapes import revolve
+from .transform import UP_AXES
 
 _BASE = 512 * 2**20  # bytes that usd-core takes for any file
 _SEGMENTS = 64  # around spheres, cylinders, cones and capsules
@@ -53,7 +54,7 @@ def read_usd(data: bytes, path: Path) -> Content:
     """
     if find_spec("pxr") is None:
         raise MeshFileError('is OpenUSD, which usd-core reads: pip install "lidarpool[usd]"')
-    allowance = Allowance(len(data), SMALLER)
+    allowance = Allowance(0, SMALLER)  # grows by all files of the scene
     meshes: dict[int, list[Mesh]] = {}
     stage: dict[str, Any] = {}
     with closing(_frames(path, allowance)) as frames:
@@ -108,6 +109,8 @@ def _frames(path: Path, allowance: Allowance) -> Generator[_Frame]:
             code = child.wait()
         finally:
             child.kill()
+    if code == -signal.SIGALRM:
+        raise ValueError("usd-core takes too long for it")
     why = signal.Signals(-code).name if code < 0 else f"status {code}"
     raise ValueError(f"usd-core ended with {why}, or needs more than {bytes_of(memory)} of memory")
 
@@ -115,10 +118,11 @@ def _frames(path: Path, allowance: Allowance) -> Generator[_Frame]:
 def _check_files(files: list[str], path: Path) -> None:
     """Check that all files that a scene was read from are in its folder."""
     folder, own = path.parent.resolve(), path.resolve()
-    for file in map(Path, files):
-        if file.resolve() != own and not file.resolve().is_relative_to(folder):
+    for file in (Path(name).resolve() for name in files):
+        if file != own and not file.is_relative_to(folder):
+            name = os.path.relpath(file, folder)[-80:]
             raise MeshFileError(
-                f"takes data from {str(file)[-80:]!r}, but only files in its own folder are read; "
+                f"takes data from {name!r}, but only files in its own folder are read; "
                 f'make one file of it: python -c "from pxr import Usd; '
                 f"Usd.Stage.Open('{path.name}').Export('{path.stem}-flat.usdc')\""
             )
@@ -186,13 +190,21 @@ def _places(
 ) -> list[Place]:
     """Places of meshes, by the nodes of a scene."""
     matrices, *copies = arrays
+    nodes = frame["nodes"]
 
     def node(key: Any) -> Node:
         if isinstance(key, tuple):
-            child, array, row = key
-            return Node("", copies[array][row], (), [child])
-        name, mesh, children, copied = frame["nodes"][key]
-        children += [(child, at, row) for child, at in copied for row in range(len(copies[at]))]
+            copied, places, row = key
+            if row is not None:
+                return Node("", copies[places][row], (), [copied])
+            name, mesh, *_ = nodes[copied]
+            return Node(name, np.eye(4), meshes[mesh], (), copies[places] @ matrices[copied])
+        name, mesh, children, instanced = nodes[key]
+        for copied, places in instanced:
+            inner = nodes[copied]
+            alone = inner[1] is not None and not (inner[2] or inner[3])  # a mesh, and no more
+            rows = [None] if alone else range(len(copies[places]))
+            children += [(copied, places, row) for row in rows]
         return Node(name, matrices[key], meshes.get(mesh, ()), children)
 
     return instances(frame["roots"], node, stem)
@@ -203,6 +215,8 @@ def _told(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Co
     content.unit_m, content.up_axis = stage["unit_m"], stage["up_axis"]
     if not 0 < stage["unit_m"] < np.inf:
         raise ValueError(f"its unit is {stage['unit_m']} metres")
+    if stage["up_axis"] not in UP_AXES:
+        raise ValueError(f"its upAxis is {stage['up_axis'][:20]!r}")
     content.turned = "as it states" if stage["up_stated"] else "as OpenUSD asks"
     if not stage["unit_stated"]:
         content.unit_note = "states no unit and is taken in centimetres, as OpenUSD asks"

@@ -220,6 +220,16 @@ def _missing(stage: Any) -> list[str]:
     return sorted(name for name in found if not name.endswith(".mtlx"))
 
 
+def _reason(error: Exception, path: str) -> str:
+    """Say what is wrong, without names of C++ and folders."""
+    try:
+        text = error.args[0].commentary if isinstance(error, Tf.ErrorException) else str(error)
+    except UnicodeDecodeError:
+        return "its text is garbled"
+    text = text.replace(path, os.path.basename(path))  # noqa: PTH119
+    return re.sub(r"pxrInternal\w+::", "", text)[:300]
+
+
 def main(path: str, most: int) -> None:
     """Read a file, and write frames."""
     out = os.fdopen(os.dup(1), "wb")
@@ -236,7 +246,6 @@ def main(path: str, most: int) -> None:
     silent = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         stage = Usd.Stage.Open(path)
-        stated = stage.HasAuthoredMetadata("upAxis")
         write({
             "what": "stage",
             "files": _files(stage),
@@ -244,25 +253,21 @@ def main(path: str, most: int) -> None:
             "unit_m": UsdGeom.GetStageMetersPerUnit(stage),
             "unit_stated": UsdGeom.StageHasAuthoredMetersPerUnit(stage),
             "up_axis": UsdGeom.GetStageUpAxis(stage).lower(),
-            "up_stated": stated,
+            "up_stated": stage.HasAuthoredMetadata("upAxis"),
         })  # fmt: skip
         scene = Scene(stage, most, write)
         scene.read()
-        matrices = np.array(scene.matrices)
         write({
             "what": "nodes",
             "files": _files(stage),  # with those of value clips
             "roots": scene.roots,
             "nodes": scene.nodes,
             "counts": scene.counts,
-        }, matrices, *scene.copies)  # fmt: skip
-    except Tf.ErrorException as error:
-        words = str(error.args[0].commentary).replace(path, os.path.basename(path))  # noqa: PTH119
-        write({"what": "error", "reason": re.sub(r"pxrInternal\w+::", "", words)})
+        }, np.array(scene.matrices), *scene.copies)  # fmt: skip
     except TooManyError:
         write({"what": "too many"})
     except Exception as error:  # of any type, as readers of broken files are
-        write({"what": "error", "reason": str(error)[:300]})
+        write({"what": "error", "reason": _reason(error, path)})
     out.flush()
     del silent
 
@@ -271,6 +276,8 @@ if __name__ == "__main__":
     file, most_places, memory = sys.argv[1:]
     signal.alarm(LONGEST_S)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    resource.setrlimit(resource.RLIMIT_DATA, (int(memory), resource.RLIM_INFINITY))
+    _, most_memory = resource.getrlimit(resource.RLIMIT_DATA)
+    limit = int(memory) if most_memory < 0 else min(int(memory), most_memory)
+    resource.setrlimit(resource.RLIMIT_DATA, (limit, most_memory))
     main(file, int(most_places))
     os._exit(0)  # at once: taking a large stage down takes long
