@@ -142,6 +142,33 @@ def test_moving_prims_are_taken_at_the_first_time(tmp_path):
     assert bounds(objects)[0, 0] == 1
 
 
+@with_library
+def test_skeletons_bend_their_meshes_but_in_instances(tmp_path):
+    still, raised = "((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,{},1))".format, "5"
+    bones = f"""uniform token[] joints = ["a"]
+    uniform matrix4d[] bindTransforms = [{still(0)}]
+    uniform matrix4d[] restTransforms = [{still(raised)}]
+    """
+    skin = (
+        QUAD
+        + """rel skel:skeleton = <../Bones>
+    int[] primvars:skel:jointIndices = [0] (elementSize = 1
+ interpolation = "constant")
+    float[] primvars:skel:jointWeights = [1] (elementSize = 1
+ interpolation = "constant")
+    """
+    )
+    api = 'prepend apiSchemas = ["SkelBindingAPI"]'
+    man = prim(
+        "Man", "SkelRoot", prim("Bones", "Skeleton", bones) + prim("Skin", text=skin, meta=api)
+    )
+    objects, lines = told(write(tmp_path / "man.usda", man, stage=METRES + '\ndefaultPrim = "Man"'))
+    assert bounds(objects)[:, 2].tolist() == [5, 5] and lines == []
+    placed = prim("A", "", "", "references = @man.usda@\ninstanceable = true")
+    objects, [line] = told(write(tmp_path / "m.usda", placed))
+    assert bounds(objects)[:, 2].tolist() == [0, 0] and "in instances" in line
+
+
 def copied(count, extra=""):
     """Two kinds of tree in so many places, below a forest that is moved."""
     places = ", ".join(f"({10 * i}, 0, 0)" for i in range(count))
