@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import importlib.resources
+import pickle
 import shutil
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +16,8 @@ from tests.lidarpool.casting import cast_between
 from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
 
 from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scene, Survey, Track
+from lidarpool.columns.parts import pack
+from lidarpool.pipeline import cast
 from lidarpool.scene.actors import box
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import Material
@@ -138,6 +142,22 @@ def test_columns_of_actors(scene, name, scenes, backend):
     if scene == "plain":
         survey = replace(survey, materials=())
     same(scenes[scene].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
+
+
+def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
+    survey, spans = MADE["on the move"], [(0, 9), (9, 28)]
+    monkeypatch.setattr(cast, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
+    tasks = []
+    for name in (backend, "numpy"):
+        rig = Rig(scenes["both"], survey, name)
+        monkeypatch.setattr(cast, "rig_of", lambda handle, rig=rig: rig)
+        tasks.append(pickle.loads(pickle.dumps(cast.intersect("a run", spans), protocol=5)))
+    for mine, other in zip(*tasks, strict=True):
+        assert pack(mine.part) == pack(other.part)
+        for field in ("hits", "points"):
+            assert np.array_equal(mine.summaries[field], other.summaries[field])
+        samples, exact = mine.summaries["samples"], other.summaries["samples"]
+        assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
 
 
 @pytest.mark.parametrize("card", ["75", "120"])
