@@ -75,6 +75,7 @@ class DeviceColumns:
         self.wanted = [column for column in _MADE if column in survey.stored_columns]
         self.energies = [column for column in self.wanted if column.name in _ENERGIES]
         self.bodies, self._turns = surfaces.bodies()
+        self._counters = world.counters()
         self._sent: tuple[Any, ...] | None = None
 
     @staticmethod
@@ -111,8 +112,7 @@ class DeviceColumns:
             others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
         most = -(-len(scan) // every) + len(groups)
         making = _Making(self, specs, groups, most, moves=others is not None)
-        caster, counters = self._world.caster, self._world.counters()
-        hits, tally = caster.visit(scan, making.make, counters, others)
+        hits, tally = self._world.caster.visit(scan, making.make, self._counters, others)
         assert tally is not None
         columns = making.done()
         if making.moving:
