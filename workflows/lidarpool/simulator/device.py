@@ -81,16 +81,14 @@ class DeviceColumns:
     @staticmethod
     def can_make(world: World, survey: Survey) -> bool:
         """Whether all of a survey's columns are made on a device, given one return for each ray."""
-        names = {column.name for column in survey.stored_columns}
-        known = {*(column.name for column in _MADE), *_EQUAL}
-        clear = not any(survey.extinction(carried.sensor) for carried in survey.carried)
-        return (
-            world.caster.on_device
-            and survey.coordinates == "world"
-            and all(column in TABLE.values() for column in survey.stored_columns)
-            and names <= known
-            and (clear or not names & {*_ENERGIES})
-        )
+        if not world.caster.on_device or survey.coordinates != "world":
+            return False
+        wanted = survey.stored_columns
+        shines = any(column.name in _ENERGIES for column in wanted)
+        if shines and any(survey.extinction(carried.sensor) for carried in survey.carried):
+            return False
+        known = {*_MADE, *(TABLE[name] for name in _EQUAL)}
+        return known.issuperset(wanted)
 
     def returns(
         self,
