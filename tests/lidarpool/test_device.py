@@ -38,6 +38,12 @@ MATERIALS = (
     Material("copy 2", retro=True, semantic_class=7),
 )
 
+# One drives through the other, and both past what stands.
+WAYS = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
+ACTORS = tuple(
+    Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(WAYS)
+)
+
 
 @pytest.fixture
 def backend(source_backend, monkeypatch):  # noqa: F811
@@ -111,18 +117,27 @@ def test_a_survey_that_hits_nothing(scenes, backend):
 
 
 OWN = Column("own", "float32", "", "of a user", lambda returns: returns.range)
-OTHERS = {
+MORE = {
     "a user's column": {"columns": (*COLUMNS, OWN)},
-    "angles": {"columns": ("azimuth",)},
-    "sub-rays": {"returns": Returns("all", 7, 3.0)},
-    "noise": {"noise": Noise(range_m=0.01)},
+    "angles": {"columns": ("azimuth", "intensity")},
     "haze": {"visibility_km": 2.0},
     "the sensor's axes": {"coordinates": "sensor"},
+    "only angles": {"columns": ("elevation",), "keep_every": 4},
 }
 
 
+@pytest.mark.parametrize("actors", [(), ACTORS], ids=["", "actors"])
+@pytest.mark.parametrize("name", MORE)
+def test_numpy_makes_the_other_columns_of_the_hits(name, actors, scenes, backend):
+    survey = replace(MADE["on the move"], **MORE[name])
+    same(scenes["both"].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
+
+
+OTHERS = {"sub-rays": {"returns": Returns("all", 7, 3.0)}, "noise": {"noise": Noise(range_m=0.01)}}
+
+
 @pytest.mark.parametrize("name", OTHERS)
-def test_what_only_numpy_can_make_is_made_of_the_hits(name, scenes, backend):
+def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
     survey = replace(MADE["on the move"], **OTHERS[name])
     rigs = [Rig(scenes["plain"], survey, which) for which in (backend, "numpy")]
     got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
@@ -133,15 +148,10 @@ def test_what_only_numpy_can_make_is_made_of_the_hits(name, scenes, backend):
 @pytest.mark.parametrize("scene", ["plain", "instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
 def test_columns_of_actors(scene, name, scenes, backend):
-    """One drives through the other, and both past what stands."""
-    ways = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
-    actors = tuple(
-        Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(ways)
-    )
     survey = replace(MADE[name], materials=[*MATERIALS, Material("Car*", 0.7, 40)])
     if scene == "plain":
         survey = replace(survey, materials=())
-    same(scenes[scene].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
+    same(scenes[scene].with_actors(ACTORS), survey, backend, (0, 3, survey.scan_count))
 
 
 def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):

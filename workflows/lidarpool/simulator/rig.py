@@ -101,7 +101,7 @@ class Rig:
         """Make what depends on where the surfaces are."""
         given = self._world, self.scene, self.survey, self._surfaces
         self._echoes = EchoCaster(*given)
-        able = self._echoes.plain and DeviceColumns.can_make(self._world, self.survey)
+        able = self._echoes.plain and self._world.caster.on_device
         self._device = DeviceColumns(*given) if able else None
 
     @property
