@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -39,7 +40,13 @@ class BatchReturns:
         self.scene, self.survey = scene, survey
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
-        self.specs, self.found = specs, found
+        self.specs = specs
+        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
+        # would be kept for each station of a batch.
+        hits = np.zeros(0, np.int64) if found.tally is None else found.tally
+        triangles = np.flatnonzero(hits)
+        self.tally = triangles, hits[triangles]
+        self.found = replace(found, tally=None)
         self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
@@ -259,14 +266,17 @@ def columns_of(found: list[BatchReturns]) -> PartColumns:
         column.name: _joined([column.make(returns) for returns in found])
         for column in found[0].survey.stored_columns
     }
-    tally = np.sum([np.asarray(returns.found.tally) for returns in found], axis=0)
-    triangles = np.flatnonzero(tally)
+    hits = np.zeros(found[0].scene.counters, np.int64)
+    for returns in found:
+        triangles, counts = returns.tally
+        hits[triangles] += counts
+    triangles = np.flatnonzero(hits)
     return PartColumns(
         found[0].specs[0].scan,
         _joined([returns.counts for returns in found]),
         columns,
         triangles.astype(np.int32),
-        tally[triangles].astype(np.int64),
+        hits[triangles],
     )
 
 
