@@ -508,7 +508,7 @@ class TaskOptions:
     batch_mb: Annotated[
         int,
         told(
-            "most memory to cast some scans at a time, on each GPU worker, megabytes",
+            "most memory of a batch, the scans that a GPU worker casts at a time, megabytes",
             ge=1,
             le=1_000_000,
         ),
