@@ -61,6 +61,7 @@ FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most
 
 # Rays that are cast at most, whole scans of them, and the least and most scans.
 SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
+SAMPLE_MOST = 20_000_000  # rays beyond which fewer scans are cast, one at least
 
 
 def forecast(
@@ -213,7 +214,9 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     """
     rig = Rig(scene, survey, backend)
     all_rays = survey.ray_count * survey.returns.subrays
-    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, *SAMPLE_SCANS)
+    least, most = SAMPLE_SCANS
+    few = max(1, SAMPLE_MOST * survey.scan_count // all_rays)
+    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, min(least, few), most)
     rays = hits = points = 0
     for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
         rays += survey.scan(scan).ray_count
