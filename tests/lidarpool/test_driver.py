@@ -68,7 +68,7 @@ class Workers:
         self.casts[key] = (spans, worker, Outcome.PENDING)
         return key
 
-    def outcome(self, key, what):
+    def outcome(self, key):
         return self.casts[key][-1]
 
     def forget(self, key):

@@ -214,7 +214,7 @@ class SurveyDriver:
     def _check_casts(self) -> bool:
         moved = False
         for batch in self.batches.at(Place.CASTING):
-            outcome = self._workers.outcome(batch.key, batch.name)
+            outcome = self._workers.outcome(batch.key)
             if outcome is Outcome.DONE:
                 batch.to(Place.CAST, time.monotonic())
                 self.cast += len(batch)
