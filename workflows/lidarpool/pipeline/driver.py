@@ -205,7 +205,6 @@ class SurveyDriver:
         for task, worker in chosen:
             key = self._workers.cast([(batch.first, batch.stop) for batch in task], worker)
             for batch in task:
-                batch.offers += 1
                 batch.key, batch.worker, batch.collector = key, worker, ""
                 batch.to(Place.CASTING, time.monotonic())
                 self._trace("submit", INTERSECT, batch.scans)
