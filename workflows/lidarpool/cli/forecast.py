@@ -283,7 +283,9 @@ def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     other = PROCESS_BYTES + PARTICLE_BYTES * swarm
     piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
-    shown = min(job.scene.triangles, job.scene.kept_triangles + DRAWN_TRIANGLES)
+    shown = job.scene.kept_triangles + DRAWN_TRIANGLES
+    if not job.scene.masked:  # which is cut into more
+        shown = min(job.scene.triangles, shown)
     driver = (
         2 * SCENE_BYTES * shown + _copies_bytes(job) + SCAN_BYTES * job.survey.scan_count + piece
     )
