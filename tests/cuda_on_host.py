@@ -144,6 +144,7 @@ HOST = Module(
     empty=poisoned,
     zeros=lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array),
     cumsum=np.cumsum,
+    flatnonzero=lambda a: np.flatnonzero(a).view(Array),
     get_default_memory_pool=lambda: SimpleNamespace(free_all_blocks=lambda: None),
     cuda=SimpleNamespace(
         Device=Device,

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .device import DeviceHits
-from .hits import Part, ScanReturns, joined
+from .device import DeviceHits, sent
+from .hits import Counted, Part, ScanReturns, joined
 from .instances import Scene
 from .layout import lay_out, lay_out_places
 from .opacity import Masks
@@ -82,8 +82,8 @@ class CudaBackend(Backend):
             masks = made.masks or Masks(*NO_MASKS)
             tables = (made.nodes, made.triangles, made.corners, made.faces)
             given = (*tables, masks.uv, masks.mask, masks.records)
-            self._meshes = tuple(_sent(cupy, table) for table in given)
-            nothing = (_sent(cupy, np.zeros(2, np.int64)), np.int32(0))
+            self._meshes = tuple(sent(cupy, table) for table in given)
+            nothing = (sent(cupy, np.zeros(2, np.int64)), np.int32(0))
             self._uncounted = (*nothing, cupy.zeros(1, np.int64))
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
@@ -100,7 +100,7 @@ class CudaBackend(Backend):
                 self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
             )
             given = (made.frame, made.top, made.instances)
-            self._places = tuple(_sent(self._cupy, table) for table in given)
+            self._places = tuple(sent(self._cupy, table) for table in given)
 
     @staticmethod
     def _library() -> Any:
@@ -129,8 +129,12 @@ class CudaBackend(Backend):
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`."""
         kept: list[Part] = []
-        hits, tally = self.visit(scan, lambda found: kept.append(found.get()))
+        hits, counted = self.visit(scan, lambda found: kept.append(found.get()))
         ray, distance, triangle, instance = joined(kept)
+        tally = None
+        if counted is not None:
+            tally = np.zeros(self._scene.face_count, np.int64)
+            tally[counted[0]] = counted[1]
         return ScanReturns(ray, distance, triangle, hits, tally, instance)
 
     def visit(
@@ -138,7 +142,7 @@ class CudaBackend(Backend):
         scan: Scan,
         use: Callable[[DeviceHits], object],
         counters: NDArray[np.int64] | None = None,
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
+    ) -> tuple[NDArray[np.int64], Counted | None]:
         """See `RayCaster.visit`."""
         scene, groups, unit = self._scene, Groups(scan.groups, scan.keep_every), self._scene.frame
         with self._device:
@@ -148,12 +152,17 @@ class CudaBackend(Backend):
                 faces = np.diff(scene.first_face)[scene.mesh]
                 most = int((rows[:, 0] + rows[:, 1] * (faces - 1)).max())
                 tally = self._cupy.zeros(most + 1, np.int64)
-                counting = _sent(self._cupy, rows), np.int32(1), tally
+                counting = sent(self._cupy, rows), np.int32(1), tally
             for start, n, rays in self._made(scan):
                 found = self._cast("cast_pattern", n, rays)
                 kept = self._packed(found, start, groups, unit.scale, counting)
                 use(DeviceHits(*kept, self._cupy, partial(self._rays, start, rays)))
-            return groups.hits, counting[2].get() if scan.tally else None
+            return groups.hits, self._counted(counting[2]) if scan.tally else None
+
+    def _counted(self, tally: Any) -> Counted:
+        """Copy what was counted to the host: a tally has a row for each triangle, most of them 0."""
+        rows = self._cupy.flatnonzero(tally)
+        return rows.get(), tally[rows].get()
 
     def _rays(self, start: int, rays: tuple[Any, ...], ray: Any) -> tuple[Any, Any]:
         """Make starts and directions of rays of a chunk, on the device."""
@@ -199,7 +208,7 @@ class CudaBackend(Backend):
             given = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
             kept = self._patterns[pattern] = tuple(
-                _sent(self._cupy, table.T) for table in given if table is not None
+                sent(self._cupy, table.T) for table in given if table is not None
             )
         return kept
 
@@ -293,19 +302,3 @@ def _device(cupy: Any, number: int | None) -> Any:
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
     return cupy.cuda.Device(number)
-
-
-def _sent(cupy: Any, array: NDArray[Any]) -> Any:
-    """Copy an array to the current device, and wait for that.
-
-    A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
-    returns: hence the wait, after which the caller may release the array.
-
-    `asarray` would copy through page-locked memory as large as the array and keep it: fine for
-    the rays of a chunk, too much for a scene.
-    """
-    copy = cupy.empty(array.shape, array.dtype)
-    if array.size:
-        copy.set(array)
-        cupy.cuda.get_current_stream().synchronize()
-    return copy

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,10 +35,13 @@ class Cart:
 
 
 def cast_between(rig, survey, cuts):
-    """Columns as bytes, and hits of each triangle, of scans that are cast from cut to cut."""
+    """Columns as bytes, and {counter: hits}, of scans that are cast from cut to cut."""
     batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
     columns = {
         column.name: np.concatenate([batch.column(column) for batch in batches]).tobytes()
         for column in survey.stored_columns
     }
-    return columns, np.sum([batch.tally for batch in batches], axis=0).tolist()
+    counted = Counter()
+    for batch in batches:
+        counted.update(dict(zip(*(part.tolist() for part in batch.counted), strict=True)))
+    return columns, counted

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import DeviceHits, Outbox, Pattern, check_scan
+from raybeam import DeviceHits, Outbox, Pattern, check_scan, sent
 
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
@@ -42,7 +42,7 @@ class DeviceReturns:
     specs: list[ScanSpec]
     counts: NDArray[np.int64]  # of each scan
     hits: NDArray[np.int64]  # of each scan, kept or not
-    tally: NDArray[np.int64]
+    counted: tuple[NDArray[np.int64], NDArray[np.int64]]  # counters, and their hits
     columns: dict[str, NDArray[Any]]
 
     def __len__(self) -> int:
@@ -101,11 +101,14 @@ class DeviceColumns:
             t_max=sensor.max_range_m, keep_every=every, groups=groups, tally=True,
         )  # fmt: skip
         making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
-        hits, tally = self._world.caster.visit(scan, making.make, self._world.counters)
-        assert tally is not None
-        return DeviceReturns(survey, specs, -(-hits // every), hits, tally, making.done())
+        try:
+            hits, counted = self._world.caster.visit(scan, making.make, self._world.counters)
+        finally:  # else the device would write to memory that goes back to the pool
+            columns = making.done()
+        assert counted is not None
+        return DeviceReturns(survey, specs, -(-hits // every), hits, counted, columns)
 
-    def sent(self, cupy: Any) -> tuple[Any, ...]:
+    def tables(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""
         if self._sent is None:
             surfaces, materials = self._surfaces, self._surfaces.materials
@@ -116,7 +119,7 @@ class DeviceColumns:
                 bodies, surfaces.owners, normals, turns, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
-            self._sent = tuple(map(cupy.asarray, tables))
+            self._sent = tuple(sent(cupy, table) for table in tables)
         return self._sent
 
 
@@ -157,7 +160,7 @@ class _Making:
         """Send what the kernel reads besides hits."""
         maker, specs = self._maker, self._specs
         survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, turns, reflectance, retro, classes = maker.sent(cupy)
+        bodies, owners, normals, turns, reflectance, retro, classes = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         outbox = Outbox(cupy)
         given = (

@@ -57,9 +57,11 @@ class BatchReturns:
         return self.found.hits
 
     @property
-    def tally(self) -> NDArray[np.int64]:
-        """Returns of each counter of the scene, kept or not."""
-        return np.asarray(self.found.tally)
+    def counted(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Counters of the scene with returns, kept or not, and their numbers: (k,) each."""
+        tally = np.asarray(self.found.tally)
+        counters = np.flatnonzero(tally)
+        return counters, tally[counters]
 
     def column(self, column: Column) -> NDArray[Any]:
         """Values of a column."""
@@ -281,14 +283,17 @@ def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
         column.name: _joined([returns.column(column) for returns in found])
         for column in found[0].survey.stored_columns
     }
-    tally = np.sum([returns.tally for returns in found], axis=0)
-    triangles = np.flatnonzero(tally)
+    triangles, hits = found[0].counted
+    for returns in found[1:]:
+        both = np.concatenate([triangles, returns.counted[0]])
+        triangles, row = np.unique(both, return_inverse=True)
+        hits = np.bincount(row, np.concatenate([hits, returns.counted[1]]))  # exact below 2**53
     return PartColumns(
         found[0].specs[0].scan,
         _joined([returns.counts for returns in found]),
         columns,
         triangles.astype(np.int32),
-        tally[triangles].astype(np.int64),
+        hits.astype(np.int64),
     )
 
 
