@@ -160,7 +160,7 @@ class CudaBackend(Backend):
             return groups.hits, self._counted(counting[2]) if scan.tally else None
 
     def _counted(self, tally: Any) -> Counted:
-        """Copy what was counted to the host: a tally has a row for each triangle, most of them 0."""
+        """Copy to the host what was counted: most rows of a tally are 0."""
         rows = self._cupy.flatnonzero(tally)
         return rows.get(), tally[rows].get()
 

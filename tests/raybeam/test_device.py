@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 from tests.raybeam.test_scan import case_of
 
 from raybeam import BackendUnavailable, Instance, Mesh, Pattern, RayCaster, check_scan
@@ -74,3 +78,10 @@ def test_other_backends_have_no_device(shapes):
     assert not caster.on_device
     with pytest.raises(BackendUnavailable, match="use scan"):
         caster.visit(scan_of(), print)
+
+
+def test_the_example_of_the_page(played_cuda, capsys):  # noqa: F811
+    page = Path(__file__).parents[2].joinpath("docs/how-to/gpus.md").read_text("utf-8")
+    [code] = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+    exec(code, {})
+    assert capsys.readouterr().out.splitlines() == re.findall(r"print\(.*\)  # (.*)", code)
