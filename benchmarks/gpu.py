@@ -217,7 +217,7 @@ def main(arguments: list[str] | None = None) -> int:
 
     for name in chosen.only:
         left = end - time.monotonic()
-        if left < 5:
+        if left < 30:
             keep(name, {"left out": "no time was left"})
         elif chosen.in_process:
             for rows in measured(name, QUICK if chosen.quick else Sizes(), chosen.folder):

@@ -120,6 +120,10 @@ def columns(here: Here) -> Rows:
         row = timed(rig, rays, 3 * sizes.seconds)
         row["bus_share"] = row["mpoints_s"] * row["bytes_a_point"] / 1e3 / bus
         yield name, row
+    engine: Any = rig._world.caster._engine
+    for chunk in (1 << 16, 1 << 18):  # copies of a chunk run while the next is cast
+        with patch.object(engine, "chunk", chunk):
+            yield f"chunks of {chunk:,} rays", timed(rig, sizes.batch, sizes.seconds)
     with watched(here.cupy, rig) as split:
         count = 10
         made, start = batches(rig, sizes.batch), time.perf_counter()
@@ -189,7 +193,12 @@ def _written(here: Here, rig: Rig, storage: Storage, threads: int) -> dict[str, 
 
 
 def sharing(here: Here) -> Rows:
-    """Points a second into host memory by one process, and by two that share the device."""
+    """Points a second into host memory: two threads, one process, two that share the device."""
+    rig = Rig(city(here.sizes.cities[-1]), survey(here.sizes), "cuda")
+    with ThreadPoolExecutor(2) as pool:
+        both = [pool.submit(timed, rig, here.sizes.batch, here.sizes.seconds) for _ in range(2)]
+        yield "2 threads", {"mpoints_s": sum(found.result()["mpoints_s"] for found in both)}
+    del rig
     context, totals = multiprocessing.get_context(START), []
     for count in (1, 2):
         barrier, out = context.Barrier(count), context.Queue()

@@ -7,6 +7,7 @@ can make, sub-rays, noise, actors or haze takes the hits to the host instead.
 from __future__ import annotations
 
 import importlib.resources
+from copy import copy
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -69,6 +70,13 @@ class DeviceColumns:
         self._world, self.survey, self._surfaces = world, survey, surfaces
         self.wanted = [column for column in _MADE if column in survey.stored_columns]
         self._sent: tuple[Any, ...] | None = None
+        self._turns: Any = None
+
+    def moved(self, surfaces: Surfaces) -> DeviceColumns:
+        """Return the same after instances have moved; what has not changed stays on the device."""
+        made = copy(self)
+        made._surfaces, made._turns = surfaces, None
+        return made
 
     @staticmethod
     def can_make(world: World, scene: Scene, survey: Survey) -> bool:
@@ -114,13 +122,14 @@ class DeviceColumns:
             surfaces, materials = self._surfaces, self._surfaces.materials
             shines = any(column.name in _ENERGIES for column in self.wanted)
             normals = surfaces.unit_normals if shines else np.zeros((3, 1), np.float32)
-            bodies, turns = surfaces.bodies()
             tables = (
-                bodies, surfaces.owners, normals, turns, materials.reflectance,
+                surfaces.bodies()[0], surfaces.owners, normals, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
             self._sent = tuple(sent(cupy, table) for table in tables)
-        return self._sent
+        if self._turns is None:
+            self._turns = sent(cupy, self._surfaces.bodies()[1])
+        return *self._sent, self._turns
 
 
 class _Making:
@@ -160,7 +169,7 @@ class _Making:
         """Send what the kernel reads besides hits."""
         maker, specs = self._maker, self._specs
         survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, turns, reflectance, retro, classes = maker.tables(cupy)
+        bodies, owners, normals, reflectance, retro, classes, turns = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         outbox = Outbox(cupy)
         given = (

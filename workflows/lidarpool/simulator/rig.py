@@ -51,6 +51,7 @@ class Rig:
         self._surfaces = Surfaces(scene, tuple(survey.materials))
         options = {"backend": backend, "threads": threads, "device": device}
         self._world = World(scene, self._surfaces, **options)
+        self._device: DeviceColumns | None = None
         self._see()
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
@@ -99,10 +100,12 @@ class Rig:
 
     def _see(self) -> None:
         """Make what depends on where the surfaces are."""
-        given = self._world, self.survey, self._surfaces
         self._echoes = EchoCaster(self._world, self.scene, self.survey, self._surfaces)
         able = self._echoes.plain and DeviceColumns.can_make(self._world, self.scene, self.survey)
-        self._device = DeviceColumns(*given) if able else None
+        if self._device is not None:
+            self._device = self._device.moved(self._surfaces)
+        elif able:
+            self._device = DeviceColumns(self._world, self.survey, self._surfaces)
 
     @property
     def backend(self) -> str:
