@@ -2,7 +2,7 @@
 
 from .backend import BackendUnavailable
 from .caster import RayCaster
-from .device import DeviceHits, Outbox, sent
+from .device import DeviceHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
 from .opacity import Opacity
@@ -27,5 +27,4 @@ __all__ = [
     "available_backends",
     "backend_build",
     "check_scan",
-    "sent",
 ]

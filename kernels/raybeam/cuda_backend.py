@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .device import DeviceHits, sent
+from .device import DeviceHits, to_device
 from .hits import Counted, Part, ScanReturns, joined
 from .instances import Scene
 from .layout import lay_out, lay_out_places
@@ -82,8 +82,8 @@ class CudaBackend(Backend):
             masks = made.masks or Masks(*NO_MASKS)
             tables = (made.nodes, made.triangles, made.corners, made.faces)
             given = (*tables, masks.uv, masks.mask, masks.records)
-            self._meshes = tuple(sent(cupy, table) for table in given)
-            nothing = (sent(cupy, np.zeros(2, np.int64)), np.int32(0))
+            self._meshes = tuple(to_device(cupy, table) for table in given)
+            nothing = (to_device(cupy, np.zeros(2, np.int64)), np.int32(0))
             self._uncounted = (*nothing, cupy.zeros(1, np.int64))
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
@@ -100,7 +100,7 @@ class CudaBackend(Backend):
                 self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
             )
             given = (made.frame, made.top, made.instances)
-            self._places = tuple(sent(self._cupy, table) for table in given)
+            self._places = tuple(to_device(self._cupy, table) for table in given)
 
     @staticmethod
     def _library() -> Any:
@@ -152,7 +152,7 @@ class CudaBackend(Backend):
                 faces = np.diff(scene.first_face)[scene.mesh]
                 most = int((rows[:, 0] + rows[:, 1] * (faces - 1)).max())
                 tally = self._cupy.zeros(most + 1, np.int64)
-                counting = sent(self._cupy, rows), np.int32(1), tally
+                counting = to_device(self._cupy, rows), np.int32(1), tally
             for start, n, rays in self._made(scan):
                 found = self._cast("cast_pattern", n, rays)
                 kept = self._packed(found, start, groups, unit.scale, counting)
@@ -208,7 +208,7 @@ class CudaBackend(Backend):
             given = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
             kept = self._patterns[pattern] = tuple(
-                sent(self._cupy, table.T) for table in given if table is not None
+                to_device(self._cupy, table.T) for table in given if table is not None
             )
         return kept
 

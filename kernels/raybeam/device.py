@@ -51,7 +51,7 @@ class DeviceHits:
         return self.ray.get(), self.distance.get(), self.triangle.get(), self.instance.get()
 
 
-def sent(cupy: Any, array: NDArray[Any]) -> Any:
+def to_device(cupy: Any, array: NDArray[Any]) -> Any:
     """Copy an array to the current device, and wait for that: any stream may read it then.
 
     A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`

@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import DeviceHits, Outbox, Pattern, check_scan, sent
+from raybeam import DeviceHits, Outbox, Pattern, check_scan
+from raybeam.device import to_device
 
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
@@ -126,9 +127,9 @@ class DeviceColumns:
                 surfaces.bodies()[0], surfaces.owners, normals, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
-            self._sent = tuple(sent(cupy, table) for table in tables)
+            self._sent = tuple(to_device(cupy, table) for table in tables)
         if self._turns is None:
-            self._turns = sent(cupy, self._surfaces.bodies()[1])
+            self._turns = to_device(cupy, self._surfaces.bodies()[1])
         return *self._sent, self._turns
 
 
