@@ -45,6 +45,7 @@ SECTIONS = {
     "sharing": ("gpu_points", 60),
     "run": ("gpu_points", 90),
     "peers": ("gpu_warp", 60),
+    "mujoco": ("gpu_warp", 60),
     "large": ("gpu_rays", 120),
 }
 
@@ -71,6 +72,8 @@ ROWS = (
      ("different", "leaks/edges and corners/escaped")),
     ("NVIDIA Warp's mesh query at best, city of 10⁵, 10⁶, in order, Gray/s", 2,
      [f"peers/{city}/coherent" for city in _CITIES]),
+    ("MuJoCo-LiDAR's Warp backend; raybeam, poses to distances on the host, city of 10⁵, Gray/s", 2,
+     ("mujoco/MuJoCo-LiDAR/grays_s", "mujoco/raybeam/grays_s")),
     ("points with columns in host memory: plain survey, every fifth, ten actors, million/s", 0,
      [f"columns/{name}/mpoints_s" for name in ("plain", "every fifth point", "ten actors")]),
     ("bytes of a point over the bus; share of the bus", 2,

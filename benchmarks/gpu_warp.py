@@ -1,4 +1,4 @@
-"""Section of the device's benchmark: the same rays cast by NVIDIA Warp's mesh query."""
+"""Sections of the device's benchmark: the same rays cast by NVIDIA Warp, and by MuJoCo-LiDAR."""
 
 from __future__ import annotations
 
@@ -9,10 +9,13 @@ from typing import Any
 import numpy as np
 import warp
 
-from .gpu_clock import Here
-from .gpu_rays import MIDDLE, Rows, name_of
+from raybeam import RayCaster
+
+from .gpu_clock import Here, wall_milliseconds
+from .gpu_rays import MIDDLE, Rows, name_of, revolutions
 from .gpu_scenes import Float, city, revolution
 from .raycast_warp import first_hits
+from .sensors_peers import mujoco_lidar_caster
 
 # (constructor, most triangles for which it is tried): the one on the CPU takes minutes at 1e7.
 _BUILDERS = (("lbvh", None), ("cubql", None), ("sah", 2_000_000))
@@ -44,6 +47,22 @@ def peers(here: Here, where: str = "cuda:0") -> Rows:
                 for name, rays in directions.items():
                     row[name] = _cast(mesh, rays, where, here.sizes.seconds / 3)
                 yield f"{name_of(count)}, {builder}, leaves of {size}", row
+
+
+def mujoco(here: Here, where: str = "cuda:0") -> Rows:
+    """Rates of MuJoCo-LiDAR's Warp backend and ours, from poses to distances on the host."""
+    vertices, faces = city(here.sizes.cities[0])
+    once = revolution(here.sizes.rays)
+    scan = revolutions(here, once)
+    origins, rays = scan.poses.positions, np.tile(once, (here.sizes.poses, 1))
+    job = {"vertices": vertices, "faces": faces, "origins": origins, "directions": rays}
+    theirs = mujoco_lidar_caster(job, "warp", where)
+    ours = RayCaster(vertices, faces, backend="cuda")
+    casts = {"MuJoCo-LiDAR": theirs, "raybeam": lambda: int(ours._engine.scan(scan).hits.sum())}
+    for name, cast in casts.items():
+        hits = cast()
+        took = wall_milliseconds(here, cast)
+        yield name, {"hits": hits / len(rays), "grays_s": len(rays) / took["ms"] / 1e6, **took}
 
 
 def _cast(mesh: Any, directions: Float, where: str, seconds: float) -> dict[str, float]:

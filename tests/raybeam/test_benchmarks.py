@@ -50,7 +50,7 @@ def results_of(tmp_path, *options):
 @pytest.mark.slow
 def test_all_that_the_device_is_measured_at(played_cuda, tmp_path, capsys, monkeypatch):  # noqa: F811
     monkeypatch.setattr(gpu_points, "START", "fork")
-    names = [name for name in gpu.SECTIONS if name not in ("run", "peers")]
+    names = [name for name in gpu.SECTIONS if name not in ("run", "peers", "mujoco")]
     code, found = results_of(tmp_path, "--in-process", "--only", *names)
     said = capsys.readouterr()
     assert code == 0, said
