@@ -4,10 +4,10 @@ From the repository's root, with NumPy and CuPy, the parts of the project on the
 
     PYTHONPATH=kernels:scheduler:workflows python -m benchmarks.gpu --json gpu.json
 
-Points need pydantic, PyYAML, Pillow and mapbox-earcut besides, a survey all that lidarpool needs,
-peers warp-lang; what cannot be imported is left out and named. Each section is a process of its
-own, with a limit of time: one that fails, even by ending the process, leaves the others. The file
-is written after each. At the end comes the table of docs/performance.md. Times are medians.
+Points need lidarpool's dependencies besides, but not Open3D, trimesh or Matplotlib; peers need
+warp-lang and mujoco-lidar. What cannot be imported is left out and named. Each section is a process
+of its own, with a limit of time: one that fails, even by ending the process, leaves the others. The
+file is written after each. At the end comes the table of docs/performance.md. Times are medians.
 """
 
 from __future__ import annotations
