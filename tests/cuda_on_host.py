@@ -93,11 +93,24 @@ KINDS = {
 }  # fmt: skip
 
 
-def pointed(argument):
+# {what a kernel declares: what it may be given}
+DECLARED = {
+    "int": np.int32, "Count": np.int64, "double": np.float64, "float": np.float32,
+    "unsigned int": np.uint32, "unsigned char": np.uint8, "unsigned short": np.uint16,
+    "unsigned long long": np.int64, "float4": np.float32,
+}  # fmt: skip
+
+
+def pointed(argument, declared):
     """A kernel's argument, as something that `ctypes.byref` can point to."""
-    if isinstance(argument, np.ndarray):
+    kind, pointer = re.fullmatch(
+        r"(?:const )?([\w ]+?)(\*?) ?(?:__restrict__ )?\w+", declared
+    ).groups()
+    if pointer:
         assert argument.flags.c_contiguous
+        assert argument.dtype == DECLARED[kind] or not argument.size, declared
         return ctypes.c_void_p(argument.ctypes.data)
+    assert type(argument) is DECLARED[kind], declared
     return KINDS[type(argument)](argument)
 
 
@@ -112,6 +125,10 @@ class Kernels:
         # Libraries are shared by scenes of all depths.
         same = (f"-DSTACK={STACK}" if "STACK" in option else option for option in options)
         self.library = self.compile_for(code, tuple(same))
+        self.declared = {
+            name: [" ".join(words.split()) for words in given.split(",")]
+            for name, given in re.findall(r"^KERNEL (\w+)\((.*?)\)\n", code, re.M | re.S)
+        }
 
     def compile(self):
         pass
@@ -120,7 +137,7 @@ class Kernels:
         def launch(grid, block, arguments):
             assert block == (128,)
             assert getattr(self.library, f"parameters_{name}")() == len(arguments)
-            values = [pointed(argument) for argument in arguments]
+            values = [*map(pointed, arguments, self.declared[name])]
             pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(v) for v in values))
             getattr(self.library, f"run_{name}")(ctypes.c_uint(grid[0]), pointers)
 
