@@ -34,7 +34,7 @@ class Cart:
 
 
 def cast_between(rig, survey, cuts):
-    """Columns as bytes, and hits of each triangle, of scans that are cast from cut to cut."""
+    """Columns as bytes, and {counter: hits}, of scans that are cast from cut to cut."""
     batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
     columns = {
         column.name: np.concatenate([batch.column(column) for batch in batches]).tobytes()

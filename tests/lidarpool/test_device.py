@@ -113,6 +113,19 @@ def test_columns_of_instances(scene, name, scenes, backend):
     same(scenes[scene], survey, backend, (0, survey.scan_count))
 
 
+@pytest.mark.parametrize("scene", ["instances", "both"])
+def test_columns_after_instances_have_moved(scene, scenes, backend):
+    survey = replace(MADE["beams with offsets"], materials=MATERIALS)
+    rigs = [Rig(scenes[scene], survey, name) for name in (backend, "numpy")]
+    cast_between(rigs[0], survey, (0, 1))  # its tables are on the device
+    owner = int(scenes[scene].instances.owner[0])
+    for yaw in (40, 80):
+        rigs = [rig.moved(owner, Pose((1.0, 2.0, 0.1), yaw)) for rig in rigs]
+        got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
+        assert got == want
+    assert isinstance(next(rigs[0].cast(0, 1)), DeviceReturns)
+
+
 def test_a_survey_that_hits_nothing(scenes, backend):
     survey = replace(MADE["few columns"], trajectory=Stations((Pose((0, 0, 500)),)), poses=())
     same(scenes["plain"], survey, backend, (0, survey.scan_count))

@@ -9,6 +9,7 @@ its own.
 from __future__ import annotations
 
 import importlib.resources
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import DeviceHits, Outbox, Pattern, check_scan
+from raybeam.device import to_device
 
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
@@ -101,9 +103,16 @@ class DeviceColumns:
         self.energies = [column for column in self.made if column.name in _ENERGIES]
         # Whether NumPy needs hits on actors.
         self.some_hits = bool(scene.actors and self.energies)
-        self.bodies, self._turns = surfaces.bodies()
+        self.bodies, _ = surfaces.bodies()
         self._counters = world.counters()
         self._sent: tuple[Any, ...] | None = None
+        self._turns: Any = None
+
+    def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
+        """Return the same after instances have moved; what has not changed stays on the device."""
+        made = copy(self)
+        made._scene, made._surfaces, made._turns = scene, surfaces, None
+        return made
 
     def returns(
         self,
@@ -124,9 +133,11 @@ class DeviceColumns:
         if others is not None:  # rows of the actors' body
             others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
         making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
-        hits, tally = self._world.caster.visit(scan, making.make, self._counters, others)
+        try:
+            hits, tally = self._world.caster.visit(scan, making.make, self._counters, others)
+        finally:  # else the device would write to memory that goes back to the pool
+            columns, (ray, distance, triangle) = making.done()
         assert tally is not None
-        columns, (ray, distance, triangle) = making.done()
         one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
         found = Echoes(
             ray, distance, triangle, hits, None, none,
@@ -139,22 +150,21 @@ class DeviceColumns:
             for column in self.energies:
                 columns[column.name][making.rows] = column.make(returns)
         counts, on_host = -(-hits // every), returns if self.all_hits else None
-        met = np.flatnonzero(tally)
-        return DeviceReturns(
-            self._scene, survey, specs, counts, hits, (met, tally[met]), columns, on_host
-        )
+        return DeviceReturns(self._scene, survey, specs, counts, hits, tally, columns, on_host)
 
-    def sent(self, cupy: Any) -> tuple[Any, ...]:
+    def tables(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""
         if self._sent is None:
             surfaces, materials = self._surfaces, self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((3, 1), np.float32)
             tables = (
-                self.bodies, surfaces.owners, normals, self._turns, materials.reflectance,
+                self.bodies, surfaces.owners, normals, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
-            self._sent = tuple(map(cupy.asarray, tables))
-        return self._sent
+            self._sent = tuple(to_device(cupy, table) for table in tables)
+        if self._turns is None:
+            self._turns = to_device(cupy, self._surfaces.bodies()[1])
+        return *self._sent, self._turns
 
 
 class _Making:
@@ -213,7 +223,7 @@ class _Making:
         """Send what the kernel reads besides hits."""
         maker, specs = self._maker, self._specs
         survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, turns, *materials, classes = maker.sent(cupy)
+        bodies, owners, normals, reflectance, retro, classes, turns = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         outbox = Outbox(cupy)
         given = (
@@ -222,7 +232,7 @@ class _Making:
             cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
             np.int32(sensor.channels), np.int64(specs[0].start_ns),
             bodies, owners, normals, np.int64(normals.shape[1]), turns,
-            *materials, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
+            reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
             np.float64(NEAREST_M), classes,
         )  # fmt: skip
         out = {column: outbox.room(self._most, column.dtype) for column in maker.made}

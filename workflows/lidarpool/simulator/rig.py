@@ -61,6 +61,7 @@ class Rig:
         self._surfaces = Surfaces(scene, tuple(survey.materials))
         options = {"backend": backend, "threads": threads, "device": device}
         self._world = World(scene, self._surfaces, **options)
+        self._device: DeviceColumns | None = None
         self._see()
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
@@ -109,8 +110,10 @@ class Rig:
         """Make what depends on where the surfaces are."""
         given = self._world, self.scene, self.survey, self._surfaces
         self._echoes = EchoCaster(*given)
-        able = self._echoes.plain and self._world.caster.on_device
-        self._device = DeviceColumns(*given) if able else None
+        if self._device is not None:
+            self._device = self._device.moved(self.scene, self._surfaces)
+        elif self._echoes.plain and self._world.caster.on_device:
+            self._device = DeviceColumns(*given)
 
     @property
     def backend(self) -> str:
