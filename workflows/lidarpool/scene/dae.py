@@ -31,7 +31,7 @@ Int = NDArray[np.int64]
 _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
-def read_dae(data: bytes, path: Path) -> Content:
+def read_dae(data: bytes, path: Path, colours: bool = False) -> Content:
     """Read the visual scene of a file."""
     root = xml_root(data)
     for element in root.iter():

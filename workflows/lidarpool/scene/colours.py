@@ -1,0 +1,234 @@
+"""Colours of triangles: images, plain colours, and colours of corners."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..base.errors import LidarpoolError
+from ..base.words import counted
+
+Bytes = NDArray[np.uint8]
+
+# What has no colour is grey, of half of the light, as the default reflectance is.
+GREY = np.full((1, 1, 3), 188, np.uint8)
+WHITE = np.full((1, 1, 3), 255, np.uint8)
+WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear light, ITU-R BT.709
+BLOCK_FACES = 1 << 16
+
+_byte = np.arange(256) / 255
+# {sRGB byte: linear light}, IEC 61966-2-1
+LINEAR = np.where(_byte <= 0.04045, _byte / 12.92, ((_byte + 0.055) / 1.055) ** 2.4)
+_EDGES = (LINEAR[:-1] + LINEAR[1:]) / 2
+
+
+def as_srgb(linear: ArrayLike) -> Bytes:
+    """Nearest sRGB bytes of linear light, 0 to 1, of any shape."""
+    return np.searchsorted(_EDGES, np.asarray(linear, np.float64)).astype(np.uint8)
+
+
+def as_bytes(shares: ArrayLike) -> Bytes:
+    """Bytes of shares of sRGB, 0 to 1, of any shape; NaN is 0."""
+    known = np.nan_to_num(np.asarray(shares, np.float64))
+    return np.rint(255 * np.clip(known, 0, 1)).astype(np.uint8)
+
+
+@dataclass(frozen=True, eq=False)
+class Colours:
+    """Colours of the faces of a mesh, in sRGB as files have them.
+
+    Attributes
+    ----------
+    images
+        uint8 (h, w, 3) each. One of a single element is a plain colour.
+    image
+        int32 (f,): which of them each face has.
+    uv
+        float32 (f, 3, 2): texture coordinates of the corners, see `Cutout`; None if there are only
+        plain colours.
+    corners
+        uint8 (f, 3, 3): colours of the corners, by which those of the images are multiplied in
+        linear light; None for white.
+    """
+
+    images: tuple[Bytes, ...]
+    image: NDArray[np.int32]
+    uv: NDArray[np.float32] | None = None
+    corners: Bytes | None = None
+
+    def __len__(self) -> int:
+        return len(self.image)
+
+    @classmethod
+    def plain(cls, colour: Bytes, faces: int) -> Colours:
+        """One colour, (1, 1, 3), for all faces."""
+        return cls((colour,), np.zeros(faces, np.int32))
+
+    @classmethod
+    def of_faces(cls, colours: Bytes) -> Colours:
+        """Give each face a colour of its own, (f, 3)."""
+        return replace(cls.plain(WHITE, len(colours)), corners=colours[:, None].repeat(3, axis=1))
+
+    def take(self, rows: NDArray[np.integer[Any]] | slice) -> Colours:
+        """Select faces."""
+        uv = None if self.uv is None else self.uv[rows]
+        corners = None if self.corners is None else self.corners[rows]
+        return Colours(self.images, self.image[rows], uv, corners)
+
+    def mirrored(self) -> Colours:
+        """Reverse the order of the corners."""
+        uv = None if self.uv is None else self.uv[:, ::-1]
+        corners = None if self.corners is None else self.corners[:, ::-1]
+        return replace(self, uv=uv, corners=corners)
+
+    def check(self, name: str, faces: int) -> None:
+        """Check the shapes for so many faces of an object; LidarpoolError if they are wrong."""
+        shapes = [(self.image, (faces,)), (self.uv, (faces, 3, 2)), (self.corners, (faces, 3, 3))]
+        well = all(one is None or one.shape == shape for one, shape in shapes)
+        well &= all(one.dtype == np.uint8 and one.shape[2:] == (3,) for one in self.images)
+        well &= all(one.size == 3 or (one.size > 3 and self.uv is not None) for one in self.images)
+        if not well or not _within(self.image, len(self.images)):
+            raise LidarpoolError(
+                f"The colours of {name!r} do not fit its {faces} faces: images are uint8 "
+                "(h, w, 3), image (f,), uv (f, 3, 2) and corners (f, 3, 3)."
+            )
+
+    def means(self) -> Bytes:
+        """Mean colour of each face, in linear light, of four places on it: (f, 3)."""
+        lookup, out = Lookup(self), np.empty((len(self), 3), np.uint8)
+        for begin in range(0, len(self), BLOCK_FACES):
+            rows = np.arange(begin, min(begin + BLOCK_FACES, len(self)))
+            total = sum(
+                LINEAR[unpacked(lookup.at(rows, np.full(len(rows), b), np.full(len(rows), c)))]
+                for b, c in ((1 / 3, 1 / 3), (1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3))
+            )
+            out[rows] = as_srgb(total / 4)
+        return out
+
+
+def _within(numbers: NDArray[np.int32], count: int) -> bool:
+    return not len(numbers) or 0 <= numbers.min() <= numbers.max() < count
+
+
+class Lookup:
+    """Colours by the number of a face and a place on it; images are kept as one table."""
+
+    def __init__(self, colours: Colours) -> None:
+        self._image, self._corners = colours.image, colours.corners
+        images = colours.images
+        self._texels = np.concatenate([packed(one.reshape(-1, 3)) for one in images])
+        sizes = np.array([one.shape[:2] for one in images], np.int64)
+        self._height, self._width = sizes.T
+        self._first = np.cumsum([0, *sizes.prod(axis=1)[:-1]])
+        self._plain = sizes.prod(axis=1) == 1
+        self._uv = None if colours.uv is None else colours.uv.reshape(-1, 6)
+
+    def flat(self, rows: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
+        """Whether faces (n,) have one colour each."""
+        if self._corners is not None:
+            return np.zeros(len(rows), np.bool_)
+        return self._plain[self._image[rows]]
+
+    def at(
+        self, rows: NDArray[np.integer[Any]], b: NDArray[np.float64], c: NDArray[np.float64]
+    ) -> NDArray[np.uint32]:
+        """Colours of faces (n,), packed; `b` and `c` (n,) are the weights of their last corners.
+
+        Of images, the nearest element counts.
+        """
+        image = self._image[rows]
+        at = self._first[image]
+        if self._uv is not None:
+            on = slice(None) if not self._plain.any() else np.flatnonzero(~self._plain[image])
+            image = image[on]
+            u0, v0, u1, v1, u2, v2 = self._uv[rows[on]].T.astype(np.float64)
+            b_on, c_on = b[on], c[on]
+            column = _element(u0 + b_on * (u1 - u0) + c_on * (u2 - u0), self._width[image])
+            row = _element(v0 + b_on * (v1 - v0) + c_on * (v2 - v0), self._height[image])
+            at[on] += row * self._width[image] + column
+        found = self._texels[at]
+        if self._corners is None:
+            return found
+        corners = LINEAR[self._corners[rows]]  # (n, 3, 3)
+        weights = np.stack([1 - b - c, b, c], axis=1)
+        tint = np.clip((weights[:, :, None] * corners).sum(axis=1), 0, 1)
+        return packed(as_srgb(LINEAR[unpacked(found)] * tint))
+
+
+def _element(place: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Which of so many elements of an image that repeats a texture coordinate is in: (n,)."""
+    within = ((place - np.floor(place)) * size).astype(np.int64)
+    return np.minimum(within, size - 1)
+
+
+def packed(colours: Bytes) -> NDArray[np.uint32]:
+    """Colours (n, 3) as one number each, red in its lowest byte."""
+    out = np.zeros((len(colours), 4), np.uint8)
+    out[:, :3] = colours
+    return out.view("<u4")[:, 0]
+
+
+def unpacked(colours: NDArray[np.uint32]) -> Bytes:
+    """Undo `packed`."""
+    return np.ascontiguousarray(colours, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
+
+
+def luminance(colours: NDArray[np.uint32]) -> NDArray[np.float64]:
+    """Luminance (n,) of packed colours in linear light, 0 to 1."""
+    red, green, blue = (
+        light[colours >> shift & 255] for light, shift in zip(_SHARES, (0, 8, 16), strict=True)
+    )
+    return np.asarray(red + green + blue)
+
+
+_SHARES = WEIGHTS[:, None] * LINEAR
+
+
+def joined(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | None:
+    """Colours of meshes of so many faces, one after the other; grey where there are none."""
+    if not any(part is not None for part in parts):
+        return None
+    whole = [
+        Colours.plain(GREY, size) if part is None else part
+        for part, size in zip(parts, sizes, strict=True)
+    ]
+    numbers: dict[int, int] = {}  # {id of an image: its number}
+    images: list[Bytes] = []
+    image = []
+    for part in whole:
+        for one in part.images:
+            if id(one) not in numbers:
+                numbers[id(one)] = len(images)
+                images.append(one)
+        image.append(np.array([numbers[id(one)] for one in part.images], np.int32)[part.image])
+    uv = corners = None
+    if any(part.uv is not None for part in whole):
+        uv = np.concatenate(
+            [np.zeros((len(p), 3, 2), np.float32) if p.uv is None else p.uv for p in whole]
+        )
+    if any(part.corners is not None for part in whole):
+        corners = np.concatenate(
+            [np.full((len(p), 3, 3), 255, np.uint8) if p.corners is None else p.corners
+             for p in whole]
+        )  # fmt: skip
+    return Colours(tuple(images), np.concatenate(image), uv, corners)
+
+
+def told(parts: Iterable[Colours | None]) -> str:
+    """Say what the colours of meshes are: «2 textures, 1 plain colour, colours of vertices»."""
+    there = [part for part in parts if part is not None]
+    kinds = {
+        id(part.images[number]): "texture" if part.images[number].size > 3 else "plain colour"
+        for part in there
+        for number in np.unique(part.image)
+        if part.images[number] is not WHITE
+    }
+    counts = Counter(kinds.values())
+    words = [counted(counts[kind], kind) for kind in ("texture", "plain colour") if counts[kind]]
+    words += ["colours of vertices"] * any(part.corners is not None for part in there)
+    return ", ".join(words) or "no colours"
