@@ -96,7 +96,7 @@ class Column:
                 f"for each of the {len(returns)} points."
             )
         wanted = np.dtype(self.dtype)
-        if wanted.kind in "iu" and len(values):
+        if wanted.kind in "iu" and len(values) and values.dtype != wanted:
             limits = np.iinfo(wanted)
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 raise LidarpoolError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -100,15 +100,19 @@ class Colours:
 
     def means(self) -> Bytes:
         """Mean colour of each face, in linear light, of four places on it: (f, 3)."""
-        lookup, out = Lookup(self), np.empty((len(self), 3), np.uint8)
+        out = np.empty((len(self), 3), np.uint8)
         for begin in range(0, len(self), BLOCK_FACES):
-            rows = np.arange(begin, min(begin + BLOCK_FACES, len(self)))
-            total = sum(
-                LINEAR[unpacked(lookup.at(rows, np.full(len(rows), b), np.full(len(rows), c)))]
+            some = self.take(slice(begin, begin + BLOCK_FACES))
+            lookup, rows = Lookup(some, [_UNIT.repeat(len(some), axis=0)]), np.arange(len(some))
+            light = [
+                LINEAR[unpacked(lookup.at(rows, np.tile([b, c, 0.0], (len(some), 1))))]
                 for b, c in ((1 / 3, 1 / 3), (1 / 6, 1 / 6), (2 / 3, 1 / 6), (1 / 6, 2 / 3))
-            )
-            out[rows] = as_srgb(total / 4)
+            ]
+            out[begin : begin + BLOCK_FACES] = as_srgb(np.mean(light, axis=0))
         return out
+
+
+_UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
 def _within(numbers: NDArray[np.int32], count: int) -> bool:
@@ -116,54 +120,117 @@ def _within(numbers: NDArray[np.int32], count: int) -> bool:
 
 
 class Lookup:
-    """Colours by the number of a face and a place on it; images are kept as one table."""
+    """Colours by the number of a face and a point on it; images are kept as one table.
 
-    def __init__(self, colours: Colours) -> None:
-        self._image, self._corners = colours.image, colours.corners
-        images = colours.images
+    Parameters
+    ----------
+    colours
+        Of f faces.
+    corners
+        (k, 3, 3) each: corners of the faces, one block after the other.
+    """
+
+    def __init__(self, colours: Colours, corners: Iterable[NDArray[np.float64]]) -> None:
+        images, tints = colours.images, colours.corners
+        self._image = colours.image
         self._texels = np.concatenate([packed(one.reshape(-1, 3)) for one in images])
         sizes = np.array([one.shape[:2] for one in images], np.int64)
         self._height, self._width = sizes.T
-        self._first = np.cumsum([0, *sizes.prod(axis=1)[:-1]])
-        self._plain = sizes.prod(axis=1) == 1
-        self._uv = None if colours.uv is None else colours.uv.reshape(-1, 6)
+        counts = sizes.prod(axis=1)
+        self._first = np.cumsum([0, *counts[:-1]])
+        # Faces with images have texture coordinates, and those with colours at their corners
+        # have these, as planes of the position.
+        own = (counts > 1)[self._image]
+        tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
+        textures, lights, at = [np.zeros((0, 8))], [np.zeros((0, 12))], 0
+        for block in corners:
+            rows = slice(at, at + len(block))
+            if colours.uv is not None:
+                uv = colours.uv[rows][own[rows]]
+                textures.append(_planes(block[own[rows]], uv.astype(np.float64)))
+            if tints is not None:
+                light = LINEAR[tints[rows][tinted[rows]]]
+                lights.append(_planes(block[tinted[rows]], light))
+            at += len(block)
+        self._texture = _Planes.of(own, textures)
+        self._light = _Planes.of(tinted, lights)
 
-    def flat(self, rows: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
-        """Whether faces (n,) have one colour each."""
-        if self._corners is not None:
-            return np.zeros(len(rows), np.bool_)
-        return self._plain[self._image[rows]]
+    def at(self, rows: NDArray[np.integer[Any]], points: NDArray[np.float64]) -> NDArray[np.uint32]:
+        """Colours of points (n, 3) on faces (n,), packed; of images the nearest element."""
+        image = self._image.take(rows)
+        at = self._first.take(image)
+        place = np.ascontiguousarray(points.T)
+        if self._texture is not None:
+            on, (u, v) = self._texture.at(rows, place)
+            image = image[on]
+            width = self._width.take(image)
+            row = _element(v, self._height.take(image))
+            at[on] += row * width + _element(u, width)
+        found = self._texels.take(at)
+        if self._light is not None:
+            on, light = self._light.at(rows, place)
+            tinted = LINEAR[unpacked(found[on])] * np.clip(light.T, 0, 1)
+            found[on] = packed(as_srgb(tinted))
+        return found
+
+
+class _Planes(NamedTuple):
+    """Values on faces that are linear in the position."""
+
+    place: NDArray[np.int32]  # (f,): row of `slopes` that each face has; -1 for none
+    slopes: NDArray[np.float64]  # (k, 4 w): of each of w values, along x, y and z, and at zero
+    everywhere: bool
+
+    @classmethod
+    def of(cls, there: NDArray[np.bool_], blocks: list[NDArray[np.float64]]) -> _Planes | None:
+        """Join blocks (k, 4 w), of the faces (f,) that have some; None if there are none."""
+        if not there.any():
+            return None
+        place = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
+        return cls(place, np.concatenate(blocks), bool(there.all()))
 
     def at(
-        self, rows: NDArray[np.integer[Any]], b: NDArray[np.float64], c: NDArray[np.float64]
-    ) -> NDArray[np.uint32]:
-        """Colours of faces (n,), packed; `b` and `c` (n,) are the weights of their last corners.
+        self, rows: NDArray[np.integer[Any]], points: NDArray[np.float64]
+    ) -> tuple[Any, NDArray[np.float64]]:
+        """Which of the faces (n,) have values, and the values at points (3, n): (w, m)."""
+        on: Any = slice(None)
+        place = self.place.take(rows)
+        if not self.everywhere:
+            on = np.flatnonzero(place >= 0)
+            place, points = place[on], points[:, on]
+        x, y, z = points
+        out = np.empty((self.slopes.shape[1] // 4, len(x)))
+        slopes = self.slopes.take(place, axis=0).T.reshape(len(out), 4, len(x))
+        for value, (a, b, c, d) in zip(out, slopes, strict=True):
+            np.multiply(a, x, out=value)
+            value += b * y
+            value += c * z
+            value += d
+        return on, out
 
-        Of images, the nearest element counts.
-        """
-        image = self._image[rows]
-        at = self._first[image]
-        if self._uv is not None:
-            on = slice(None) if not self._plain.any() else np.flatnonzero(~self._plain[image])
-            image = image[on]
-            u0, v0, u1, v1, u2, v2 = self._uv[rows[on]].T.astype(np.float64)
-            b_on, c_on = b[on], c[on]
-            column = _element(u0 + b_on * (u1 - u0) + c_on * (u2 - u0), self._width[image])
-            row = _element(v0 + b_on * (v1 - v0) + c_on * (v2 - v0), self._height[image])
-            at[on] += row * self._width[image] + column
-        found = self._texels[at]
-        if self._corners is None:
-            return found
-        corners = LINEAR[self._corners[rows]]  # (n, 3, 3)
-        weights = np.stack([1 - b - c, b, c], axis=1)
-        tint = np.clip((weights[:, :, None] * corners).sum(axis=1), 0, 1)
-        return packed(as_srgb(LINEAR[unpacked(found)] * tint))
+
+def _planes(corners: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w), see `_Planes`.
+
+    Flat triangles, which are not hit, have the value of their first corner.
+    """
+    a, b, c = corners.transpose(1, 0, 2)
+    normal = np.cross(b - a, c - a)
+    area = (normal * normal).sum(axis=1, keepdims=True)
+    scale = np.divide(1, area, out=np.zeros_like(area), where=area > 0)
+    along_b, along_c = np.cross(c - a, normal) * scale, np.cross(normal, b - a) * scale
+    out = np.empty((len(corners), values.shape[2], 4))
+    for value, (first, second, third) in enumerate(values.transpose(2, 1, 0)):
+        slope = (second - first)[:, None] * along_b + (third - first)[:, None] * along_c
+        out[:, value, :3], out[:, value, 3] = slope, first - (slope * a).sum(axis=1)
+    return out.reshape(len(corners), 4 * values.shape[2])
 
 
 def _element(place: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.int64]:
     """Which of so many elements of an image that repeats a texture coordinate is in: (n,)."""
-    within = ((place - np.floor(place)) * size).astype(np.int64)
-    return np.minimum(within, size - 1)
+    within = place - np.floor(place)
+    within *= size
+    return np.minimum(within.astype(np.int64), size - 1)
 
 
 def packed(colours: Bytes) -> NDArray[np.uint32]:
@@ -180,9 +247,7 @@ def unpacked(colours: NDArray[np.uint32]) -> Bytes:
 
 def luminance(colours: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Luminance (n,) of packed colours in linear light, 0 to 1."""
-    red, green, blue = (
-        light[colours >> shift & 255] for light, shift in zip(_SHARES, (0, 8, 16), strict=True)
-    )
+    red, green, blue = map(np.take, _SHARES, unpacked(colours).T)
     return np.asarray(red + green + blue)
 
 

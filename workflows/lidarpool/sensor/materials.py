@@ -230,7 +230,8 @@ class MaterialTable:
         shares = self.reflectance[rows]
         if luminance is not None:
             scale = self.scale[rows]
-            shares = np.where(scale > 0, np.clip(scale * luminance, DARKEST, 1.0), shares)
+            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
+            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
         return shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
 
     def goes_on(

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..columns.parts import PartColumns
+from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
@@ -239,24 +240,25 @@ class BatchReturns:
             return self.found.colour
         ways = self._poses.ways
         times = self.time if ways else np.zeros(len(self), np.int64)
-        points = self.directions * self.found.distance[:, None]
-        points += self._rays[0]
+        points = self.positions
+        if self.found.reported is not self.found.distance:
+            points = self.directions * self.found.distance[:, None] + self._rays[0]
         return self._surfaces.colours(self.found.triangle, points, times, ways)
 
     @property
     def red(self) -> NDArray[np.uint8]:
         """Red of the surface, sRGB."""
-        return (self._colours & 255).astype(np.uint8)
+        return unpacked(self._colours)[:, 0]
 
     @property
     def green(self) -> NDArray[np.uint8]:
         """Green of the surface, sRGB."""
-        return (self._colours >> 8 & 255).astype(np.uint8)
+        return unpacked(self._colours)[:, 1]
 
     @property
     def blue(self) -> NDArray[np.uint8]:
         """Blue of the surface, sRGB."""
-        return (self._colours >> 16).astype(np.uint8)
+        return unpacked(self._colours)[:, 2]
 
     @property
     def reflectivity(self) -> NDArray[np.float64]:

@@ -164,36 +164,21 @@ class Surfaces:
             if len(moving):
                 places, rotations = way.poses(0, times[moving].astype(np.float64))
                 points[moving] = into_axes(points[moving] - places, rotations)
-        x, y, z = points.T
-        place, planes = self._planes
-        p, q, r, s, t, u, v, w = planes.take(place[rows], axis=0).T
-        return self._lookup.at(rows, p * x + q * y + r * z + s, t * x + u * y + v * z + w)
+        return self._lookup.at(rows, points)
 
     @cached_property
     def _lookup(self) -> Lookup | None:
         """Colours of the triangles that are kept once; None if there are none."""
         bodies = self._bodies
         colours = joined([colours for _, _, colours in bodies], [len(f) for _, f, _ in bodies])
-        return None if colours is None else Lookup(colours)
-
-    @cached_property
-    def _planes(self) -> tuple[NDArray[np.int32], Real]:
-        """Weights of the last two corners of triangles, as planes of the position: (k, 8).
-
-        Triangles of one colour have none; `place` (f,) says where those of the others are.
-        """
-        assert self._lookup is not None
-        bodies, first = self._bodies, 0
-        place, tables = [], [np.zeros((1, 8))]
-        for vertices, faces, _ in bodies:
-            for begin in range(0, len(faces), BLOCK_FACES):
-                block = faces[begin : begin + BLOCK_FACES]
-                some = ~self._lookup.flat(np.arange(first, first + len(block)))
-                before = sum(map(len, tables))
-                place.append(np.where(some, before - 1 + np.cumsum(some), 0).astype(np.int32))
-                tables.append(_planes_of(vertices[block[some]]))
-                first += len(block)
-        return np.concatenate(place), np.concatenate(tables)
+        if colours is None:
+            return None
+        corners = (
+            vertices[faces[begin : begin + BLOCK_FACES]]
+            for vertices, faces, _ in bodies
+            for begin in range(0, len(faces), BLOCK_FACES)
+        )
+        return Lookup(colours, corners)
 
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
         """Objects of triangles (n,)."""
@@ -274,22 +259,6 @@ class Surfaces:
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
         return len(self._owners) - 1 + np.cumsum([0, *sizes[:-1]])
-
-
-def _planes_of(corners: Real) -> Real:
-    """Weights of the last two of the corners (k, 3, 3), as planes: (k, 8).
-
-    Flat triangles, which are not hit, have zeros.
-    """
-    a, b, c = corners.transpose(1, 0, 2)
-    normal = np.cross(b - a, c - a)
-    area = (normal * normal).sum(axis=1, keepdims=True)
-    scale = np.divide(1, area, out=np.zeros_like(area), where=area > 0)
-    out = np.empty((len(corners), 8))
-    for plane, slope in ((out[:, :4], (c - a, normal)), (out[:, 4:], (normal, b - a))):
-        plane[:, :3] = np.cross(*slope) * scale
-        plane[:, 3] = -(plane[:, :3] * a).sum(axis=1)
-    return out
 
 
 def _turns(transforms: Real) -> Real:
