@@ -24,6 +24,7 @@ from trimesh.visual.material import PBRMaterial
 
 from lidarpool import (
     Actor,
+    Column,
     Instance,
     LidarpoolError,
     Material,
@@ -83,7 +84,7 @@ def png(colours=PICTURE):
 
 def sweep(scene, *columns, sensor=SENSOR, pose=HERE, **options):
     """A sweep, and the colours (n, 3) of its points."""
-    names = [*COLOURS, "triangle", *columns]
+    names: list[str | Column] = [*COLOURS, "triangle", *columns]
     scanner = Scanner(scene, sensor, columns=names, precision_m=1e-6, backend="numpy", **options)
     cloud = scanner.sweep(pose)
     assert len(cloud) > 500
@@ -443,6 +444,30 @@ def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
         np.testing.assert_allclose(found, share * full, rtol=1e-5)
 
 
+def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
+    scene = Scene.from_meshes([Mesh("Ground", *hills()[:2])])
+    columns = "reflectivity", Column("cosine", "float64", "", "of incidence", "cosine")
+
+    def returned(**arguments):
+        cloud, _ = sweep(scene, *columns, materials=[Material("*", **arguments)])
+        return cloud["cosine"], cloud["reflectivity"]
+
+    cosine, matt = returned(reflectance=0.3)
+    np.testing.assert_allclose(matt, 0.3 * cosine, rtol=1e-5)
+    for roughness, metalness in ((0.2, 0.0), (0.5, 0.5), (1.0, 1.0)):
+        _, found = returned(reflectance=0.3, roughness=roughness, metalness=metalness)
+        # Cook and Torrance's D F G / (4 cos² θ), for light and receiver in one direction.
+        a, front = roughness**2, 0.04 * (1 - metalness) + 0.3 * metalness
+        d = a**2 / (np.pi * (cosine**2 * (a**2 - 1) + 1) ** 2)
+        tangent = np.sqrt(1 - cosine**2) / cosine
+        g = 1 / (1 + 2 * (np.sqrt(1 + (a * tangent) ** 2) - 1) / 2)
+        want = np.pi * cosine * d * front * g / (4 * cosine**2) + (1 - metalness) * matt
+        np.testing.assert_allclose(found, want, rtol=1e-4)
+    for wrong in ({"metalness": 0.5}, {"roughness": 0.5, "retro": True}, {"roughness": 0.0}):
+        with pytest.raises(LidarpoolError):
+            Material("*", **wrong)
+
+
 def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for arguments, why in (
         ({"material": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
@@ -459,6 +484,10 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
     assert len(table) >= 30
     assert all(0 < share < 1 for one in table.values() for share in one.shares)
     assert all(one.library and one.sample for one in table.values())
+    page = (EXAMPLES.parent / "docs" / "how-to" / "materials.md").read_text("utf-8")
+    for name, (shares, library, sample) in table.items():
+        row = f"| `{name}` | {shares[0]:.2f} | {shares[1]:.2f} | {library}: {sample} |"
+        assert row in page
 
 
 def test_a_written_scene_keeps_masks_and_loses_colours(tmp_path):

@@ -107,7 +107,7 @@ def test_colours_are_counted_by_file_where_they_are_read(check, tmp_path):
     assert "colours     road.glb: 1 texture, 2 plain colours\n" in told
     assert "colours     m.ply: no colours\n" in told
     del scenario["cloud"]
-    assert "colours" not in check("--no-plan", text=json.dumps(scenario)).out
+    assert "\ncolours" not in check("--no-plan", text=json.dumps(scenario)).out
 
 
 def test_objects_with_masks_are_named(check, tmp_path):

@@ -27,6 +27,7 @@ RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
 NEAREST_M = 1e-3  # energies do not grow below this distance
 NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
+POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
 DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
@@ -65,8 +66,8 @@ def _share_or_texture(value: Any) -> Any:
 class Material:
     """Material of objects; the last entry for an object counts.
 
-    Reflectance is that at the sensor's wavelength, in all directions. Of light that is not
-    scattered, "pass" reflects what glass reflects; with "none" it is lost.
+    Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
+    is not scattered, "pass" reflects what glass reflects; with "none" it is lost.
 
     Raises
     ------
@@ -109,6 +110,13 @@ class Material:
             examples=["asphalt, dry"],
         ),
     ] = None
+    roughness: Annotated[
+        float | None,
+        Field(ge=0.1, le=1, description="adds a gloss, as of paint or metal; by default none"),
+    ] = None
+    metalness: Annotated[
+        Share, Field(description="with roughness: 1 for metals, which scatter by their gloss alone")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
@@ -131,6 +139,11 @@ class Material:
                 )
         elif self.scale != 1:
             raise LidarpoolError("scale is a factor of colours: give reflectance texture with it.")
+
+        if self.roughness is None and self.metalness:
+            raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
+        if self.roughness is not None and (self.retro or self.transparent != "none"):
+            raise LidarpoolError("roughness is for opaque surfaces that are not retro-reflective.")
 
     def share(self, wavelength_nm: float) -> float:
         """Share of light that is scattered; of textures, that of what has no colour."""
@@ -163,6 +176,8 @@ class MaterialTable:
 
     reflectance: NDArray[np.float64]
     scale: NDArray[np.float64]  # of the luminance of colours; 0 where the reflectance is a number
+    roughness: NDArray[np.float64]  # 0 for no gloss
+    metalness: NDArray[np.float64]
     retro: NDArray[np.bool_]
     passes: NDArray[np.bool_]
     mirrors: NDArray[np.bool_]
@@ -201,6 +216,8 @@ class MaterialTable:
         return cls(
             np.array([m.share(wavelength_nm) for m in found], np.float64)[last],
             np.array(textured, np.float64)[last],
+            np.array([m.roughness or 0.0 for m in found])[last],
+            np.array([m.metalness for m in found])[last],
             np.array([m.retro for m in found], np.bool_)[last],
             np.array([m.transparent == "pass" for m in found], np.bool_)[last],
             np.array([m.transparent == "mirror" for m in found], np.bool_)[last],
@@ -232,7 +249,14 @@ class MaterialTable:
             scale = self.scale[rows]
             bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
             shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
-        return shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        if self.roughness.any():
+            on = np.flatnonzero(self.roughness[rows])
+            metal, some = self.metalness[rows[on]], shares[on]
+            front = POLISHED * (1 - metal) + some * metal
+            back[on] *= 1 - metal
+            back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
+        return back
 
     def goes_on(
         self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
@@ -240,6 +264,18 @@ class MaterialTable:
         """Share of the light that continues at glass or mirrors (n,)."""
         through = np.where(self.passes[rows], 1 - fresnel(cosine), 1.0)
         return np.asarray((1 - self.reflectance[rows]) * through)
+
+
+def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Light that facets of a rough surface mirror back to where it came from, of a white diffuser.
+
+    Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
+    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, their
+    π D G / (4 cos θ) is what is left here. Multiply it by the reflection at right angles.
+    """
+    width, square = roughness**4, cosine**2
+    spread = 1 - square * (1 - width)
+    return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 
 
 def fresnel(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
