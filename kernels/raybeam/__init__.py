@@ -2,23 +2,30 @@
 
 from .backend import BackendUnavailable
 from .caster import RayCaster
+from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
 from .opacity import Opacity
 from .pattern import Pattern
 from .poses import Motion
 from .registry import available_backends, backend_build
+from .scan import Scan, check_scan
 
 __all__ = [
     "BackendUnavailable",
+    "DeviceHits",
     "Hits",
     "Instance",
     "Mesh",
     "Motion",
     "Opacity",
+    "OtherHits",
+    "Outbox",
     "Pattern",
     "RayCaster",
+    "Scan",
     "ScanReturns",
     "available_backends",
     "backend_build",
+    "check_scan",
 ]

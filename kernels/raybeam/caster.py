@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from operator import index
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from .backend import Backend
+from .backend import Backend, BackendUnavailable
+from .cuda_backend import CudaBackend
+from .device import DeviceHits, OtherHits
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
 from .poses import Motion, Poses
 from .rays import check_rays
 from .registry import choose
-from .scan import check_scan
+from .scan import Scan, check_scan
 
 
 class RayCaster:
@@ -129,6 +131,11 @@ class RayCaster:
     def backend(self) -> str:
         """Name of the backend in use."""
         return self._engine.name
+
+    @property
+    def on_device(self) -> bool:
+        """Whether hits can stay on a CUDA device, see `visit`."""
+        return isinstance(self._engine, CudaBackend)
 
     @property
     def face_count(self) -> int:
@@ -289,3 +296,46 @@ class RayCaster:
                 motion=motion,
             )
         )
+
+    def visit(
+        self,
+        scan: Scan,
+        use: Callable[[DeviceHits], object],
+        counters: tuple[NDArray[np.int64], int] | None = None,
+        others: OtherHits | None = None,
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
+        """Cast a scan, and use its hits on the CUDA device where they are.
+
+        Parameters
+        ----------
+        scan
+            From `check_scan`, whose arguments are those of `RayCaster.scan`.
+        use
+            Called with the kept hits of some rays after the other, in ray order, on the caster's
+            device. Its arrays may be used after the call.
+        counters
+            Table and length of the scan's tally. The table is int64 (instances, 2): hits of
+            triangle t of instance i count in row ``table[i, 0] + table[i, 1] * t``. None for the
+            rows of `ScanReturns.tally`.
+        others
+            Hits that replace those of the caster that are farther. They count as an instance more
+            than there are: with a tally, the table of the counters needs a row for them.
+
+        Returns
+        -------
+        hits
+            As of `ScanReturns`.
+        tally
+            int64 (rows,); None if not requested.
+
+        Raises
+        ------
+        BackendUnavailable
+            If this caster's backend is not cuda.
+        """
+        engine = self._ready()
+        if not isinstance(engine, CudaBackend):
+            raise BackendUnavailable(
+                f"Hits of backend {self.backend!r} are on no device: use scan, or backend='cuda'."
+            )
+        return engine.visit(scan, use, counters, others)

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import importlib.resources
 import importlib.util
-from collections.abc import Iterator
-from functools import lru_cache
+from collections.abc import Callable, Iterator
+from functools import lru_cache, partial
 from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
@@ -13,14 +13,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .hits import ScanReturns
+from .device import DeviceHits, OtherHits
+from .hits import Part, ScanReturns, joined
 from .instances import Scene
 from .layout import lay_out, lay_out_places
 from .opacity import Masks
 from .pattern import Pattern
 from .poses import Poses
 from .rays import Rays
-from .scan import Collector, Scan
+from .scan import Groups, Scan
 
 _BLOCK = 128  # threads; the kernels are bound to it
 _STACK_STEP = 32
@@ -30,7 +31,7 @@ _MOST_INT = (1 << 31) - 1  # rays of a pose for intersect.cu: more than a chunk 
 
 
 class CudaBackend(Backend):
-    """The traversal of intersect.cu, one thread a ray; only hits leave the device.
+    """The traversal of intersect.cu, one thread a ray; only kept hits leave the device.
 
     Kernels and copies use the thread's current stream, and every call ends with a copy to the
     host, for which CuPy waits: when it returns, the device no longer uses the call's memory.
@@ -42,9 +43,10 @@ class CudaBackend(Backend):
     """
 
     name: ClassVar[str] = "cuda"
-    # Rays: some 430 MB on the device. Grid, sums of hits and indices into a chunk's arrays stay far
-    # below 2**31; only the number of a ray needs 64 bits.
-    chunk: ClassVar[int] = 1 << 22
+    # Rays: some 300 MB on the device, and while columns are copied again as much. Grid, sums of
+    # hits and indices into a chunk's arrays stay far below 2**31; only the number of a ray needs
+    # 64 bits.
+    chunk: ClassVar[int] = 1 << 21
 
     @classmethod
     def missing(cls) -> str:
@@ -76,12 +78,15 @@ class CudaBackend(Backend):
         self._device = _device(cupy, device)
         made = lay_out(scene.meshes)
         self._roots, self._stack = made.roots, made.stack
+        self._masked = made.masks is not None
         with self._device:
             masks = made.masks or Masks(*NO_MASKS)
             tables = (made.nodes, made.triangles, made.corners, made.faces)
             given = (*tables, masks.uv, masks.mask, masks.records)
             self._meshes = tuple(_sent(cupy, table) for table in given)
-        self._masked = made.masks is not None
+            nothing = (_sent(cupy, np.zeros(2, np.int64)), np.int32(0))
+            self._uncounted = (*nothing, cupy.zeros(1, np.int64))
+            self._none = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
         # {pattern: its directions on the device, and its origins if it has any}
         self._patterns: WeakKeyDictionary[Pattern, tuple[Any, ...]] = WeakKeyDictionary()
         self.place(scene)
@@ -114,7 +119,8 @@ class CudaBackend(Backend):
             table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
             limits = (np.float64(t * self._scene.frame.scale) for t in (rays.t_min, rays.t_max))
             found = self._cast("cast_table", n, (*table, np.int64(n), *limits))
-            ray, *hits, instance = self._packed(*found, 1.0)
+            groups = Groups(np.zeros(1, np.int64), 1)
+            ray, *hits, instance = self._packed(found, 0, groups, 1.0, self._uncounted, self._none)
             u, v = cp.empty(len(ray)), cp.empty(len(ray))
             frame, _, instances = self._places
             scene = (self._meshes[2], frame, instances)
@@ -123,17 +129,53 @@ class CudaBackend(Backend):
             return Found(*(array.get() for array in (ray, *hits, u, v, instance)))
 
     def scan(self, scan: Scan) -> ScanReturns:
-        """See `Backend.scan`; the rays are made on the device, hits are chosen on the host."""
-        collector = Collector(scan, self._scene.face_count)
+        """See `Backend.scan`."""
+        kept: list[Part] = []
+        hits, tally = self.visit(scan, lambda found: kept.append(found.get()))
+        ray, distance, triangle, instance = joined(kept)
+        return ScanReturns(ray, distance, triangle, hits, tally, instance)
+
+    def visit(
+        self,
+        scan: Scan,
+        use: Callable[[DeviceHits], object],
+        counters: tuple[NDArray[np.int64], int] | None = None,
+        others: OtherHits | None = None,
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
+        """See `RayCaster.visit`."""
+        cp, scene, groups = self._cupy, self._scene, Groups(scan.groups, scan.keep_every)
         with self._device:
+            counting = self._uncounted
+            if scan.tally:
+                table, size = (scene.counters, scene.face_count) if counters is None else counters
+                counting = _sent(cp, table), np.int32(1), cp.zeros(size, np.int64)
             for start, n, rays in self._made(scan):
                 found = self._cast("cast_pattern", n, rays)
-                packed = self._packed(*found, self._scene.frame.scale)
-                ray, distance, triangle, instance = (array.get() for array in packed)
-                collector.tally(self._scene.tally_rows(instance, triangle))
-                kept = collector.keep(ray, start, start + n)
-                collector.add(start, ray[kept], distance[kept], triangle[kept], instance[kept])
-        return collector.result()
+                replaced = self._replaced(found, start, n, others)
+                kept = self._packed(found, start, groups, scene.frame.scale, counting, replaced)
+                use(DeviceHits(*kept, cp, partial(self._rays, start, rays)))
+            return groups.hits, counting[2].get() if scan.tally else None
+
+    def _replaced(
+        self, found: tuple[Any, Any, Any], start: int, n: int, others: OtherHits | None
+    ) -> tuple[Any, ...]:
+        """Let other hits replace those of a cast that are farther; arguments of `pack`."""
+        if others is None:
+            return self._none
+        span = slice(*np.searchsorted(others.ray, [start, start + n]))
+        tables = (others.ray[span], others.distance[span], others.triangle[span])
+        ray, metres, triangle = map(self._cupy.asarray, tables)
+        count, scale = np.int64(len(ray)), np.float64(self._scene.frame.scale)
+        self._run("replace", len(ray), ray, metres, count, np.int64(start), scale, *found[:2])
+        return metres, triangle, np.int32(len(self._scene.mesh))
+
+    def _rays(self, start: int, rays: tuple[Any, ...], ray: Any) -> tuple[Any, Any]:
+        """Make starts and directions of rays of a chunk, on the device."""
+        cp, n = self._cupy, len(ray)
+        origins, directions = cp.empty((3, n)), cp.empty((3, n))
+        numbers = ray, np.int64(start), np.int64(n)
+        self._run("make_rays", n, *rays[:-3], *numbers, origins, directions)
+        return origins, directions
 
     def _made(self, scan: Scan) -> Iterator[tuple[int, int, tuple[Any, ...]]]:
         """Chunks of a scan: number of the first ray, how many, and arguments for cast_pattern."""
@@ -183,21 +225,36 @@ class CudaBackend(Backend):
         return t, place, instance
 
     def _packed(
-        self, distance: Any, place: Any, instance: Any, scale: float
+        self,
+        found: tuple[Any, Any, Any],
+        start: int,
+        groups: Groups,
+        scale: float,
+        counting: tuple[Any, np.int32, Any],
+        others: tuple[Any, ...],
     ) -> tuple[Any, Any, Any, Any]:
-        """Compact the results of a cast on the device; distances are divided by `scale`.
+        """Count the hits of a cast and close up those that are kept, all on the device.
 
-        Returns numbers of the rays that hit, distances, the caller's triangles, and instances.
+        Distances are divided by `scale`. `counting` and `others` are arguments of the kernel
+        `pack`. Returns numbers of the rays, from `start` on, distances, the caller's
+        triangles, and instances.
         """
-        cp, n = self._cupy, len(place)
-        # Compacted by sums in ray order, not by atomics: the same bytes on every run.
-        ends = cp.cumsum(place >= 0, dtype=np.int32) if n else place
-        hits = int(ends[-1]) if n else 0
+        cp, n = self._cupy, len(found[1])
+        # Closed up by sums in ray order, not by atomics: the same bytes on every run.
+        ends = cp.cumsum(found[1] != -1, dtype=np.int32)
+        span, begins = groups.spans(start, start + n)
+        cuts = np.append(0, ends[cp.asarray(np.append(begins, n) - 1)].get()).astype(np.int64)
+        leave, number = groups.count(span, np.diff(cuts))
+        before = np.cumsum(number) - number
+        table = np.minimum([np.append(0, begins), cuts[:-1] + leave, before], _MOST_INT)
         kinds = (np.uint32, np.float64, np.int32, np.int32)
-        packed = tuple(cp.empty(hits, kind) for kind in kinds)
-        found = (distance, place, instance, ends)
-        self._run("pack", n, self._meshes[3], *found, np.int64(n), np.float64(scale), *packed)
-        return packed
+        kept = tuple(cp.empty(int(number.sum()), kind) for kind in kinds)
+        self._run(
+            "pack", n, self._meshes[3], *found, ends, np.int64(n), np.float64(scale),
+            np.int64(start), *others, cp.asarray(table.astype(np.int32)), np.int32(len(number)),
+            np.int32(min(groups.every, _MOST_INT)), *counting, *kept,
+        )  # fmt: skip
+        return kept
 
     def _run(self, kernel: str, threads: int, *arguments: Any) -> None:
         """Launch a kernel with one thread for each item; does nothing without items.

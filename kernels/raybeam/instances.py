@@ -119,6 +119,12 @@ class Scene:
         """Rows of a tally."""
         return int(self.first_face[-1])
 
+    @property
+    def counters(self) -> NDArray[np.int64]:
+        """First row of each instance's triangles in a tally, and the step to the next: (n, 2)."""
+        first = self.first_face[:-1][self.mesh]
+        return np.stack([first, np.ones_like(first)], axis=1)
+
     def to_scene(self) -> Float:
         """Matrices (n, 3, 4) that take the meshes' local coordinates to the scene's."""
         assert self.matrices is not None

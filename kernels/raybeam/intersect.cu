@@ -6,11 +6,10 @@
 // instances, 0 for a plain one: one mesh, in its place; MASKED, 1 where parts of triangles are
 // transparent, else 0. A scene pays nothing for what it has not.
 //
-// Threads are independent: no shared memory, no barriers, no votes of a warp, no atomics, so it does
-// not matter which of them run together. Offsets into tables are 64 bits wide; an int is enough for
-// the rest: there are fewer than 2^28 triangles, so rows shifted by LEAF_BITS fit, and the greatest
-// code of a leaf is not DONE. A chunk of rays is far below 2^31
-// (cuda_backend.py).
+// Threads are independent: no shared memory, no barriers, no votes of a warp, no atomics but for
+// counts, so it does not matter which of them run together. Offsets into tables are 64 bits wide; an
+// int is enough for the rest: there are fewer than 2^28 triangles, so rows shifted by LEAF_BITS fit,
+// and the greatest code of a leaf is not DONE. A chunk of rays is far below 2^31 (cuda_backend.py).
 // Tables of float4 are allocations of their own, which the device aligns to 256 bytes.
 //
 // CuPy adds -ftz=true: subnormal floats are flushed to zero. The bands below allow for that (FLOOR
@@ -145,7 +144,8 @@ struct PatternRays {
         z = c;
     }
 
-    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    // Start of a ray in metres, and its direction.
+    __device__ __forceinline__ void make(Count i, double* at, double* to) const
     {
         Count row = first + i;
         // A chunk's rays fit an int, see above; so does the rest after a turn, if there are more.
@@ -154,20 +154,18 @@ struct PatternRays {
         const int ray = (int)i;
         const unsigned pose = ray < left ? 0u : 1u + (unsigned)(ray - left) / (unsigned)each;
         const double* r = rotations + 9 * (Count)pose;
-        Ray out;
         const double x = directions[row], y = directions[rows + row];
         const double z = directions[2 * rows + row];
-        out.dx = x;
-        out.dy = y;
-        out.dz = z;
-        if (turned) turn(r, x, y, z, out.dx, out.dy, out.dz);
+        to[0] = x;
+        to[1] = y;
+        to[2] = z;
+        if (turned) turn(r, x, y, z, to[0], to[1], to[2]);
         const double* rate = rates + 6 * (Count)pose;
         double delay = 0.0;
         if (moving) {
             delay = delays[pose == 0 ? each - left + ray : (ray - left) % each];
-            drift(rate + 3, delay, out.dx, out.dy, out.dz);
+            drift(rate + 3, delay, to[0], to[1], to[2]);
         }
-        double at[3];
         for (int axis = 0; axis < 3; ++axis) at[axis] = positions[3 * (Count)pose + axis];
         if (shifted) {
             double u = origins[row], v = origins[rows + row], w = origins[2 * rows + row];
@@ -182,7 +180,17 @@ struct PatternRays {
         }
         if (moving)
             for (int axis = 0; axis < 3; ++axis) at[axis] = at[axis] + delay * rate[axis];
+    }
+
+    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    {
+        double at[3], to[3];
+        make(i, at, to);
+        Ray out;
         place_origin(scene, at, out);
+        out.dx = to[0];
+        out.dy = to[1];
+        out.dz = to[2];
         return out;
     }
 };
@@ -664,22 +672,84 @@ KERNEL weigh_table(
     v[k] = hit.c / hit.det;
 }
 
-// ---- compaction of hits ----
+// ---- what becomes of the hits ----
 
-// Compact hits, in ray order: number of the ray, distance in metres, the caller's triangle, instance.
-// `ends` are the inclusive sums of hits up to each ray.
+// Hits of other surfaces, at most one a ray, take the place of those that are farther, divided by
+// `scale`: place becomes -2 - k for hit k.
+KERNEL replace(
+    const unsigned int* __restrict__ ray, const double* __restrict__ metres, Count count,
+    Count start, double scale, const double* __restrict__ distance, int* __restrict__ place)
+{
+    const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (k >= count) return;
+    const Count i = (Count)ray[k] - start;
+    if (place[i] < 0 || metres[k] < distance[i] / scale) place[i] = -2 - (int)k;
+}
+
+// Close up the hits that are kept, in ray order: number of the ray, from `start` on, distance in
+// metres, the caller's triangle, instance. `other_…` are those of `replace`.
+//
+// `ends` are the inclusive sums of hits up to each ray. Of each group of rays, the first kept hit
+// and every n-th after it are kept. `groups` has three rows of `group_count`: the first ray of each,
+// the first hit to keep, and the place of that among all that are kept; it is not read where `every`
+// is 1. `counters`, not read where `counting` is 0, are two numbers for each instance: hits of its
+// triangle t are counted in row first + step * t of `tally`, whether they are kept or not.
 KERNEL pack(
     const int* __restrict__ faces, const double* __restrict__ distance,
     const int* __restrict__ place, const int* __restrict__ instance,
-    const int* __restrict__ ends, Count count, double scale,
+    const int* __restrict__ ends, Count count, double scale, Count start,
+    const double* __restrict__ other_metres, const int* __restrict__ other_triangle,
+    int other_instance,
+    const int* __restrict__ groups, int group_count, int every,
+    const Count* __restrict__ counters, int counting, unsigned long long* __restrict__ tally,
     unsigned int* __restrict__ ray, double* __restrict__ metres, int* __restrict__ triangle,
     int* __restrict__ which)
 {
     const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
-    if (i >= count || place[i] < 0) return;
-    const int k = ends[i] - 1;
-    ray[k] = (unsigned int)i;
-    metres[k] = distance[i] / scale;
-    triangle[k] = faces[place[i]];
-    which[k] = NESTED ? instance[i] : 0;
+    if (i >= count || place[i] == -1) return;
+    const int row = place[i], other = -2 - row;
+    const int face = row < 0 ? other_triangle[other] : faces[row];
+    const int in = row < 0 ? other_instance : NESTED ? instance[i] : 0;
+    if (counting) atomicAdd(tally + counters[2 * in] + counters[2 * in + 1] * face, 1ULL);
+    int k = ends[i] - 1;
+    if (every > 1) {
+        int group = 0;
+        for (int high = group_count; high - group > 1;) {
+            const int middle = (group + high) / 2;
+            if (groups[middle] <= i)
+                group = middle;
+            else
+                high = middle;
+        }
+        k -= groups[group_count + group];
+        if (k < 0 || k % every != 0) return;
+        k = groups[2 * group_count + group] + k / every;
+    }
+    ray[k] = (unsigned int)(start + i);
+    metres[k] = row < 0 ? other_metres[other] : distance[i] / scale;
+    triangle[k] = face;
+    which[k] = in;
+}
+
+// Starts in metres and directions of the rays that are listed, counted from `start`: (3, count) each,
+// with the bits of `Pattern.rays`.
+KERNEL make_rays(
+    const double* __restrict__ positions, const double* __restrict__ rotations,
+    const double* __restrict__ directions, const double* __restrict__ origins,
+    Count rows, Count first, int left, int each, int turned, int shifted,
+    const double* __restrict__ delays, const double* __restrict__ rates, int moving,
+    const unsigned int* __restrict__ ray, Count start, Count count,
+    double* __restrict__ from, double* __restrict__ towards)
+{
+    const Count k = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (k >= count) return;
+    const PatternRays rays = {positions, rotations, directions, origins, rows,
+                              first,     left,      each,       turned,  shifted,
+                              delays,    rates,     moving};
+    double at[3], to[3];
+    rays.make((Count)ray[k] - start, at, to);
+    for (int axis = 0; axis < 3; ++axis) {
+        from[axis * count + k] = at[axis];
+        towards[axis * count + k] = to[axis];
+    }
 }

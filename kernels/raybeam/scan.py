@@ -107,7 +107,39 @@ def check_scan(
     )
 
 
-class Collector:
+class Groups:
+    """Groups of a scan's rays: their hits are counted, and every n-th of each group is kept.
+
+    Parameters
+    ----------
+    begins, every
+        `groups` and `keep_every` of `Scan`.
+    """
+
+    def __init__(self, begins: NDArray[np.int64], every: int) -> None:
+        self._begins, self.every = begins, every
+        self.hits = np.zeros(len(begins), np.int64)  # of each group, so far
+
+    def spans(self, start: int, stop: int) -> tuple[slice, NDArray[np.int64]]:
+        """Find the groups of rays `start` to `stop`, and the first ray of all but the first.
+
+        The rays are counted from `start`.
+        """
+        first = int(np.searchsorted(self._begins, start, side="right")) - 1
+        last = int(np.searchsorted(self._begins, stop, side="left"))
+        return slice(first, last), self._begins[first + 1 : last] - start
+
+    def count(
+        self, groups: slice, counts: NDArray[np.int64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+        """Count hits of groups in a chunk; of each: the first that is kept, and how many are."""
+        before = self.hits[groups].copy()  # of the first group, in the chunks before this one
+        self.hits[groups] += counts
+        leave = -before % self.every
+        return leave, np.maximum(-((leave - counts) // self.every), 0)
+
+
+class Collector(Groups):
     """Collects the hits of a scan, chunk after chunk in ray order.
 
     Parameters
@@ -127,8 +159,7 @@ class Collector:
     """
 
     def __init__(self, scan: Scan, face_count: int) -> None:
-        self._groups, self._every = scan.groups, scan.keep_every
-        self._hits = np.zeros(len(scan.groups), np.int64)
+        super().__init__(scan.groups, scan.keep_every)
         self._tally = np.zeros(face_count, np.int64) if scan.tally else None
         self._kept: list[Part] = []
 
@@ -146,24 +177,17 @@ class Collector:
         -------
         The selection of kept hits: rows of `ray`, or all.
         """
-        first = int(np.searchsorted(self._groups, start, side="right")) - 1
-        last = int(np.searchsorted(self._groups, stop, side="left"))
-        begins = (self._groups[first + 1 : last] - start).astype(ray.dtype)
-        cuts = np.concatenate([[0], np.searchsorted(ray, begins), [len(ray)]])
-        counts = np.diff(cuts)
-        groups = slice(first, first + len(counts))
-        before = self._hits[groups].copy()  # of the first group, in the chunks before this one
-        self._hits[groups] += counts
-        if self._every == 1:
+        groups, begins = self.spans(start, stop)
+        cuts = np.searchsorted(ray, begins.astype(ray.dtype))
+        cuts = np.concatenate([[0], cuts, [len(ray)]])
+        leave, number = self.count(groups, np.diff(cuts))
+        if self.every == 1:
             return slice(None)
-        # Of each group: the row of the first kept hit, and the number of kept hits.
-        leave = -before % self._every
-        if len(counts) == 1:
-            return np.arange(leave[0], len(ray), self._every)
-        number = np.maximum(-((leave - counts) // self._every), 0)
-        offset = cuts[:-1] + leave - self._every * (np.cumsum(number) - number)
+        if len(leave) == 1:
+            return np.arange(leave[0], len(ray), self.every)
+        offset = cuts[:-1] + leave - self.every * (np.cumsum(number) - number)
         rows: NDArray[np.intp] = np.repeat(offset, number)
-        rows += self._every * np.arange(len(rows))
+        rows += self.every * np.arange(len(rows))
         return rows
 
     def tally(self, rows: NDArray[np.integer[Any]]) -> None:
@@ -187,4 +211,4 @@ class Collector:
     def result(self) -> ScanReturns:
         """Return the result of all chunks."""
         ray, distance, triangle, instance = joined(self._kept)
-        return ScanReturns(ray, distance, triangle, self._hits, self._tally, instance)
+        return ScanReturns(ray, distance, triangle, self.hits, self._tally, instance)

@@ -37,7 +37,7 @@ def cast_between(rig, survey, cuts):
     """Columns as bytes, and hits of each triangle, of scans that are cast from cut to cut."""
     batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
     columns = {
-        column.name: np.concatenate([column.make(batch) for batch in batches]).tobytes()
+        column.name: np.concatenate([batch.column(column) for batch in batches]).tobytes()
         for column in survey.stored_columns
     }
-    return columns, np.sum([batch.found.tally for batch in batches], axis=0).tolist()
+    return columns, np.sum([batch.tally for batch in batches], axis=0).tolist()

@@ -37,7 +37,7 @@ from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Cutout
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.simulator import rig as rig_module
-from lidarpool.simulator.returns import columns_of
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 
 COLUMNS = [column.name for column in OPTIONAL]

@@ -25,7 +25,7 @@ from lidarpool.columns.table import SCAN
 from lidarpool.scene.actors import box, one_mesh
 from lidarpool.scene.mesh import Cutout
 from lidarpool.scene.shapes import seed_objects
-from lidarpool.simulator.returns import columns_of
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 
 SPHERE = seed_objects(rings=8, segments=12)[0]

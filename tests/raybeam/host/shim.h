@@ -35,8 +35,12 @@ static inline To bits(From from)
 static inline int __float_as_int(float f) { return bits<int>(f); }
 static inline float __int_as_float(int i) { return bits<float>(i); }
 
+template <class Number>
+static inline void atomicAdd(Number* sum, Number more) { *sum += more; }
+
 using std::fabs;
 using std::floor;
 using std::fmax;
 using std::fmin;
+using std::rint;
 using std::sqrt;

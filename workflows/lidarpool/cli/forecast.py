@@ -203,7 +203,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
         rays += survey.scan(scan).ray_count
         for found in rig.cast(scan, scan + 1):
-            hits += int(found.found.hits.sum())
+            hits += int(found.hits.sum())
             points += len(found)
     share = survey.ray_count / rays
     return {"rays": rays, "hits": round(hits * share), "points": round(points * share)}

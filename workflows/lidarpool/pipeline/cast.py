@@ -12,7 +12,9 @@ from poolpart import Recorder, TaskRecord
 
 from ..base.tracing import trace
 from ..columns.parts import PartColumns
-from ..simulator.returns import BatchReturns, columns_of
+from ..simulator.batch import columns_of
+from ..simulator.device import DeviceReturns
+from ..simulator.returns import BatchReturns
 from ..simulator.rig import Rig
 from .failures import naming_scans
 from .messages import Span, samples_of_scan, summary_type
@@ -60,10 +62,10 @@ def _cast(rig: Rig, handle: str, first: int, stop: int) -> CastBatch:
     return batch
 
 
-def _summaries(returns: BatchReturns) -> NDArray[np.void]:
+def _summaries(returns: BatchReturns | DeviceReturns) -> NDArray[np.void]:
     kind = summary_type(samples_of_scan(returns.survey.scan_count))
     out = np.zeros(len(returns.specs), kind)
-    out["hits"], out["points"] = returns.found.hits, returns.counts
+    out["hits"], out["points"] = returns.hits, returns.counts
     # Sample rays: spread over the points of each scan, their ends in float32.
     samples = kind["samples"].shape[0]
     begins = np.cumsum(returns.counts) - returns.counts
@@ -73,5 +75,5 @@ def _summaries(returns: BatchReturns) -> NDArray[np.void]:
     there = (np.arange(samples) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
     out["samples"] = np.nan
     if len(returns):
-        out["samples"][there] = returns.positions[rows[there]]
+        out["samples"][there] = returns.ends(rows[there])
     return out

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..columns.parts import PartColumns
+from ..columns.table import Column
 from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
@@ -47,6 +48,24 @@ class BatchReturns:
 
     def __len__(self) -> int:
         return len(self.found.ray)
+
+    @property
+    def hits(self) -> NDArray[np.int64]:
+        """Returns of each scan, kept or not: (scans,)."""
+        return self.found.hits
+
+    @property
+    def tally(self) -> NDArray[np.int64]:
+        """Returns of each counter of the scene, kept or not."""
+        return np.asarray(self.found.tally)
+
+    def column(self, column: Column) -> NDArray[Any]:
+        """Values of a column."""
+        return column.make(self)
+
+    def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions of some returns (k,): (k, 3)."""
+        return self.positions[rows]
 
     # -- the ray -----------------------------------------------------------------------------
 
@@ -280,24 +299,3 @@ class BatchReturns:
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
         return self._surfaces.materials.semantic_class[self.object]
-
-
-def columns_of(found: list[BatchReturns]) -> PartColumns:
-    """Make the columns of consecutive scans, and count the hits of each triangle."""
-    columns = {
-        column.name: _joined([column.make(returns) for returns in found])
-        for column in found[0].survey.stored_columns
-    }
-    tally = np.sum([np.asarray(returns.found.tally) for returns in found], axis=0)
-    triangles = np.flatnonzero(tally)
-    return PartColumns(
-        found[0].specs[0].scan,
-        _joined([returns.counts for returns in found]),
-        columns,
-        triangles.astype(np.int32),
-        tally[triangles].astype(np.int64),
-    )
-
-
-def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
-    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

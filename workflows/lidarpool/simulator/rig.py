@@ -15,6 +15,7 @@ from raybeam import Pattern
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Survey, Trajectory
+from .device import DeviceColumns, DeviceReturns
 from .echoes import PATTERN_RAYS, EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
 from .returns import BatchReturns
@@ -51,7 +52,7 @@ class Rig:
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         options = {"backend": backend, "threads": threads, "device": device}
         self._world = World(scene, self._surfaces, **options)
-        self._echoes = EchoCaster(self._world, scene, survey, self._surfaces)
+        self._see()
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
         self._firings: dict[tuple[int, int, int], _Rays] = {}  # {(sensor, first, stop): rays}
@@ -94,8 +95,15 @@ class Rig:
         rows = np.flatnonzero(shared.owner == owner)
         rig._surfaces = self._surfaces.moved(rig.scene, rows)
         rig._world.place(rig._surfaces, shared, rows)
-        rig._echoes = EchoCaster(rig._world, rig.scene, rig.survey, rig._surfaces)
+        rig._see()
         return rig
+
+    def _see(self) -> None:
+        """Make what depends on where the surfaces are."""
+        given = self._world, self.scene, self.survey, self._surfaces
+        self._echoes = EchoCaster(*given)
+        able = self._echoes.plain and self._world.caster.on_device
+        self._device = DeviceColumns(*given) if able else None
 
     @property
     def backend(self) -> str:
@@ -115,7 +123,7 @@ class Rig:
             origins = np.add(np.zeros(3) if origins is None else origins, carried.mount.position)
         return Pattern(directions, origins)
 
-    def cast(self, first: int, stop: int) -> Iterator[BatchReturns]:
+    def cast(self, first: int, stop: int) -> Iterator[BatchReturns | DeviceReturns]:
         """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
         run: list[ScanSpec] = []
         for spec in map(self.survey.scan, range(first, stop)):
@@ -129,7 +137,7 @@ class Rig:
 
     def returns(
         self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0
-    ) -> BatchReturns:
+    ) -> BatchReturns | DeviceReturns:
         """Cast scans of one station, the firings of each following those of the one before.
 
         The carrier is `late_ns` further on its path than the firings' own times say.
@@ -151,6 +159,8 @@ class Rig:
             pattern, start = self.pattern(number, first, stop), 0
         window = (start, start + (stop - first) * channels)
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
+        if self._device is not None:
+            return self._device.returns(specs, pattern, poses, window, groups)
         found = self._echoes.scan(sensor, specs[0].scan, pattern, subrays, poses, window, groups)
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 

@@ -34,8 +34,8 @@ from ..sensor import (
     Trajectory,
 )
 from ..sensor.trajectory import CENTRE, pose_of
+from .batch import columns_of
 from .motion import check_trajectory
-from .returns import columns_of
 from .rig import Rig
 from .world import check_backend_here
 

@@ -14,7 +14,7 @@ from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey, Trajectory
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
-from .motion import into_axes
+from .motion import into_axes, products
 
 BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
@@ -68,9 +68,9 @@ class Surfaces:
         self._begins = plain + np.cumsum([0, *sizes])
         moving = [len(actor.mesh.faces) for actor in scene.actors]
         owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
-        # Objects of the triangles of faces and of actors; the last is none.
+        # Objects of the triangles of faces and of actors; the last is of no triangle.
         owned = [scene.face_object, np.repeat(owners, moving), np.zeros(1, np.int32)]
-        self._owners = np.concatenate(owned)
+        self.owners = np.concatenate(owned)
         if shared is not None:
             self._turns = _turns(shared.transforms)
 
@@ -78,6 +78,12 @@ class Surfaces:
     def materials(self) -> MaterialTable:
         """Materials of objects, the same at all wavelengths but for their reflectance."""
         return next(iter(self._tables.values()))
+
+    @property
+    def plain(self) -> bool:
+        """Whether an object has one reflectance, and no gloss."""
+        table = self.materials
+        return len(self._tables) == 1 and not table.textured and not table.roughness.any()
 
     def at(self, wavelength_nm: float) -> MaterialTable:
         """Materials of objects at the wavelength of a sensor."""
@@ -108,11 +114,13 @@ class Surfaces:
         """
         normals = np.empty((3, len(triangle)))
         rows, on, which = self._rows(triangle)
-        for axis, out in zip(self._unit_normals, normals, strict=True):
+        for axis, out in zip(self.unit_normals, normals, strict=True):
             out[:] = axis.take(rows)
         if len(on):
-            turned = np.einsum("nij,jn->in", self._turns[which], normals[:, on])
-            normals[:, on] = turned / np.linalg.norm(turned, axis=0)
+            # In one order of rounding, that of columns.cu.
+            turns = self._turns[which].transpose(1, 2, 0)
+            x, y, z = (products(row, normals[:, on]) for row in turns)
+            normals[:, on] = [x, y, z] / np.sqrt((x * x + y * y) + z * z)
         objects = self.objects(triangle) if ways else None
         for number, way in enumerate(ways, self._standing):
             rows = np.flatnonzero(objects == number)
@@ -169,7 +177,7 @@ class Surfaces:
     @cached_property
     def _lookup(self) -> Lookup | None:
         """Colours of the triangles that are kept once; None if there are none."""
-        bodies = self._bodies
+        bodies = self._kept
         colours = joined([colours for _, _, colours in bodies], [len(f) for _, f, _ in bodies])
         if colours is None:
             return None
@@ -180,14 +188,40 @@ class Surfaces:
         )
         return Lookup(colours, corners)
 
+    def bodies(self) -> tuple[NDArray[np.int64], Real]:
+        """Return what bodies the triangles belong to, in the order of a world's ray caster.
+
+        Returns
+        -------
+        bodies
+            (b, 3): the scene's faces, if there are any, each instance, and all actors as one. Of
+            each its first triangle, its object, or -1 if `owners` has that of each triangle, and
+            the row of its first normal in `unit_normals`. Rows of the actors begin behind those of
+            the scene's faces.
+        turns
+            (b, 3, 3): matrices that take its normals to the scene's axes, but for their length.
+        """
+        plain, actors = self._begins[[0, -1]]
+        one = np.eye(3)[None]
+        bodies: list[Any] = [[[actors - plain, -1, 0]]]
+        turns = [one]
+        if (shared := self._scene.instances) is not None:
+            firsts = self._first_of_part[shared.part]
+            bodies.insert(0, np.stack([self._begins[:-1], shared.owner, firsts], axis=1))
+            turns.insert(0, self._turns)
+        if plain:
+            bodies.insert(0, [[0, -1, 0]])
+            turns.insert(0, one)
+        return np.concatenate(bodies).astype(np.int64), np.concatenate(turns)
+
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
         """Objects of triangles (n,)."""
         shared = self._scene.instances
         if shared is None:
-            return self._owners[triangle]
+            return self.owners[triangle]
         rows, on, which = self._found(triangle)
         rows[on] = -1
-        objects = self._owners[rows]
+        objects = self.owners[rows]
         objects[on] = shared.owner[which]
         return objects
 
@@ -221,7 +255,7 @@ class Surfaces:
         return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
     @property
-    def _bodies(self) -> list[tuple[Real, Triangles, Colours | None]]:
+    def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
         """Vertices, faces and colours of the triangles that are kept once.
 
         Those of actors follow the scene's, and those of the parts of instances follow them.
@@ -238,9 +272,9 @@ class Surfaces:
         return bodies
 
     @cached_property
-    def _unit_normals(self) -> NDArray[np.float32]:
-        """Unit normals of `_bodies`, one row for each axis, the fastest layout: (3, f)."""
-        bodies = self._bodies
+    def unit_normals(self) -> NDArray[np.float32]:
+        """Unit normals of `_kept`, one row for each axis, the fastest layout: (3, f)."""
+        bodies = self._kept
         out = np.empty((3, sum(len(faces) for _, faces, _ in bodies)), np.float32)
         at = 0
         for vertices, faces, _ in bodies:
@@ -258,7 +292,7 @@ class Surfaces:
         """Rows at which the parts of instances begin."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
-        return len(self._owners) - 1 + np.cumsum([0, *sizes[:-1]])
+        return len(self.owners) - 1 + np.cumsum([0, *sizes[:-1]])
 
 
 def _turns(transforms: Real) -> Real:

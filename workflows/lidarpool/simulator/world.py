@@ -18,6 +18,7 @@ from raybeam import (
     Instance,
     Mesh,
     Opacity,
+    OtherHits,
     Pattern,
     RayCaster,
     ScanReturns,
@@ -69,15 +70,15 @@ class World:
     def __init__(self, scene: Scene, surfaces: Surfaces, **options: Any) -> None:
         self._surfaces, self._shared = surfaces, scene.instances
         self._begins: NDArray[np.int32] | None = None  # of each body of the caster
-        faces = len(scene.faces)
+        self._faces = faces = len(scene.faces)
         if self._shared is None:
-            self._caster = RayCaster(scene.vertices, scene.faces, **options)
+            self.caster = RayCaster(scene.vertices, scene.faces, **options)
         else:
             own = [Instance(Mesh(scene.vertices, scene.faces))] if faces else []
             meshes = [_mesh_of(part) for part in self._shared.parts]
             placed = zip(self._shared.part, self._shared.transforms, strict=True)
             shared = [Instance(meshes[part], matrix) for part, matrix in placed]
-            self._caster = RayCaster.of([*own, *shared], **options)
+            self.caster = RayCaster.of([*own, *shared], **options)
             begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
             self._begins = np.append([0] * bool(own), begins).astype(np.int32)
             faces += self._shared.triangles
@@ -89,15 +90,22 @@ class World:
 
     def place(self, surfaces: Surfaces, shared: Instances, rows: NDArray[np.intp]) -> None:
         """Move some instances to where they are now; no scan may be under way."""
-        first = self._caster.instance_count - len(shared)
+        first = self.caster.instance_count - len(shared)
         for row in rows:
-            self._caster.move(first + int(row), shared.transforms[row])
+            self.caster.move(first + int(row), shared.transforms[row])
         self._surfaces, self._shared = surfaces, shared
+
+    def counters(self) -> tuple[NDArray[np.int64], int]:
+        """Return counters of bodies as `RayCaster.visit` takes them, see `Scene.counters`."""
+        shared = 0 if self._shared is None else len(self._shared)
+        own = self.caster.instance_count - shared
+        rows = [[0, 1]] * own + [[self._faces + number, 0] for number in range(shared)]
+        return np.array([*rows, [shared, 1]], np.int64), self._surfaces.counters
 
     @property
     def backend(self) -> str:
         """Name of the backend in use."""
-        return self._caster.backend
+        return self.caster.backend
 
     def scan(
         self,
@@ -117,10 +125,10 @@ class World:
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
         }  # fmt: skip
         if self._begins is None and not self._actors:
-            return self._caster.scan(
+            return self.caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
-        found = self._caster.scan(pattern, **common)
+        found = self.caster.scan(pattern, **common)
         if self._begins is not None:
             found = replace(found, triangle=found.triangle + self._begins[found.instance])
         ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
@@ -151,23 +159,36 @@ class World:
         reach: tuple[float, float],
     ) -> tuple[NDArray[np.int64], Float, NDArray[np.int32]]:
         """Rays, distances and triangles of all hits, those on actors among them."""
-        start, stop = window
-        t_min, t_max = reach
-        distance = np.full(stop - start, np.inf)
-        triangle = np.full(stop - start, -1, np.int32)
+        rays = window[1] - window[0]
+        distance = np.full(rays, np.inf)
+        triangle = np.full(rays, -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
-        cells = _Cells(pattern, poses, start, stop)
-        for actor, way in zip(self._actors, poses.ways, strict=True):
-            ray = cells.near(actor, way, t_max)
-            if not len(ray):
-                continue
-            origins, directions = poses.rays(pattern, ray, start)
-            moved = way.poses(0, poses.times(ray))
-            rows, t, face = actor.hits(origins, directions, moved, t_min, t_max)
-            nearer = t < distance[ray[rows]]
-            distance[ray[rows[nearer]]], triangle[ray[rows[nearer]]] = t[nearer], face[nearer]
+        moving = self.on_actors(pattern, poses, window, reach)
+        nearer = moving.distance < distance[moving.ray]
+        there = moving.ray[nearer]
+        distance[there], triangle[there] = moving.distance[nearer], moving.triangle[nearer]
         ray = np.flatnonzero(triangle >= 0)
         return ray, distance[ray], triangle[ray]
+
+    def on_actors(
+        self, pattern: Pattern, poses: Poses, window: tuple[int, int], reach: tuple[float, float]
+    ) -> OtherHits:
+        """Find the nearest hits of rays on actors, whether something stands before them or not."""
+        cells = _Cells(pattern, poses, *window)
+        found = []
+        for actor, way in zip(self._actors, poses.ways, strict=True):
+            ray = cells.near(actor, way, reach[1])
+            if len(ray):
+                origins, directions = poses.rays(pattern, ray, window[0])
+                moved = way.poses(0, poses.times(ray))
+                rows, t, face = actor.hits(origins, directions, moved, *reach)
+                found.append((ray[rows], t, face))
+        if not found:
+            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
+        ray, t, face = map(np.concatenate, zip(*found, strict=True))
+        order = np.lexsort((t, ray))  # of equal distances, that of the first actor comes first
+        order = order[np.diff(ray[order], prepend=-1) > 0]
+        return OtherHits(ray[order].astype(np.uint32), t[order], face[order])
 
 
 def _mesh_of(part: Part) -> Mesh:

@@ -1,0 +1,199 @@
+"""A CUDA device played by the CPU: kernels compiled by g++, and CuPy's part by NumPy."""
+
+from __future__ import annotations
+
+import ctypes
+import re
+import shutil
+import subprocess
+from collections import deque
+from collections.abc import Callable
+from contextlib import nullcontext
+from functools import cache, partial
+from pathlib import Path
+from types import SimpleNamespace
+from typing import ClassVar
+
+import numpy as np
+import pytest
+
+from raybeam.cuda_backend import CudaBackend
+
+HOST_FILES = Path(__file__).parent / "raybeam" / "host"
+STACK = 256
+
+
+class Array(np.ndarray):
+    """An array "on the device"."""
+
+    def get(self, stream=None, out=None, blocking=True):
+        if out is None:
+            assert blocking
+            return np.array(self)
+        assert out.shape == self.shape
+        assert out.dtype == self.dtype
+        assert not np.shares_memory(self, out)
+        if blocking:
+            out[...] = self
+        else:  # only when somebody waits for it: until then, neither may be touched
+            out.view(np.uint8).fill(0x5A)
+            stream.begun.append((out, self))
+        return out
+
+    def set(self, values):
+        assert values.shape == self.shape
+        assert values.dtype == self.dtype
+        self[...] = values
+
+
+class Device(nullcontext):
+    def __init__(self, number=None):
+        super().__init__()
+        self.id = number or 0
+
+    def synchronize(self):
+        pass
+
+
+class Event:
+    """What was begun in a stream before it was recorded."""
+
+    def __init__(self, begun):
+        self.begun = begun
+
+    def synchronize(self):
+        while self.begun:
+            out, given = self.begun.popleft()
+            out[...] = given
+
+
+class Stream:
+    def __init__(self, non_blocking=False):
+        self.begun = deque()
+
+    def record(self):
+        return Event(self.begun)
+
+    def wait_event(self, event):
+        event.synchronize()
+
+    def synchronize(self):
+        self.record().synchronize()
+
+
+KINDS = {
+    np.int32: ctypes.c_int, np.int64: ctypes.c_longlong, np.float64: ctypes.c_double,
+    np.uint32: ctypes.c_uint,
+}  # fmt: skip
+
+
+def pointed(argument):
+    """A kernel's argument, as something that `ctypes.byref` can point to."""
+    if isinstance(argument, np.ndarray):
+        assert argument.flags.c_contiguous
+        return ctypes.c_void_p(argument.ctypes.data)
+    return KINDS[type(argument)](argument)
+
+
+class Kernels:
+    """Stands for CuPy's RawModule: kernels that run thread by thread."""
+
+    compile_for: ClassVar[Callable[[str, tuple[str, ...]], ctypes.CDLL]]
+
+    def __init__(self, code, options):
+        stack = re.search(r"-DSTACK=(\d+)", " ".join(options))
+        assert stack is None or int(stack[1]) <= STACK
+        # Libraries are shared by scenes of all depths.
+        same = (f"-DSTACK={STACK}" if "STACK" in option else option for option in options)
+        self.library = self.compile_for(code, tuple(same))
+
+    def compile(self):
+        pass
+
+    def get_function(self, name):
+        def launch(grid, block, arguments):
+            assert block == (128,)
+            assert getattr(self.library, f"parameters_{name}")() == len(arguments)
+            values = [pointed(argument) for argument in arguments]
+            pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(v) for v in values))
+            getattr(self.library, f"run_{name}")(ctypes.c_uint(grid[0]), pointers)
+
+        launch.num_regs = launch.local_size_bytes = 0
+        return launch
+
+
+class CudaError(RuntimeError):
+    """What CuPy raises when a call of CUDA fails."""
+
+
+class Module(SimpleNamespace):
+    __hash__ = object.__hash__
+
+
+def poisoned(shape, dtype=np.float64):
+    """Memory that nobody has written to yet."""
+    array = np.empty(shape, dtype)
+    array.view(np.uint8).fill(0xA5)
+    return array.view(Array)
+
+
+# As much of CuPy as the backend uses, on the CPU.
+HOST = Module(
+    RawModule=Kernels,
+    asarray=lambda a: np.array(a, order="K").view(Array),
+    empty=poisoned,
+    zeros=lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array),
+    cumsum=np.cumsum,
+    flatnonzero=lambda a: np.flatnonzero(a).view(Array),
+    get_default_memory_pool=lambda: SimpleNamespace(free_all_blocks=lambda: None),
+    cuda=SimpleNamespace(
+        Device=Device,
+        Stream=Stream,
+        get_current_stream=Stream,
+        alloc_pinned_memory=bytearray,
+        runtime=SimpleNamespace(getDeviceCount=lambda: 1, CUDARuntimeError=CudaError),
+    ),
+)
+
+
+class SourceBackend(CudaBackend):
+    """The cuda backend, its kernels compiled for the CPU and CuPy's part played by NumPy."""
+
+    name = "source"
+    chunk = 1 << 16
+
+    @classmethod
+    def missing(cls):
+        return ""
+
+    @staticmethod
+    def _library():
+        return HOST
+
+
+def compiled(compiler, folder, code, options):
+    """Kernels made a library for the CPU."""
+    number = len(list(folder.iterdir()))
+    source, library = folder / f"{number}.cpp", folder / f"{number}.so"
+    names = re.findall(r"^KERNEL (\w+)\(", code, re.M)
+    runs = "".join(f"RUN({name})\n" for name in names)
+    source.write_text(f'#include "launch.h"\n{code}\n{runs}')
+    command = [
+        compiler, "-O2", "-Wall", "-Werror", "-Wno-unknown-pragmas", "-ffp-contract=off",
+        "-shared", "-fPIC", *(option for option in options if option != "-fmad=false"),
+        f"-I{HOST_FILES}", "-o", str(library), str(source),
+    ]  # fmt: skip
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return ctypes.CDLL(str(library))
+
+
+@pytest.fixture(scope="session")
+def source_backend(tmp_path_factory):
+    """`SourceBackend`, its libraries made by g++ when they are needed."""
+    compiler = shutil.which("g++")
+    if compiler is None:
+        pytest.skip("g++ is not here to compile the kernels for the CPU")
+    folder = tmp_path_factory.mktemp("source")
+    Kernels.compile_for = staticmethod(cache(partial(compiled, compiler, folder)))
+    return SourceBackend

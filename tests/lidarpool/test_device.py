@@ -1,0 +1,196 @@
+"""Columns that are made on a device, against those that NumPy makes of its own hits."""
+
+from __future__ import annotations
+
+import importlib.resources
+import pickle
+import shutil
+import subprocess
+from dataclasses import replace
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
+from tests.lidarpool.casting import cast_between
+from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
+
+from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scene, Survey, Track
+from lidarpool.columns.parts import pack
+from lidarpool.pipeline import cast
+from lidarpool.scene.actors import box
+from lidarpool.scene.colours import Colours
+from lidarpool.scene.shapes import seed_objects
+from lidarpool.sensor.materials import Material
+from lidarpool.sensor.models import load_sensor
+from lidarpool.sensor.optics import Returns
+from lidarpool.sensor.trajectory import Stations
+from lidarpool.simulator.device import OPTIONS, DeviceReturns
+from lidarpool.simulator.rig import Rig
+from raybeam import registry
+
+COLUMNS = (
+    "ray", "time", "range", "intensity", "reflectivity", "class", "triangle", "sensor", "returns",
+    "return_number",
+)  # fmt: skip
+MATERIALS = (
+    Material("*", reflectance=0.3),
+    Material("copy*", reflectance=0.8, semantic_class=300),
+    Material("copy 2", retro=True, semantic_class=7),
+)
+
+# One drives through the other, and both past what stands.
+WAYS = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
+ACTORS = tuple(
+    Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(WAYS)
+)
+
+
+@pytest.fixture
+def backend(source_backend, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(registry, "_BACKENDS", (*registry._BACKENDS, source_backend))
+    monkeypatch.setattr(source_backend, "chunk", 997)
+    return source_backend.name
+
+
+@pytest.fixture(scope="module")
+def scenes():
+    """The same objects as parts of the scene, and as instances: all, or beside others."""
+    objects = []
+    for k, mesh in enumerate(seed_objects(rings=8, segments=12)):
+        colours = np.random.default_rng(k).integers(0, 256, (len(mesh.faces), 3), np.uint8)
+        objects.append(replace(mesh, colours=Colours.of_faces(colours)))
+    copies = []
+    for k, stretch in enumerate((1, 2, -1, 1, 1, 0.5)):
+        matrix = np.diag([stretch, 1, 1, 1.0])
+        matrix[:2, 2:] = [[0, 2 * k - 5], [0.3, 0.1]]
+        copies.append(Instance(objects[1 + k % 3], matrix, f"copy {k}"))
+    return {
+        "plain": Scene.from_meshes(objects),
+        "instances": Scene.from_meshes(copies),
+        "both": Scene.from_meshes([*objects, *copies]),
+    }
+
+
+def surveys():
+    """Standing and moving sensors of many kinds, their columns those that a device makes."""
+    for name, survey in (SURVEYS | MODELS).items():
+        if survey.returns.subrays == 1:
+            yield name, replace(survey, columns=COLUMNS, keep_every=1 + len(name) % 3)
+    two = [load_sensor(name, step_deg=10) for name in ("velodyne/vlp16", "ouster/os0-32")]
+    seats = [Mounted(two[0], Pose((1, 0, 0)), "front"), Mounted(two[1], name="rear")]
+    yield "two sensors", Survey(sensors=seats, trajectory=CART, steps=3, columns=COLUMNS)
+    yield "few columns", Survey(two[0], poses=TURNED, steps=3)
+
+
+MADE = dict(surveys())
+
+
+def same(scene, survey, backend, cuts):
+    """Cast a survey on the device and with NumPy; all bytes must be equal."""
+    rigs = [Rig(scene, survey, name) for name in (backend, "numpy")]
+    (got, tally), (want, counted) = (cast_between(rig, survey, cuts) for rig in rigs)
+    for name, column in want.items():
+        assert got[name] == column, name
+    assert tally == counted[: len(tally)] and not any(counted[len(tally) :])
+    made, plain = (list(rig.cast(*cuts[:2])) for rig in rigs)
+    for mine, other in zip(made, plain, strict=True):
+        assert isinstance(mine, DeviceReturns)
+        assert np.array_equal(mine.counts, other.counts)
+        assert np.array_equal(mine.hits, other.hits)
+        rows = np.arange(0, len(other), 7)
+        assert np.abs(mine.ends(rows) - other.ends(rows)).max(initial=0) <= survey.precision_m
+
+
+@pytest.mark.parametrize("name", MADE)
+def test_columns_have_the_bits_of_numpy(name, scenes, backend):
+    survey = MADE[name]
+    same(scenes["plain"], survey, backend, (0, 1, survey.scan_count // 2, survey.scan_count))
+
+
+@pytest.mark.parametrize("scene", ["instances", "both"])
+@pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
+def test_columns_of_instances(scene, name, scenes, backend):
+    survey = replace(MADE[name], materials=MATERIALS)
+    same(scenes[scene], survey, backend, (0, survey.scan_count))
+
+
+def test_a_survey_that_hits_nothing(scenes, backend):
+    survey = replace(MADE["few columns"], trajectory=Stations((Pose((0, 0, 500)),)), poses=())
+    same(scenes["plain"], survey, backend, (0, survey.scan_count))
+
+
+OWN = Column("own", "float32", "", "of a user", lambda returns: returns.range)
+MORE = {
+    "a user's column": {"columns": (*COLUMNS, OWN)},
+    "angles": {"columns": ("azimuth", "intensity")},
+    "haze": {"visibility_km": 2.0},
+    "the sensor's axes": {"coordinates": "sensor"},
+    "only angles": {"columns": ("elevation",), "keep_every": 4},
+    "colours": {"columns": ("red", "blue", "time")},
+    "textures": {"materials": [Material("*", "texture", scale=0.7)]},
+    "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
+    "a measured material": {"materials": [Material("*", material="asphalt, dry")]},
+}
+
+
+@pytest.mark.parametrize("actors", [(), ACTORS], ids=["", "actors"])
+@pytest.mark.parametrize("name", MORE)
+def test_numpy_makes_the_other_columns_of_the_hits(name, actors, scenes, backend):
+    survey = replace(MADE["on the move"], **MORE[name])
+    same(scenes["both"].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
+
+
+OTHERS = {"sub-rays": {"returns": Returns("all", 7, 3.0)}, "noise": {"noise": Noise(range_m=0.01)}}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
+    survey = replace(MADE["on the move"], **OTHERS[name])
+    rigs = [Rig(scenes["plain"], survey, which) for which in (backend, "numpy")]
+    got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
+    assert got == want
+    assert not isinstance(next(rigs[0].cast(0, 1)), DeviceReturns)
+
+
+@pytest.mark.parametrize("scene", ["plain", "instances", "both"])
+@pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
+def test_columns_of_actors(scene, name, scenes, backend):
+    survey = replace(MADE[name], materials=[*MATERIALS, Material("Car*", 0.7, 40)])
+    if scene == "plain":
+        survey = replace(survey, materials=())
+    same(scenes[scene].with_actors(ACTORS), survey, backend, (0, 3, survey.scan_count))
+
+
+def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
+    survey, spans = MADE["on the move"], [(0, 9), (9, 28)]
+    monkeypatch.setattr(cast, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
+    tasks = []
+    for name in (backend, "numpy"):
+        rig = Rig(scenes["both"], survey, name)
+        monkeypatch.setattr(cast, "rig_of", lambda handle, rig=rig: rig)
+        tasks.append(pickle.loads(pickle.dumps(cast.intersect("a run", spans), protocol=5)))
+    for mine, other in zip(*tasks, strict=True):
+        assert pack(mine.part) == pack(other.part)
+        for field in ("hits", "points"):
+            assert np.array_equal(mine.summaries[field], other.summaries[field])
+        samples, exact = mine.summaries["samples"], other.summaries["samples"]
+        assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
+
+
+@pytest.mark.parametrize("card", ["75", "120"])
+def test_the_kernel_compiles_without_spills(card, tmp_path):
+    nvcc = shutil.which("nvcc")
+    if nvcc is None:
+        pytest.skip("nvcc is not here")
+    known = subprocess.run([nvcc, "--list-gpu-arch"], capture_output=True, text=True).stdout
+    if f"compute_{card}" not in known.split():
+        pytest.skip(f"this nvcc does not know sm_{card}")
+    source = importlib.resources.files("lidarpool.simulator") / "columns.cu"
+    done = subprocess.run(
+        [nvcc, *OPTIONS, f"-arch=sm_{card}", "-cubin", "-Xptxas", "-v", "-o",
+         str(tmp_path / "out"), str(source)],
+        capture_output=True, text=True,
+    )  # fmt: skip
+    assert done.returncode == 0 and "warning" not in done.stderr, done.stderr
+    assert "0 bytes spill stores, 0 bytes spill loads" in done.stderr

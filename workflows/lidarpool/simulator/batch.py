@@ -1,0 +1,33 @@
+"""The columns of a batch: those of the returns of its scans, one station after the other."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..columns.parts import PartColumns
+from .device import DeviceReturns
+from .returns import BatchReturns
+
+
+def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
+    """Make the columns of consecutive scans, and count the hits of each triangle."""
+    columns = {
+        column.name: _joined([returns.column(column) for returns in found])
+        for column in found[0].survey.stored_columns
+    }
+    tally = np.sum([returns.tally for returns in found], axis=0)
+    triangles = np.flatnonzero(tally)
+    return PartColumns(
+        found[0].specs[0].scan,
+        _joined([returns.counts for returns in found]),
+        columns,
+        triangles.astype(np.int32),
+        tally[triangles].astype(np.int64),
+    )
+
+
+def _joined(arrays: list[NDArray]) -> NDArray:  # type: ignore[type-arg]
+    return np.ascontiguousarray(arrays[0]) if len(arrays) == 1 else np.concatenate(arrays)

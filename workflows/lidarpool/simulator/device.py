@@ -1,0 +1,237 @@
+"""Columns that are made on the CUDA device: only kept values cross the bus, in the types of files.
+
+The formulas are those of `BatchReturns`, with the same bits. If a survey has other columns too, its
+kept hits cross the bus as well, and NumPy makes those. So it does with the energies of hits on
+actors, for which it needs their poses; `World` finds these hits, and the device merges them with
+its own.
+"""
+
+from __future__ import annotations
+
+import importlib.resources
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import DeviceHits, Outbox, Pattern, check_scan
+
+from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
+from ..scene.scene import Scene
+from ..sensor import ScanSpec, Survey
+from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+from .echoes import Echoes
+from .motion import Poses
+from .returns import BatchReturns
+from .surfaces import Surfaces
+from .world import World
+
+OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
+_BLOCK = 128  # threads
+_ENERGIES = "intensity", "reflectivity"
+_TRIANGLE = TABLE["triangle"]
+# In the order of columns.cu.
+_MADE = (
+    *AXES, CHANNEL, OBJECT,
+    *(TABLE[name] for name in ("ray", "time", "range", *_ENERGIES, "class")), _TRIANGLE,
+)  # fmt: skip
+_EQUAL = "sensor", "return_number", "returns"  # the same for all points
+_HITS = np.uint32, np.float64, np.int32  # rays, distances and triangles of hits for NumPy
+_NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
+
+
+@dataclass(frozen=True, eq=False)
+class DeviceReturns:
+    """Columns of some consecutive scans of one station, see `BatchReturns`."""
+
+    survey: Survey
+    specs: list[ScanSpec]
+    counts: NDArray[np.int64]  # of each scan
+    hits: NDArray[np.int64]  # of each scan, kept or not
+    tally: NDArray[np.int64]
+    columns: dict[str, NDArray[Any]]  # by name
+    returns: BatchReturns | None  # on the host, if there are columns that NumPy makes
+
+    def __len__(self) -> int:
+        return int(self.counts.sum())
+
+    def column(self, column: Column) -> NDArray[Any]:
+        """Values of a column."""
+        if column.name in self.columns:
+            return self.columns[column.name]
+        if self.returns is not None:
+            return column.make(self.returns)
+        value = self.specs[0].sensor if column.name == "sensor" else 1
+        return np.full(len(self), value, column.dtype)
+
+    def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+        """Positions of some points (k,), at least to the survey's precision: (k, 3)."""
+        if self.returns is not None:
+            return self.returns.ends(rows)
+        cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
+        return cells * self.survey.precision_m
+
+
+class DeviceColumns:
+    """Casts surveys whose rays have one return each, and makes their columns on the device."""
+
+    def __init__(self, world: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
+        self._world, self._scene, self._surfaces = world, scene, surfaces
+        self.survey = survey
+        wanted = {column.name for column in survey.stored_columns}
+        hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
+        able = {column.name for column in _MADE}
+        able -= {*(_ENERGIES if hazy or not surfaces.plain else ())}
+        able -= {axis.name for axis in AXES if survey.coordinates == "sensor"}
+        self.all_hits = not wanted <= able | {*_EQUAL}  # whether NumPy needs all hits
+        if self.all_hits and scene.actors:
+            able -= {*_ENERGIES}
+        self.made = [column for column in _MADE if column.name in wanted & able]
+        self.energies = [column for column in self.made if column.name in _ENERGIES]
+        # Whether NumPy needs hits on actors.
+        self.some_hits = bool(scene.actors and self.energies)
+        self.bodies, self._turns = surfaces.bodies()
+        self._counters = world.counters()
+        self._sent: tuple[Any, ...] | None = None
+
+    def returns(
+        self,
+        specs: list[ScanSpec],
+        pattern: Pattern,
+        poses: Poses,
+        window: tuple[int, int],
+        groups: NDArray[np.int64],
+    ) -> DeviceReturns:
+        """Cast scans, see `Rig.returns`."""
+        survey, sensor = self.survey, self.survey.carried[specs[0].sensor].sensor
+        every, reach = survey.keep_every, (sensor.min_range_m, sensor.max_range_m)
+        scan = check_scan(
+            pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
+            keep_every=every, groups=groups, tally=True,
+        )  # fmt: skip
+        others = self._world.on_actors(pattern, poses, window, reach) if poses.ways else None
+        if others is not None:  # rows of the actors' body
+            others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
+        making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
+        hits, tally = self._world.caster.visit(scan, making.make, self._counters, others)
+        assert tally is not None
+        columns, (ray, distance, triangle) = making.done()
+        one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
+        found = Echoes(
+            ray, distance, triangle, hits, tally, none,
+            energy=None, number=one, returns=one, reported=distance,
+        )  # fmt: skip
+        returns = BatchReturns(
+            self._scene, survey, self._surfaces, specs, found, pattern, window[0], poses
+        )
+        if self.some_hits:
+            for column in self.energies:
+                columns[column.name][making.rows] = column.make(returns)
+        counts, on_host = -(-hits // every), returns if self.all_hits else None
+        return DeviceReturns(survey, specs, counts, hits, tally, columns, on_host)
+
+    def sent(self, cupy: Any) -> tuple[Any, ...]:
+        """Tables of the surfaces for columns.cu, on the caster's device; see there."""
+        if self._sent is None:
+            surfaces, materials = self._surfaces, self._surfaces.materials
+            normals = surfaces.unit_normals if self.energies else np.zeros((3, 1), np.float32)
+            tables = (
+                self.bodies, surfaces.owners, normals, self._turns, materials.reflectance,
+                materials.retro.astype(np.uint8), materials.semantic_class,
+            )  # fmt: skip
+            self._sent = tuple(map(cupy.asarray, tables))
+        return self._sent
+
+
+class _Making:
+    """Columns of a batch on their way from the device to the host."""
+
+    def __init__(
+        self, maker: DeviceColumns, specs: list[ScanSpec], groups: NDArray[np.int64], most: int
+    ) -> None:
+        self._maker, self._specs, self._groups, self._most = maker, specs, groups, most
+        self._begun: _Begun | None = None
+        self._count = 0
+        self._on_actors: list[tuple[NDArray[Any], ...]] = [_NO_HITS]  # rows, and as `_HITS`
+
+    def make(self, hits: DeviceHits) -> None:
+        """Make the columns of some hits, and send them to the host."""
+        if not len(hits):
+            return
+        begun = self._begun = self._begun or self._begin(hits.cupy)
+        cp, count = hits.cupy, np.int64(len(hits))
+        asked = {*begun.out, *([_TRIANGLE] if begun.hits else [])}
+        made = {c: cp.empty(len(hits) if c in asked else 1, c.dtype) for c in _MADE}
+        wanted = np.int32(sum(1 << _MADE.index(column) for column in asked))
+        found = hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(), count
+        given = (*found, wanted, *begun.given, *made.values())
+        begun.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), given)
+        rows = slice(self._count, self._count + len(hits))
+        pairs = [(made[column], out[rows]) for column, out in begun.out.items()]
+        raw = hits.ray, hits.distance, made[_TRIANGLE]
+        pairs += [(array, out[rows]) for array, out in zip(raw, begun.hits, strict=False)]
+        begun.outbox.send(pairs)
+        if self._maker.some_hits:
+            on = cp.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
+            some = (on, hits.ray[on], hits.distance[on], hits.triangle[on])
+            at, ray, distance, triangle = (array.get() for array in some)
+            triangle += np.int32(self._maker.bodies[-1, 0])
+            self._on_actors.append((self._count + at, ray, distance, triangle))
+        self._count += len(hits)
+
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Rows of the hits on actors."""
+        return np.concatenate([rows for rows, *_ in self._on_actors])
+
+    def done(self) -> tuple[dict[str, NDArray[Any]], tuple[NDArray[Any], ...]]:
+        """Wait for all columns; returns them by name, and what NumPy needs of hits, as `_HITS`."""
+        if self._begun is None:
+            return {c.name: np.zeros(0, c.dtype) for c in self._maker.made}, _NO_HITS[1:]
+        self._begun.outbox.wait()
+        columns = {column.name: out[: self._count] for column, out in self._begun.out.items()}
+        if self._begun.hits:
+            return columns, tuple(out[: self._count] for out in self._begun.hits)
+        _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
+        return columns, tuple(hits)
+
+    def _begin(self, cupy: Any) -> _Begun:
+        """Send what the kernel reads besides hits."""
+        maker, specs = self._maker, self._specs
+        survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
+        bodies, owners, normals, turns, *materials, classes = maker.sent(cupy)
+        firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
+        outbox = Outbox(cupy)
+        given = (
+            np.float64(survey.precision_m),
+            cupy.asarray(self._groups), np.int32(len(specs)),
+            cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
+            np.int32(sensor.channels), np.int64(specs[0].start_ns),
+            bodies, owners, normals, np.int64(normals.shape[1]), turns,
+            *materials, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
+            np.float64(NEAREST_M), classes,
+        )  # fmt: skip
+        out = {column: outbox.room(self._most, column.dtype) for column in maker.made}
+        hits = [outbox.room(self._most, kind) for kind in _HITS] if maker.all_hits else []
+        return _Begun(_kernel(cupy, cupy.cuda.Device().id), given, outbox, out, hits)
+
+
+@dataclass(frozen=True, eq=False)
+class _Begun:
+    """What a batch needs from its first hits on."""
+
+    kernel: Any
+    given: tuple[Any, ...]  # arguments between hits and columns
+    outbox: Outbox
+    out: dict[Column, NDArray[Any]]  # page-locked, as all of these
+    hits: list[NDArray[Any]]  # as `_HITS`, if NumPy needs all of them
+
+
+@lru_cache(maxsize=16)
+def _kernel(cupy: Any, device: int) -> Any:
+    """Compile columns.cu for the current device, whose number is `device`, once."""
+    code = importlib.resources.files(__package__).joinpath("columns.cu").read_text("utf-8")
+    module = cupy.RawModule(code=f'#line 1 "columns.cu"\n{code}', options=OPTIONS)
+    return module.get_function("columns")
