@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
+from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
 from tests.lidarpool.casting import cast_between
 from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
 
@@ -25,7 +25,9 @@ from lidarpool.sensor.materials import Material
 from lidarpool.sensor.models import load_sensor
 from lidarpool.sensor.optics import Returns
 from lidarpool.sensor.trajectory import Stations
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.device import OPTIONS, DeviceReturns
+from lidarpool.simulator.memory import cast_bytes
 from lidarpool.simulator.rig import Rig
 from raybeam import registry
 
@@ -92,7 +94,7 @@ def same(scene, survey, backend, cuts):
     (got, tally), (want, counted) = (cast_between(rig, survey, cuts) for rig in rigs)
     for name, column in want.items():
         assert got[name] == column, name
-    assert tally == counted[: len(tally)] and not any(counted[len(tally) :])
+    assert tally == counted
     made, plain = (list(rig.cast(*cuts[:2])) for rig in rigs)
     for mine, other in zip(made, plain, strict=True):
         assert isinstance(mine, DeviceReturns)
@@ -176,6 +178,18 @@ def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeyp
             assert np.array_equal(mine.summaries[field], other.summaries[field])
         samples, exact = mine.summaries["samples"], other.summaries["samples"]
         assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
+
+
+@pytest.mark.parametrize("more", [{}, MORE["a user's column"]], ids=["", "hits"])
+def test_the_hosts_memory_is_what_was_estimated(more, scenes, backend, monkeypatch):
+    taken = []
+    monkeypatch.setattr(HOST.cuda, "alloc_pinned_memory", lambda n: taken.append(n) or bytearray(n))
+    survey = replace(MADE["on the move"], **more)
+    columns_of(list(Rig(scenes["plain"], survey, backend).cast(0, 14)))
+    assert 0 < sum(taken) < cast_bytes(scenes["plain"], survey, 14, on_device=True)
+    assert cast_bytes(scenes["plain"], survey, 14, on_device=True) < cast_bytes(
+        scenes["plain"], survey, 14
+    )
 
 
 @pytest.mark.parametrize("card", ["75", "120"])

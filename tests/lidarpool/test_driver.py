@@ -216,7 +216,7 @@ class Run:
         self.committed = []
         self.driver = SurveyDriver(
             self.workers, self.stages, SURVEY, self.db, self.storage, None,
-            self.frames.append, self.committed.extend,
+            self.frames.append, self.committed.extend, SCANS,
         )  # fmt: skip
         self.driver.start()
 
@@ -285,7 +285,7 @@ def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
     framed = len(run.frames)
     later = SurveyDriver(
         run.workers, run.stages, SURVEY, run.db, run.storage, None,
-        run.frames.append, run.committed.extend,
+        run.frames.append, run.committed.extend, SCANS,
     )  # fmt: skip
     run.workers.tried.clear()
     run.workers.casts.clear()

@@ -153,9 +153,10 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     assert outcome.code == 2
     said = json.loads(outcome.out)
     assert said["can_run"] is False
-    assert len(said["reasons"]) == 2 and said["estimate"] is None
+    assert len(said["reasons"]) == 3 and said["estimate"] is None
     assert "is a file" in said["reasons"][0]
-    assert "There are 0.95 MiB of memory" in said["reasons"][1]
+    assert "Casting one scan takes about 1 MB, more than the 0 MB" in said["reasons"][1]
+    assert "There are 0.95 MiB of memory" in said["reasons"][2]
 
 
 def test_a_backend_that_is_not_here(check, monkeypatch):

@@ -42,15 +42,33 @@ _HITS = np.uint32, np.float64, np.int32  # rays, distances and triangles of hits
 _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
 
+def _able(survey: Survey) -> set[str]:
+    """Names of the columns that a device can make for a survey."""
+    hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
+    several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+    shining = any(
+        m.reflectance == "texture" or m.roughness is not None or (several and m.material)
+        for m in survey.materials
+    )
+    able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
+    return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
+
+
+def needs_hits(survey: Survey) -> bool:
+    """Whether NumPy makes a column, so that all kept hits leave the device."""
+    return not {column.name for column in survey.stored_columns} <= _able(survey) | {*_EQUAL}
+
+
 @dataclass(frozen=True, eq=False)
 class DeviceReturns:
     """Columns of some consecutive scans of one station, see `BatchReturns`."""
 
+    scene: Scene
     survey: Survey
     specs: list[ScanSpec]
     counts: NDArray[np.int64]  # of each scan
     hits: NDArray[np.int64]  # of each scan, kept or not
-    tally: NDArray[np.int64]
+    tally: tuple[NDArray[np.intp], NDArray[np.int64]]
     columns: dict[str, NDArray[Any]]  # by name
     returns: BatchReturns | None  # on the host, if there are columns that NumPy makes
 
@@ -80,12 +98,8 @@ class DeviceColumns:
     def __init__(self, world: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
         self._world, self._scene, self._surfaces = world, scene, surfaces
         self.survey = survey
-        wanted = {column.name for column in survey.stored_columns}
-        hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
-        able = {column.name for column in _MADE}
-        able -= {*(_ENERGIES if hazy or not surfaces.plain else ())}
-        able -= {axis.name for axis in AXES if survey.coordinates == "sensor"}
-        self.all_hits = not wanted <= able | {*_EQUAL}  # whether NumPy needs all hits
+        wanted, able = {column.name for column in survey.stored_columns}, _able(survey)
+        self.all_hits = needs_hits(survey)
         if self.all_hits and scene.actors:
             able -= {*_ENERGIES}
         self.made = [column for column in _MADE if column.name in wanted & able]
@@ -120,7 +134,7 @@ class DeviceColumns:
         columns, (ray, distance, triangle) = making.done()
         one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
         found = Echoes(
-            ray, distance, triangle, hits, tally, none,
+            ray, distance, triangle, hits, None, none,
             energy=None, number=one, returns=one, reported=distance,
         )  # fmt: skip
         returns = BatchReturns(
@@ -130,7 +144,10 @@ class DeviceColumns:
             for column in self.energies:
                 columns[column.name][making.rows] = column.make(returns)
         counts, on_host = -(-hits // every), returns if self.all_hits else None
-        return DeviceReturns(survey, specs, counts, hits, tally, columns, on_host)
+        met = np.flatnonzero(tally)
+        return DeviceReturns(
+            self._scene, survey, specs, counts, hits, (met, tally[met]), columns, on_host
+        )
 
     def sent(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -41,7 +42,13 @@ class BatchReturns:
         self.scene, self.survey = scene, survey
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
-        self.specs, self.found = specs, found
+        self.specs = specs
+        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
+        # would be kept for each station of a batch.
+        hits = np.zeros(0, np.int64) if found.tally is None else found.tally
+        triangles = np.flatnonzero(hits)
+        self.tally = triangles, hits[triangles]
+        self.found = replace(found, tally=None)
         self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
@@ -53,11 +60,6 @@ class BatchReturns:
     def hits(self) -> NDArray[np.int64]:
         """Returns of each scan, kept or not: (scans,)."""
         return self.found.hits
-
-    @property
-    def tally(self) -> NDArray[np.int64]:
-        """Returns of each counter of the scene, kept or not."""
-        return np.asarray(self.found.tally)
 
     def column(self, column: Column) -> NDArray[Any]:
         """Values of a column."""

@@ -14,7 +14,7 @@ from raybeam import Pattern
 
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import Pose, ScanSpec, Survey, Trajectory
+from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
 from .device import DeviceColumns, DeviceReturns
 from .echoes import PATTERN_RAYS, EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
@@ -34,6 +34,16 @@ class _Rays(NamedTuple):
     # Whether they are one firing in the axes of the head, each firing with a pose of its own; else
     # they are in the axes of the carrier.
     by_head: bool = False
+
+
+def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
+    """Whether a sensor's rays are made once and cast again and again, and whether by its head.
+
+    By the head they are one firing, and each firing has a pose of its own.
+    """
+    fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
+    by_head = sensor.spins(np.zeros(1, np.int64)) is not None and (moves or not fits)
+    return fits or by_head, by_head
 
 
 class Rig:
@@ -64,16 +74,14 @@ class Rig:
         made = self._made.get((number, moves))
         if made is None:
             sensor = self.survey.carried[number].sensor
-            period = sensor.period or 0
-            fits = 0 < period * sensor.channels <= PATTERN_RAYS
-            heads = sensor.spins(np.zeros(1, np.int64)) is not None
+            repeats, by_head = rays_repeat(sensor, moves)
             made = _Rays(None, None)
-            if heads and (moves or not fits):
+            if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
                 made = _Rays(pattern, self._echoes.divided(sensor, pattern), by_head=True)
-            elif fits:
-                made = self._rays_of(number, 0, period)
+            elif repeats:
+                made = self._rays_of(number, 0, sensor.period or 0)
             self._made[number, moves] = made
         return made
 

@@ -79,12 +79,6 @@ class Surfaces:
         """Materials of objects, the same at all wavelengths but for their reflectance."""
         return next(iter(self._tables.values()))
 
-    @property
-    def plain(self) -> bool:
-        """Whether an object has one reflectance, and no gloss."""
-        table = self.materials
-        return len(self._tables) == 1 and not table.textured and not table.roughness.any()
-
     def at(self, wavelength_nm: float) -> MaterialTable:
         """Materials of objects at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
