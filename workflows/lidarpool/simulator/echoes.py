@@ -213,11 +213,13 @@ class EchoCaster:
         energy = colour = None
         if self._noise.angle_deg:
             origins, directions = poses.rays(pattern, found.ray, window[0])
+            times = poses.times(found.ray)
             if self._textured:
-                ends = origins + found.distance[:, None] * directions
-                times = poses.times(found.ray)
+                ends = directions * found.distance[:, None]
+                ends += origins
                 colour = self._surfaces.colours(found.triangle, ends, times, poses.ways)
-            normals = self._surfaces.normals(found.triangle, poses.times(found.ray), poses.ways)
+                del ends  # which takes as much memory as the normals
+            normals = self._surfaces.normals(found.triangle, times, poses.ways)
             along = products(normals.T, directions.T)
             energy = self._energy(sensor, found.triangle, np.abs(along), found.distance, colour)
         one = np.ones(len(found), np.uint8)
