@@ -324,7 +324,7 @@ def test_an_image_is_sent_once_whatever_shares_it():
     assert len(Scene.from_meshes(many).colours.images) == 2
 
 
-def test_textures_are_the_reflectance():
+def test_textures_are_the_reflectance(caplog):
     bare = Mesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
     scene = Scene.from_meshes([textured(), bare])
     materials = [Material("*", 0.4), Material("Hills", "texture", scale=0.8)]
@@ -337,7 +337,7 @@ def test_textures_are_the_reflectance():
     grey, found = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity",
                         materials=[Material("*", "texture")])  # fmt: skip
     usual, _ = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity")
-    assert (found == 188).all()
+    assert (found == 188).all() and "nothing in the scene has colours" in caplog.text
     np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
 
 

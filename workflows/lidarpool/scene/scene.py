@@ -293,12 +293,12 @@ class Scene:
         return tuple(name for i, name in enumerate(self.all_names) if i in owners)
 
     @property
-    def coloured(self) -> bool:
-        """Whether something in it has colours."""
+    def coloured(self) -> list[Colours]:
+        """Colours of all that has some: the faces, parts of instances, actors."""
         parts = self.instances.parts if self.instances else ()
         found = [self.colours, *(part.colours for part in parts)]
         found += [actor.mesh.colours for actor in self.actors]
-        return any(colours is not None for colours in found)
+        return [colours for colours in found if colours is not None]
 
     @property
     def triangles(self) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterable
 from copy import copy
 from functools import cached_property
@@ -15,6 +16,8 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey, Trajectory
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from .motion import into_axes, products
+
+_log = logging.getLogger(__name__)
 
 BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
@@ -36,6 +39,15 @@ class Light(NamedTuple):
 def light_of(survey: Survey, sensor: Sensor) -> Light:
     """Light of a sensor in the air of a survey."""
     return Light(sensor.optics.wavelength_nm, survey.extinction(sensor))
+
+
+def warn_of_grey(scene: Scene, survey: Survey) -> None:
+    """Warn if a survey is to take colours for reflectance, and nothing has colours."""
+    if not scene.coloured and any(m.reflectance == "texture" for m in survey.materials):
+        _log.warning(
+            "a material has reflectance: texture, but nothing in the scene has colours, so that "
+            "all is grey; in Python, Scene.load(path, colours=True) reads them"
+        )
 
 
 class Surfaces:
