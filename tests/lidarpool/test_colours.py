@@ -276,12 +276,13 @@ def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
     assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
 
 
-def test_large_images_are_made_smaller(tmp_path, monkeypatch):
+def test_large_images_are_made_smaller(tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(masks, "SIDE_MOST", 36)
     header, body = opaque(png())
     write(tmp_path / "m.glb", glb(header, body))
     (picture,) = Scene.load(tmp_path / "m.glb", colours=True).colours.images
     assert picture.shape == (24, 36, 3)
+    assert "has images of 288 x 192 pixels, taken at 36 at most on a side" in caplog.text
 
 
 def textured():
@@ -418,6 +419,7 @@ def test_colours_that_do_not_fit_are_refused():
         Colours.plain(GREY, 3),
         Colours((GREY,), np.ones(128, np.int32)),
         Colours((PICTURE,), np.zeros(128, np.int32)),
+        Colours((PICTURE,), np.zeros(128, np.int32), np.full((128, 3, 2), np.nan, np.float32)),
         Colours((GREY.astype(float),), np.zeros(128, np.int32)),
     ):
         with pytest.raises(LidarpoolError, match="do not fit its 128 faces"):

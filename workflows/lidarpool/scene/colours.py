@@ -20,6 +20,7 @@ GREY = np.full((1, 1, 3), 188, np.uint8)
 WHITE = np.full((1, 1, 3), 255, np.uint8)
 WEIGHTS = np.array([0.2126, 0.7152, 0.0722])  # luminance of linear light, ITU-R BT.709
 BLOCK_FACES = 1 << 16
+_FLAT = 1e-200  # m⁴: the square of the area of a triangle that no ray hits, twice
 
 _byte = np.arange(256) / 255
 # {sRGB byte: linear light}, IEC 61966-2-1
@@ -92,10 +93,11 @@ class Colours:
         well = all(one is None or one.shape == shape for one, shape in shapes)
         well &= all(one.dtype == np.uint8 and one.shape[2:] == (3,) for one in self.images)
         well &= all(one.size == 3 or (one.size > 3 and self.uv is not None) for one in self.images)
+        well &= self.uv is None or bool(np.isfinite(self.uv).all())
         if not well or not _within(self.image, len(self.images)):
             raise LidarpoolError(
                 f"The colours of {name!r} do not fit its {faces} faces: images are uint8 "
-                "(h, w, 3), image (f,), uv (f, 3, 2) and corners (f, 3, 3)."
+                "(h, w, 3), image (f,), uv (f, 3, 2), finite, and corners (f, 3, 3)."
             )
 
     def means(self) -> Bytes:
@@ -217,7 +219,7 @@ def _planes(corners: NDArray[np.float64], values: NDArray[np.float64]) -> NDArra
     a, b, c = corners.transpose(1, 0, 2)
     normal = np.cross(b - a, c - a)
     area = (normal * normal).sum(axis=1, keepdims=True)
-    scale = np.divide(1, area, out=np.zeros_like(area), where=area > 0)
+    scale = np.divide(1, area, out=np.zeros_like(area), where=area > _FLAT)
     along_b, along_c = np.cross(c - a, normal) * scale, np.cross(normal, b - a) * scale
     out = np.empty((len(corners), values.shape[2], 4))
     for value, (first, second, third) in enumerate(values.transpose(2, 1, 0)):

@@ -283,7 +283,8 @@ class _Effects:
             raise MaskError(f"its image {name[-80:]!r} is not there")
         self._allowance.grow(found.stat().st_size)
         along, across = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
-        return Texture(read_colours(found, self._allowance), (along, across), self._allowance)
+        image = read_colours(found, self._allowance, self.notes)
+        return Texture(image, (along, across), self._allowance)
 
 
 def _faces(primitive: Element, points: Float, corners: Callable[[Element], Int]) -> Iterator[Int]:

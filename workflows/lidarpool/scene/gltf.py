@@ -14,7 +14,7 @@ import re
 import struct
 from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import unquote_to_bytes
@@ -26,6 +26,7 @@ from ..base.allowance import Allowance
 from .beside import file_beside, spellings
 from .colours import LINEAR, WHITE, Colours, as_srgb
 from .masks import (
+    FACE_BYTES,
     Colour,
     MaskError,
     MaskNotes,
@@ -240,7 +241,8 @@ class _Reader:
     ) -> Colours | None:
         """Colours of triangles; None if they have none."""
         number, corners, colours = primitive.get("material"), None, None
-        self._allowance.take(40 * len(faces))
+        if not self._allowance.fits(FACE_BYTES * len(faces)):
+            raise MaskError("there are too many triangles")
         if "COLOR_0" in primitive["attributes"]:
             light = self._normalised(self._attribute("COLOR_0", primitive, mesh))
             check_corners(faces, len(light))
@@ -267,7 +269,7 @@ class _Reader:
     def _read_shades(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
         """Texture of an image, by which a colour is multiplied, and how it goes on."""
         image, light, along, across = key
-        found = self._image(image, read_colours)
+        found = self._image(image, partial(read_colours, notes=self.notes))
         if light != (1.0, 1.0, 1.0):
             scaled = [as_srgb(LINEAR * share) for share in light]
             found = np.stack([by[found[..., k]] for k, by in enumerate(scaled)], axis=-1)

@@ -54,15 +54,17 @@ def read_opacity(
     return _read(image, lambda opened: _decoded(opened, allowance, grey))
 
 
-def read_colours(image: Path | bytes, allowance: Allowance) -> Colour:
-    """Colours of an image, at most `SIDE_MOST` wide and high: (h, w, 3), sRGB.
+def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Colour:
+    """Colours of an image: (h, w, 3), sRGB.
+
+    It is made smaller if it is more than `SIDE_MOST` wide or high, and noted.
 
     Raises
     ------
     MaskError
         As `read_opacity`.
     """
-    return _read(image, lambda opened: _in_colour(opened, allowance))
+    return _read(image, lambda opened: _in_colour(opened, allowance, notes))
 
 
 def _read(image: Path | bytes, decoded: Callable[[Image.Image], V]) -> V:
@@ -127,13 +129,14 @@ def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np
     return np.asarray(image.convert("L"))
 
 
-def _in_colour(image: Image.Image, allowance: Allowance) -> Colour:
+def _in_colour(image: Image.Image, allowance: Allowance, notes: MaskNotes) -> Colour:
     if not allowance.fits(PIXEL_BYTES * image.width * image.height):
         raise _TooLargeError
     if image.mode.startswith("I;16"):  # which Pillow would clip
         image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
     image = image.convert("RGB")
     if max(image.size) > SIDE_MOST:
+        notes.large.append(f"{image.width:,} x {image.height:,}")
         image.thumbnail((SIDE_MOST, SIDE_MOST), Image.Resampling.BOX)
     allowance.take(3 * image.width * image.height)
     return np.asarray(image)
@@ -232,6 +235,7 @@ class MaskNotes:
         self.unread: dict[str, str] = {}  # {material: why its triangles are solid}
         self.grey: dict[str, str] = {}  # {material: why its triangles have no colour}
         self.glass: dict[str, None] = {}  # in order
+        self.large: list[str] = []  # sizes of images of colours that are made smaller
         self.gone: list[str] = []  # files of materials that are not there
 
     def instead(self, material: str) -> _Instead:
@@ -253,6 +257,9 @@ class MaskNotes:
             if found:
                 shown = _some([f"{name} ({why})" for name, why in found.items()])
                 out.append(f"has {what} that cannot be read, so that these materials {so}: {shown}")
+        if self.large:
+            sizes = _some(self.large)
+            out.append(f"has images of {sizes} pixels, taken at {SIDE_MOST:,} at most on a side")
         if self.glass:
             out.append(
                 f"has transparent materials without holes, taken as solid: {_some([*self.glass])}; "

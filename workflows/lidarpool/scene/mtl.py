@@ -209,7 +209,7 @@ class Materials:
     def _read_image(self, key: tuple[str, bool]) -> Texture:
         name, clamped = key
         wrap: Wrap = "clamp" if clamped else "repeat"
-        image = read_colours(self._there(name), self._allowance)
+        image = read_colours(self._there(name), self._allowance, self._notes)
         return Texture(image, (wrap, wrap), self._allowance)
 
     def _there(self, name: str) -> Path:
