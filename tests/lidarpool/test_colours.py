@@ -52,7 +52,7 @@ from lidarpool.scene.colours import (
     told,
     unpacked,
 )
-from lidarpool.scene.drawn import Drawn
+from lidarpool.scene.drawn import Drawn, cut
 from lidarpool.scene.scene_file import write_scene
 from lidarpool.sensor.materials import DARKEST, reflectances
 
@@ -411,6 +411,20 @@ def test_pictures_and_the_page_have_the_mean_of_each_face():
     np.testing.assert_allclose(arrays["colours"][:, 0], means, atol=1)
     plain = mesh.colours.image == 1
     assert (means[plain & (np.arange(len(means)) % 2 == 0)] == [250, 40, 10]).all()
+
+
+def test_leaves_are_drawn_in_the_colours_of_their_images(tmp_path):
+    image = np.dstack([BLOCKS[:4, :4].repeat(8, 0).repeat(8, 1), np.full((32, 32), 255, np.uint8)])
+    image[:16, :, 3] = 0  # its upper half is not there
+    header, body = card(png(image))
+    write(tmp_path / "m.glb", glb(header, body))
+    scene = Scene.load(tmp_path / "m.glb", up_axis="z", colours=True)
+    assert scene.masked
+    drawn = Drawn.of(cut(scene)).scene
+    middles, means = drawn.vertices[drawn.faces].mean(axis=1), drawn.colours.means()
+    u, v = (middles[:, 1] + 2) / 4, (2 - middles[:, 2]) / 4
+    want = BLOCKS[np.floor(v * 4).astype(int).clip(0, 3), np.floor(u * 4).astype(int).clip(0, 3)]
+    assert (means == want).all(axis=1).mean() > 0.8 and v.min() > 0.45
 
 
 def test_colours_that_do_not_fit_are_refused():

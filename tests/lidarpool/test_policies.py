@@ -36,7 +36,7 @@ A, B = "tcp://a:1", "tcp://b:1"
 
 def batch(number, place=Place.WAITING, worker="", collector="", suspect=""):
     deaths = Counter({suspect: SUSPECT_DEATHS} if suspect else {})
-    return Batch(number, number + 1, number, place, 0.0, 1, str(number), worker, collector, deaths)
+    return Batch(number, number + 1, number, place, 0.0, str(number), worker, collector, deaths)
 
 
 def casting(number, worker, suspect=""):

@@ -159,6 +159,15 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     assert "There are 0.95 MiB of memory" in said["reasons"][2]
 
 
+def test_a_scenario_with_errors_gives_json_too(check):
+    outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0]]}))
+    assert outcome.code == 2 and "poses[0].position[2] is missing" in outcome.err
+    said = json.loads(outcome.out)
+    assert said["can_run"] is False and said["notes"] == []
+    assert f"lidarpool: {said['reasons'][0]}" == outcome.err.strip()
+    assert check(text="poses: 7").out == ""
+
+
 def test_a_backend_that_is_not_here(check, monkeypatch):
     if not available_backends()["cuda"]:
         pytest.skip("there is a GPU")

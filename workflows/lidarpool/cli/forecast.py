@@ -62,6 +62,7 @@ FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most
 
 # Rays that are cast at most, whole scans of them, and the least and most scans.
 SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
+SAMPLE_MOST = 20_000_000  # rays beyond which fewer scans are cast, one at least
 
 
 def forecast(
@@ -214,7 +215,9 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     """
     rig = Rig(scene, survey, backend)
     all_rays = survey.ray_count * survey.returns.subrays
-    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, *SAMPLE_SCANS)
+    least, most = SAMPLE_SCANS
+    few = max(1, SAMPLE_MOST * survey.scan_count // all_rays)
+    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, min(least, few), most)
     rays = hits = points = 0
     for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
         rays += survey.scan(scan).ray_count
@@ -283,7 +286,9 @@ def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     other = PROCESS_BYTES + PARTICLE_BYTES * swarm
     piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
-    shown = min(job.scene.triangles, job.scene.kept_triangles + DRAWN_TRIANGLES)
+    shown = job.scene.kept_triangles + DRAWN_TRIANGLES
+    if not job.scene.masked:  # which is cut into more
+        shown = min(job.scene.triangles, shown)
     driver = (
         2 * SCENE_BYTES * shown + _copies_bytes(job) + SCAN_BYTES * job.survey.scan_count + piece
     )

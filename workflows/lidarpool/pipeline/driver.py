@@ -207,7 +207,6 @@ class SurveyDriver:
         for task, worker in chosen:
             key = self._workers.cast([(batch.first, batch.stop) for batch in task], worker)
             for batch in task:
-                batch.offers += 1
                 batch.key, batch.worker, batch.collector = key, worker, ""
                 batch.to(Place.CASTING, time.monotonic())
                 self._trace("submit", INTERSECT, batch.scans)
@@ -216,7 +215,7 @@ class SurveyDriver:
     def _check_casts(self) -> bool:
         moved = False
         for batch in self.batches.at(Place.CASTING):
-            outcome = self._workers.outcome(batch.key, batch.name)
+            outcome = self._workers.outcome(batch.key)
             if outcome is Outcome.DONE:
                 batch.to(Place.CAST, time.monotonic())
                 self.cast += len(batch)

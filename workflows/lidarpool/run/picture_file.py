@@ -18,7 +18,7 @@ from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
 from ..scene.actors import Actor
 from ..scene.colours import Colours
-from ..scene.drawn import Drawn
+from ..scene.drawn import Drawn, cut
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..sensor import Survey, Track
@@ -78,7 +78,7 @@ class Pictured:
         scene, survey = result.scene, result.survey
         actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
         ways = sensor_ways(survey)
-        drawn = Drawn.of(scene, near=[way.positions for way in ways])
+        drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         return cls(
             replace(drawn.scene, actors=actors),
             ways,

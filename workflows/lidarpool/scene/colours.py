@@ -81,6 +81,13 @@ class Colours:
         corners = None if self.corners is None else self.corners[rows]
         return Colours(self.images, self.image[rows], uv, corners)
 
+    def divided(self, rows: NDArray[np.integer[Any]], weights: NDArray[np.float64]) -> Colours:
+        """Colours of pieces of faces (k,), whose corners have these weights of theirs (k, 3, 3)."""
+        whole = self.take(rows)
+        uv = None if whole.uv is None else (weights @ whole.uv).astype(np.float32)
+        corners = None if whole.corners is None else (weights @ whole.corners).astype(np.uint8)
+        return replace(whole, uv=uv, corners=corners)
+
     def mirrored(self) -> Colours:
         """Reverse the order of the corners."""
         uv = None if self.uv is None else self.uv[:, ::-1]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from .scene import Scene
 
 DRAWN_TRIANGLES = 2_000_000  # of instances; of more, each gets its share of fewer
 PART_LEAST = 32  # triangles of a simplified part
+CUT_TRIANGLES, CUT_STEPS = 50_000, 128  # of a part with a mask, and of a triangle's edge
 _PLACES = 200  # to which distances are measured
 
 
@@ -76,6 +77,48 @@ class Drawn:
         share = area / np.bincount(self.counter, area, len(counts))[self.counter]
         moving = sum(len(actor.mesh.faces) for actor in self.scene.actors)
         return np.append(counts[self.counter] * share, counts[len(counts) - moving :])
+
+
+def cut(scene: Scene) -> Scene:
+    """Return a scene for pictures: in place of triangles with masks small ones, where it is opaque.
+
+    Its counters are the same.
+    """
+    shared = scene.instances
+    masked = sum(part.mask is not None for part in shared.parts) if shared else 0
+    if shared is None or not masked:
+        return scene
+    places = np.bincount(shared.part, minlength=len(shared.parts))
+    parts = tuple(
+        _cut(part, min(CUT_TRIANGLES, DRAWN_TRIANGLES / (masked * count)))
+        for part, count in zip(shared.parts, places.tolist(), strict=True)
+    )
+    return replace(scene, instances=replace(shared, parts=parts))
+
+
+def _cut(part: Part, most: float) -> Part:
+    """Divide a part with a mask into about so many pieces, and keep those that are opaque.
+
+    A piece is asked at a random place: the share that is kept is right, however fine the mask.
+    """
+    if part.mask is None or part.uv is None:
+        return part
+    steps = int(np.clip((most / len(part.faces)) ** 0.5, 1, CUT_STEPS))  # of an edge
+    i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
+    # Those beyond the diagonal are turned by 180 degrees, into the gaps between the others.
+    first = np.stack([[i, j], [i + 1, j], [i, j + 1]], axis=-1).transpose(1, 2, 0)
+    pieces = np.where((i + j < steps)[:, None, None], first, steps - first)
+    corners = np.concatenate([pieces, steps - pieces.sum(axis=2, keepdims=True)], axis=2) / steps
+    places = np.random.default_rng(0).dirichlet(np.ones(3), (len(part.faces), len(pieces)))
+    u, v = np.einsum("fpc,pck,fkx->xfp", places, corners, part.uv.astype(np.float64), optimize=True)
+    height, width = part.mask.shape
+    row, column = (v % 1 * height).astype(int), (u % 1 * width).astype(int)
+    opaque = part.mask[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+    opaque[0, 0] |= not opaque.any()  # no part is empty
+    face, piece = np.nonzero(opaque)
+    vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
+    colours = part.colours and part.colours.divided(face, corners[piece])
+    return Part(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), colours=colours)
 
 
 def _shares(

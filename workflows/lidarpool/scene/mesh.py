@@ -51,7 +51,7 @@ class Mesh:
     cutouts
         Of the last faces, one cutout after the other.
     colours
-        Of the faces; None if it has none.
+        Of the faces, see `lidarpool.scene.colours.Colours`; None if it has none.
 
     Raises
     ------

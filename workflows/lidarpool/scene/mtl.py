@@ -232,7 +232,7 @@ def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
     for line in data.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
         key, _, rest = line.strip().partition(b" ")
         if key == b"newmtl":
-            entry = entries[rest.strip()] = _Entry()
+            entry = entries.setdefault(rest.strip(), _Entry())
         elif key.lower() in (b"map_d", b"map_kd") and rest.strip():
             entry.images[key.lower()] = _Image.of(rest)
         elif key == b"Kd":
