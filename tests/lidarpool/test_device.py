@@ -19,6 +19,7 @@ from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scene, Surv
 from lidarpool.columns.parts import pack
 from lidarpool.pipeline import cast
 from lidarpool.scene.actors import box
+from lidarpool.scene.colours import Colours
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import Material
 from lidarpool.sensor.models import load_sensor
@@ -57,7 +58,10 @@ def backend(source_backend, monkeypatch):  # noqa: F811
 @pytest.fixture(scope="module")
 def scenes():
     """The same objects as parts of the scene, and as instances: all, or beside others."""
-    objects = seed_objects(rings=8, segments=12)
+    objects = []
+    for k, mesh in enumerate(seed_objects(rings=8, segments=12)):
+        colours = np.random.default_rng(k).integers(0, 256, (len(mesh.faces), 3), np.uint8)
+        objects.append(replace(mesh, colours=Colours.of_faces(colours)))
     copies = []
     for k, stretch in enumerate((1, 2, -1, 1, 1, 0.5)):
         matrix = np.diag([stretch, 1, 1, 1.0])
@@ -138,6 +142,10 @@ MORE = {
     "haze": {"visibility_km": 2.0},
     "the sensor's axes": {"coordinates": "sensor"},
     "only angles": {"columns": ("elevation",), "keep_every": 4},
+    "colours": {"columns": ("red", "blue", "time")},
+    "textures": {"materials": [Material("*", "texture", scale=0.7)]},
+    "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
+    "a measured material": {"materials": [Material("*", material="asphalt, dry")]},
 }
 
 

@@ -24,6 +24,7 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarpool.scene.colours import Colours
 from lidarpool.sensor.survey import OPTIONAL_NAMES
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.memory import TRIANGLE, cast_bytes, scans_that_fit
@@ -32,7 +33,10 @@ from lidarpool.simulator.rig import Rig
 RAYS = 600_000
 
 BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
-SCENE = Scene.from_meshes([Mesh("Ball", np.array(BALL.vertices), np.array(BALL.faces))])
+COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
+SCENE = Scene.from_meshes(
+    [Mesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS)]
+)
 
 DELAYS = 300.0 * np.arange(128)
 MANY = Sensor(Beams(np.radians(np.linspace(-22, 22, 128)), time_ns=DELAYS), Spin(2048))
@@ -41,6 +45,7 @@ STILL = {"poses": [(0, 0, 1)], "steps": 10_000}
 WAY = {"trajectory": Track([0, 60], [(0, 0, 1), (2, 0, 1)], [[0, 0, 0, 1], [0, 0, 1, 0]])}
 ALL = {"columns": OPTIONAL_NAMES}
 HALF = [Material("*", 0.5)]
+PAINT = {"columns": ["intensity", "red", "green", "blue"], "materials": [Material("*", "texture")]}
 
 SURVEYS = {
     "positions": Survey(MANY, **STILL),
@@ -50,6 +55,8 @@ SURVEYS = {
     "rays that never repeat": Survey(load_sensor("livox/mid40", step_deg=30), **STILL),
     "noise of angles": Survey(MANY, **STILL, noise=Noise(angle_deg=0.01)),
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
+    "colours": Survey(MANY, **STILL, **PAINT),
+    "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
 }
 

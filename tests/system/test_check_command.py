@@ -7,6 +7,7 @@ import re
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import trimesh
 import yaml
 from distributed import Client
 from tests.clusters import thread_cluster
+from tests.lidarpool.meshes import PLY
 
 import lidarpool.cli.forecast
 from lidarpool import simulate
@@ -93,6 +95,19 @@ def test_json_is_all_that_is_printed(check):
     assert list(said["slots"]) == ["GPU", "LIDAR"]
     assert said["disk"]["free"] > said["disk"]["result"] > 0
     assert said["memory"]["needed"] > 200e6
+
+
+def test_colours_are_counted_by_file_where_they_are_read(check, tmp_path):
+    road = Path(__file__).parents[2] / "examples" / "road.glb"
+    shutil.copy(road, tmp_path)
+    (tmp_path / "m.ply").write_text(PLY)
+    scenario = SHORT | {"scene": ["road.glb", "m.ply"], "poses": [[0, 0, 2]]}
+    scenario["cloud"] = {"columns": ["red"]}
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    assert "colours     road.glb: 1 texture, 2 plain colours\n" in told
+    assert "colours     m.ply: no colours\n" in told
+    del scenario["cloud"]
+    assert "\ncolours" not in check("--no-plan", text=json.dumps(scenario)).out
 
 
 def test_objects_with_masks_are_named(check, tmp_path):

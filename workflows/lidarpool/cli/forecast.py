@@ -49,6 +49,7 @@ from .run_command import no_hits
 PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles what calls Embree
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
+COLOURED_BYTES = 160  # of a triangle with colours, and four times the bytes of images
 COPY_BYTES = 2000  # of an instance, likewise
 RAY_BYTES = 48  # of a turn, and of the pattern made of it
 PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
@@ -271,7 +272,9 @@ def _worker_bytes(job: Job) -> int:
     each = job.survey.returns.subrays
     rays = sum(min((s.period or 0) * s.channels * each, PATTERN_RAYS) for s in sensors)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
-    return PROCESS_BYTES + triangles + _copies_bytes(job) + RAY_BYTES * rays
+    images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
+    coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())
+    return PROCESS_BYTES + triangles + coloured + _copies_bytes(job) + RAY_BYTES * rays
 
 
 def _copies_bytes(job: Job) -> int:

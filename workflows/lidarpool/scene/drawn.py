@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from .colours import Colours, joined
 from .instances import Instances, Part
 from .mesh import stacked, triangle_areas
 from .scene import Scene
@@ -44,22 +45,28 @@ class Drawn:
         shares = _shares(shared, most, near)
         meshes = [(scene.vertices, scene.faces)]
         owners, counters = [scene.face_object], [np.arange(faces)]
+        colours = [scene.colours]
         mirrored = np.linalg.det(shared.transforms[:, :, :3]) < 0
         for number, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
             part = shared.parts[number]
-            vertices, own = part.vertices, part.faces
+            vertices, own, kept = part.vertices, part.faces, np.arange(len(part.faces))
             size = max(PART_LEAST, int(len(own) * share))
             if size < len(own):
-                vertices, own = _fewer(part, size)
+                vertices, own, kept = _fewer(part, size)
+            shown = part.colours and Colours.of_faces(part.colours.take(kept).means())
             for row in np.flatnonzero((shared.part == number) & (shares == share)):
                 matrix = shared.transforms[row]
                 corners = own[:, ::-1] if mirrored[row] else own
                 meshes.append((vertices @ matrix[:, :3].T + matrix[:, 3], corners))
                 owners.append(np.full(len(own), shared.owner[row]))
                 counters.append(np.full(len(own), faces + row))
+                colours.append(shown)
         vertices, triangles = stacked(meshes)
         owner = np.concatenate(owners).astype(np.int32)
-        drawn = Scene(vertices, triangles, owner, scene.names, scene.origin, scene.actors)
+        coloured = joined(colours, map(len, owners))
+        drawn = Scene(
+            vertices, triangles, owner, scene.names, scene.origin, scene.actors, colours=coloured
+        )
         return cls(drawn, np.concatenate(counters))
 
     def hits(self, counts: NDArray[Any]) -> NDArray[Any]:
@@ -110,7 +117,8 @@ def _cut(part: Part, most: float) -> Part:
     opaque[0, 0] |= not opaque.any()  # no part is empty
     face, piece = np.nonzero(opaque)
     vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
-    return Part(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3))
+    colours = part.colours and part.colours.divided(face, corners[piece])
+    return Part(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), colours=colours)
 
 
 def _shares(
@@ -139,8 +147,10 @@ def _shares(
         full *= 0.9
 
 
-def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices and at most so many faces that stand for a part.
+def _fewer(
+    part: Part, most: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.intp]]:
+    """Vertices and at most so many faces that stand for a part, and which each was.
 
     Of many small pieces, as a tree's leaves are, merged vertices would leave little. There the
     largest triangles stay, as of trunk and boughs, and a choice of the others, made larger for all
@@ -149,7 +159,7 @@ def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32
     pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)  # half as many in one surface
     vertices, faces, kept, _ = _merged(part.vertices, part.faces, most)
     if not pieces and len(kept) >= most // 4:
-        return vertices, faces[kept]
+        return vertices, faces[kept], kept
     corners = part.vertices[part.faces]
     order = np.argsort(-triangle_areas(corners), kind="stable")
     large, small = np.split(order, [most // 4])
@@ -157,10 +167,11 @@ def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32
     scale = np.ones(most)
     long = np.linalg.norm(corners[some] - np.roll(corners[some], 1, axis=1), axis=2).max(axis=1)
     scale[len(large) :] = (len(small) / len(some)) ** 0.5 * np.minimum(1, np.median(long) / long)
-    chosen = corners[np.append(large, some)]
+    kept = np.append(large, some)
+    chosen = corners[kept]
     middle = chosen.mean(axis=1, keepdims=True)
     larger = middle + (chosen - middle) * np.maximum(1, scale)[:, None, None]
-    return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3)
+    return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3), kept
 
 
 def simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
@@ -170,7 +181,9 @@ def simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
     """
     vertices, faces, kept, stands = _merged(scene.vertices, scene.faces, most)
     owners = scene.face_object[kept]
-    return Scene(vertices, faces[kept], owners, scene.names, scene.origin), stands
+    colours = scene.colours and scene.colours.take(kept)
+    made = Scene(vertices, faces[kept], owners, scene.names, scene.origin, colours=colours)
+    return made, stands
 
 
 def _merged(

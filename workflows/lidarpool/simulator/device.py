@@ -47,7 +47,12 @@ _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 def _able(survey: Survey) -> set[str]:
     """Names of the columns that a device can make for a survey."""
     hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
-    able = {column.name for column in _MADE} - {*(_ENERGIES if hazy else ())}
+    several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+    shining = any(
+        m.reflectance == "texture" or m.roughness is not None or (several and m.material)
+        for m in survey.materials
+    )
+    able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
     return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
 
 

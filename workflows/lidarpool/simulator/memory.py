@@ -31,6 +31,7 @@ SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
+COLOUR = 16  # of a ray, where its colour is its reflectance
 SCAN, STATION = 500, 6000  # their descriptions, poses and small arrays
 TRIANGLE = 16  # a count of hits, twice
 
@@ -44,6 +45,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     """
     passing = any(material.transparent != "none" for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)
+    textured = any(material.reflectance == "texture" for material in survey.materials)
     subrays, noise = survey.returns.subrays, survey.noise
     echoes = subrays > 1 or noise.loses or passing or dark
     several = survey.returns.mode in ("all", "dual") and (subrays > 1 or passing)
@@ -68,7 +70,9 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         here = 0 if made_there else rays  # rays whose hits are on the host
         made = 0 if repeats else rays
         turned = rays if noise.angle_deg and not echoes else 0
-        kept = RAY * here + POSE_KEPT * poses + RAY_MADE_KEPT * max(made, turned)
+        kept = (
+            (RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * max(made, turned)
+        )
         casting = POSE * poses + RAY_MADE * made + RAY_TURNED * turned
         casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
         if echoes:

@@ -58,7 +58,8 @@ class Rig:
         device: int | None = None,
     ) -> None:
         self.scene, self.survey = scene, survey
-        self._surfaces = Surfaces(scene, tuple(survey.materials))
+        wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
+        self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         options = {"backend": backend, "threads": threads, "device": device}
         self._world = World(scene, self._surfaces, **options)
         self._device: DeviceColumns | None = None
