@@ -32,7 +32,7 @@ import numpy as np
 import psutil
 from distributed import Client
 
-import lidarpool.pipeline.policies
+import lidarpool.run.run
 from lidarpool import Scene, Sensor, Survey, simulate
 from lidarpool.scene.actors import box
 
@@ -149,7 +149,7 @@ def count_batches(batches: int) -> None:
     """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
     ends = {}
     for count in (batches, 3 * batches):
-        with counting() as counted, patch.object(lidarpool.pipeline.policies, "BATCH_RAYS", 1):
+        with counting() as counted, patch.object(lidarpool.run.run, "scans_that_fit", lambda *_: 1):
             simulate(Scene.seed(), small_survey(count, 5))
         ends[count] = counted.work(), counted.work(driver=True)
     scheduler, driver = (np.array(ends[3 * batches]) - ends[batches]) / (2 * batches)
@@ -167,7 +167,7 @@ def sustain(parts: int) -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         cluster_in_processes({"GPU": 4, "LIDAR": 8}) as (client, processes),
-        patch.object(lidarpool.pipeline.policies, "BATCH_RAYS", 1),
+        patch.object(lidarpool.run.run, "scans_that_fit", lambda *_: 1),
     ):
         simulate(room, first, client=client, backend="numpy")
         before = processor_seconds(processes)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from raybeam import Motion, Pattern, RayCaster, available_backends
 
-from .cuda_scenes import city
+from .gpu_scenes import city
 
 Float = NDArray[np.float64]
 

@@ -59,7 +59,7 @@ def mujoco_caster(job: Job) -> Callable[[], int]:
     return cast
 
 
-def mujoco_lidar_caster(job: Job, backend: str) -> Callable[[], int]:
+def mujoco_lidar_caster(job: Job, backend: str, device: str = "cpu") -> Callable[[], int]:
     """Let MuJoCo-LiDAR cast the rays of each place with one call, by azimuth and elevation."""
     if backend == "cpu":
         from mujoco_lidar.core_cpu.mjlidar_cpu import MjLidarCPU as Caster
@@ -68,7 +68,7 @@ def mujoco_lidar_caster(job: Job, backend: str) -> Callable[[], int]:
         from mujoco_lidar.core_warp.mjlidar_warp import MjLidarWarp as Caster
 
         warp.config.quiet = True
-        warp.set_device("cpu")
+        warp.set_device(device)
     model, data = _mujoco_model(job)
     places = len(job["origins"])
     far = float(job.get("far", 1e10))

@@ -6,6 +6,7 @@ import ctypes
 import re
 import shutil
 import subprocess
+import time
 from collections import deque
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -17,6 +18,7 @@ from typing import ClassVar
 import numpy as np
 import pytest
 
+from raybeam import registry
 from raybeam.cuda_backend import CudaBackend
 
 HOST_FILES = Path(__file__).parent / "raybeam" / "host"
@@ -40,7 +42,7 @@ class Array(np.ndarray):
             stream.begun.append((out, self))
         return out
 
-    def set(self, values):
+    def set(self, values, stream=None):
         assert values.shape == self.shape
         assert values.dtype == self.dtype
         self[...] = values
@@ -56,10 +58,14 @@ class Device(nullcontext):
 
 
 class Event:
-    """What was begun in a stream before it was recorded."""
+    """What was begun in a stream before it was recorded, and when."""
 
-    def __init__(self, begun):
+    def __init__(self, begun=()):
         self.begun = begun
+        self.record()
+
+    def record(self):
+        self.time = time.perf_counter()
 
     def synchronize(self):
         while self.begun:
@@ -83,15 +89,28 @@ class Stream:
 
 KINDS = {
     np.int32: ctypes.c_int, np.int64: ctypes.c_longlong, np.float64: ctypes.c_double,
-    np.uint32: ctypes.c_uint,
+    np.uint32: ctypes.c_uint, np.float32: ctypes.c_float,
 }  # fmt: skip
 
 
-def pointed(argument):
+# {what a kernel declares: what it may be given}
+DECLARED = {
+    "int": np.int32, "Count": np.int64, "double": np.float64, "float": np.float32,
+    "unsigned int": np.uint32, "unsigned char": np.uint8, "unsigned short": np.uint16,
+    "unsigned long long": np.int64, "float4": np.float32,
+}  # fmt: skip
+
+
+def pointed(argument, declared):
     """A kernel's argument, as something that `ctypes.byref` can point to."""
-    if isinstance(argument, np.ndarray):
+    kind, pointer = re.fullmatch(
+        r"(?:const )?([\w ]+?)(\*?) ?(?:__restrict__ )?\w+", declared
+    ).groups()
+    if pointer:
         assert argument.flags.c_contiguous
+        assert argument.dtype == DECLARED[kind] or not argument.size, declared
         return ctypes.c_void_p(argument.ctypes.data)
+    assert type(argument) is DECLARED[kind], declared
     return KINDS[type(argument)](argument)
 
 
@@ -106,6 +125,10 @@ class Kernels:
         # Libraries are shared by scenes of all depths.
         same = (f"-DSTACK={STACK}" if "STACK" in option else option for option in options)
         self.library = self.compile_for(code, tuple(same))
+        self.declared = {
+            name: [" ".join(words.split()) for words in given.split(",")]
+            for name, given in re.findall(r"^KERNEL (\w+)\((.*?)\)\n", code, re.M | re.S)
+        }
 
     def compile(self):
         pass
@@ -114,7 +137,7 @@ class Kernels:
         def launch(grid, block, arguments):
             assert block == (128,)
             assert getattr(self.library, f"parameters_{name}")() == len(arguments)
-            values = [pointed(argument) for argument in arguments]
+            values = [*map(pointed, arguments, self.declared[name])]
             pointers = (ctypes.c_void_p * len(values))(*(ctypes.addressof(v) for v in values))
             getattr(self.library, f"run_{name}")(ctypes.c_uint(grid[0]), pointers)
 
@@ -124,6 +147,9 @@ class Kernels:
 
 class CudaError(RuntimeError):
     """What CuPy raises when a call of CUDA fails."""
+
+
+PROPERTIES = {"name": b"g++", "totalGlobalMem": 8e9, "multiProcessorCount": 2}
 
 
 class Module(SimpleNamespace):
@@ -139,9 +165,12 @@ def poisoned(shape, dtype=np.float64):
 
 # As much of CuPy as the backend uses, on the CPU.
 HOST = Module(
+    __version__="of the tests",
     RawModule=Kernels,
     asarray=lambda a: np.array(a, order="K").view(Array),
     empty=poisoned,
+    empty_like=np.empty_like,
+    copyto=np.copyto,
     zeros=lambda shape, dtype=np.float64: np.zeros(shape, dtype).view(Array),
     cumsum=np.cumsum,
     flatnonzero=lambda a: np.flatnonzero(a).view(Array),
@@ -151,7 +180,15 @@ HOST = Module(
         Stream=Stream,
         get_current_stream=Stream,
         alloc_pinned_memory=bytearray,
-        runtime=SimpleNamespace(getDeviceCount=lambda: 1, CUDARuntimeError=CudaError),
+        Event=Event,
+        get_elapsed_time=lambda one, other: max(1e3 * (other.time - one.time), 1e-3),
+        runtime=SimpleNamespace(
+            getDeviceCount=lambda: 1,
+            getDeviceProperties=lambda number: PROPERTIES,
+            driverGetVersion=lambda: 13000,
+            runtimeGetVersion=lambda: 12090,
+            CUDARuntimeError=CudaError,
+        ),
     ),
 )
 
@@ -197,3 +234,11 @@ def source_backend(tmp_path_factory):
     folder = tmp_path_factory.mktemp("source")
     Kernels.compile_for = staticmethod(cache(partial(compiled, compiler, folder)))
     return SourceBackend
+
+
+@pytest.fixture
+def played_cuda(source_backend, monkeypatch):
+    """Have the CPU play the device of backend "cuda"."""
+    others = [backend for backend in registry._BACKENDS if backend.name != "cuda"]
+    played = type("Played", (source_backend,), {"name": "cuda"})
+    monkeypatch.setattr(registry, "_BACKENDS", (played, *others))

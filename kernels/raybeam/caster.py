@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from .backend import Backend, BackendUnavailable
 from .cuda_backend import CudaBackend
 from .device import DeviceHits, OtherHits
-from .hits import Hits, ScanReturns
+from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
 from .poses import Motion, Poses
@@ -303,7 +303,7 @@ class RayCaster:
         use: Callable[[DeviceHits], object],
         counters: tuple[NDArray[np.int64], int] | None = None,
         others: OtherHits | None = None,
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
+    ) -> tuple[NDArray[np.int64], Counted | None]:
         """Cast a scan, and use its hits on the CUDA device where they are.
 
         Parameters
@@ -325,8 +325,8 @@ class RayCaster:
         -------
         hits
             As of `ScanReturns`.
-        tally
-            int64 (rows,); None if not requested.
+        counted
+            The counters that are not 0, and their hits: int64 (k,) each; None without a tally.
 
         Raises
         ------

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from .backend import Backend, Found
-from .device import DeviceHits, OtherHits
-from .hits import Part, ScanReturns, joined
+from .device import DeviceHits, OtherHits, to_device
+from .hits import Counted, Part, ScanReturns, joined
 from .instances import Scene
 from .layout import lay_out, lay_out_places
 from .opacity import Masks
@@ -83,8 +83,8 @@ class CudaBackend(Backend):
             masks = made.masks or Masks(*NO_MASKS)
             tables = (made.nodes, made.triangles, made.corners, made.faces)
             given = (*tables, masks.uv, masks.mask, masks.records)
-            self._meshes = tuple(_sent(cupy, table) for table in given)
-            nothing = (_sent(cupy, np.zeros(2, np.int64)), np.int32(0))
+            self._meshes = tuple(to_device(cupy, table) for table in given)
+            nothing = (to_device(cupy, np.zeros(2, np.int64)), np.int32(0))
             self._uncounted = (*nothing, cupy.zeros(1, np.int64))
             self._none = cupy.zeros(1), cupy.zeros(1, np.int32), np.int32(0)
         # {pattern: its directions on the device, and its origins if it has any}
@@ -102,7 +102,7 @@ class CudaBackend(Backend):
                 self._cupy, self._device.id, flags(stack, scene.nested, self._masked)
             )
             given = (made.frame, made.top, made.instances)
-            self._places = tuple(_sent(self._cupy, table) for table in given)
+            self._places = tuple(to_device(self._cupy, table) for table in given)
 
     @staticmethod
     def _library() -> Any:
@@ -131,8 +131,12 @@ class CudaBackend(Backend):
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`."""
         kept: list[Part] = []
-        hits, tally = self.visit(scan, lambda found: kept.append(found.get()))
+        hits, counted = self.visit(scan, lambda found: kept.append(found.get()))
         ray, distance, triangle, instance = joined(kept)
+        tally = None
+        if counted is not None:
+            tally = np.zeros(self._scene.face_count, np.int64)
+            tally[counted[0]] = counted[1]
         return ScanReturns(ray, distance, triangle, hits, tally, instance)
 
     def visit(
@@ -141,20 +145,25 @@ class CudaBackend(Backend):
         use: Callable[[DeviceHits], object],
         counters: tuple[NDArray[np.int64], int] | None = None,
         others: OtherHits | None = None,
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64] | None]:
+    ) -> tuple[NDArray[np.int64], Counted | None]:
         """See `RayCaster.visit`."""
         cp, scene, groups = self._cupy, self._scene, Groups(scan.groups, scan.keep_every)
         with self._device:
             counting = self._uncounted
             if scan.tally:
                 table, size = (scene.counters, scene.face_count) if counters is None else counters
-                counting = _sent(cp, table), np.int32(1), cp.zeros(size, np.int64)
+                counting = to_device(cp, table), np.int32(1), cp.zeros(size, np.int64)
             for start, n, rays in self._made(scan):
                 found = self._cast("cast_pattern", n, rays)
                 replaced = self._replaced(found, start, n, others)
                 kept = self._packed(found, start, groups, scene.frame.scale, counting, replaced)
                 use(DeviceHits(*kept, cp, partial(self._rays, start, rays)))
-            return groups.hits, counting[2].get() if scan.tally else None
+            return groups.hits, self._counted(counting[2]) if scan.tally else None
+
+    def _counted(self, tally: Any) -> Counted:
+        """Copy to the host what was counted: most rows of a tally are 0."""
+        rows = self._cupy.flatnonzero(tally)
+        return rows.get(), tally[rows].get()
 
     def _replaced(
         self, found: tuple[Any, Any, Any], start: int, n: int, others: OtherHits | None
@@ -213,7 +222,7 @@ class CudaBackend(Backend):
             given = (pattern.directions, pattern.origins)
             # If two threads come here, the second copy is kept, and both are right.
             kept = self._patterns[pattern] = tuple(
-                _sent(self._cupy, table.T) for table in given if table is not None
+                to_device(self._cupy, table.T) for table in given if table is not None
             )
         return kept
 
@@ -308,19 +317,3 @@ def _device(cupy: Any, number: int | None) -> Any:
     if number is not None and not 0 <= number < count:
         raise ValueError(f"There is no CUDA device {number}: this process sees {count}, from 0.")
     return cupy.cuda.Device(number)
-
-
-def _sent(cupy: Any, array: NDArray[Any]) -> Any:
-    """Copy an array to the current device, and wait for that.
-
-    A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
-    returns: hence the wait, after which the caller may release the array.
-
-    `asarray` would copy through page-locked memory as large as the array and keep it: fine for
-    the rays of a chunk, too much for a scene.
-    """
-    copy = cupy.empty(array.shape, array.dtype)
-    if array.size:
-        copy.set(array)
-        cupy.cuda.get_current_stream().synchronize()
-    return copy

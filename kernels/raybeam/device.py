@@ -70,6 +70,22 @@ class OtherHits:
     triangle: NDArray[np.int32]
 
 
+def to_device(cupy: Any, array: NDArray[Any]) -> Any:
+    """Copy an array to the current device, and wait for that: any stream may read it then.
+
+    A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
+    returns: hence the wait, after which the caller may release the array.
+
+    `asarray` would copy through page-locked memory as large as the array and keep it: fine for
+    the rays of a chunk, too much for a scene.
+    """
+    copy = cupy.empty(array.shape, array.dtype)
+    if array.size:
+        copy.set(array)
+        cupy.cuda.get_current_stream().synchronize()
+    return copy
+
+
 class Outbox:
     """Copies arrays to the host in a stream of its own, while the device goes on.
 

@@ -10,6 +10,9 @@ from numpy.typing import NDArray
 # Ray, distance, triangle and instance of some hits, as in `ScanReturns`.
 Part = tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]
 
+# Numbers of the counters of a tally that are not 0, ascending, and their hits.
+Counted = tuple[NDArray[np.int64], NDArray[np.int64]]
+
 
 @dataclass(frozen=True)
 class Hits:

@@ -34,10 +34,19 @@ class Cart:
 
 
 def cast_between(rig, survey, cuts):
-    """Columns as bytes, and hits of each triangle, of scans that are cast from cut to cut."""
+    """Columns as bytes, and {counter: hits}, of scans that are cast from cut to cut."""
     batches = [batch for span in itertools.pairwise(cuts) for batch in rig.cast(*span)]
     columns = {
         column.name: np.concatenate([batch.column(column) for batch in batches]).tobytes()
         for column in survey.stored_columns
     }
-    return columns, np.sum([batch.tally for batch in batches], axis=0).tolist()
+    return columns, tally_of(batches).tolist()
+
+
+def tally_of(batches):
+    """Hits of each triangle in all of these batches."""
+    tally = np.zeros(batches[0].scene.counters, np.int64)
+    for batch in batches:
+        triangles, hits = batch.tally
+        tally[triangles] += hits
+    return tally

@@ -90,8 +90,9 @@ def test_a_list_gives_places_turns_and_factors(build):
             "4\t5\t6\t0\t1\t1\t1\n",
             {"columns": {"x": "east", "y": "north"}},
         ),
+        ("X,Y,Z,Yaw_deg,SCALE\n1,2,3,90,2\n4,5,6,0,1\n", {}),
     ],
-    ids=["commas", "semicolons, remarks, text", "tabs, other names"],
+    ids=["commas", "semicolons, remarks, text", "tabs, other names", "capital letters"],
 )
 def test_a_table_gives_what_a_list_gives(build, folder, text, more):
     (folder / "trees.csv").write_text(text)
@@ -239,7 +240,15 @@ WRONG = {
     "many": (TREE | {"scatter": {"count": 1_000_001}}, "less than or equal to 1000000"),
     "no file": (TREE | {"table": "none.csv"}, "none.csv is not a usable table of copies"),
     "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'; it has x, z"),
-    "nan": (TREE | {"table": {"file": "a.csv", "columns": {"y": "z"}}}, "'z' has a nan or inf"),
+    "nan": (
+        TREE | {"table": {"file": "a.csv", "columns": {"y": "z"}}},
+        "its column 'z' has 'nan' in line 2: give a number in every line.",
+    ),
+    "some heights": (
+        TREE | {"table": "some.csv"},
+        "its column 'z' has '' in line 5: give a number in every line, or leave the column out.",
+    ),
+    "short row": (TREE | {"table": "short.csv"}, "its column 'yaw_deg' has '' in line 2"),
     "mesh": ({"name": "A", "file": "b.stl", "at": [[0, 0]]}, "b.stl"),
 }  # fmt: skip
 
@@ -248,6 +257,8 @@ WRONG = {
 def test_what_cannot_be_is_told_in_a_line(build, folder, name):
     entry, says = WRONG[name]
     (folder / "a.csv").write_text("x,z\n1,nan\n")
+    (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")
+    (folder / "short.csv").write_text("x;y;yaw_deg\n1;2\n")
     with pytest.raises(LidarpoolError) as raised:
         build(entry)
     assert says in str(raised.value) and len(str(raised.value).splitlines()) == 1

@@ -3,24 +3,31 @@
 from __future__ import annotations
 
 import importlib.resources
+import pickle
 import shutil
 import subprocess
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
+from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
 from tests.lidarpool.casting import cast_between
 from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
 
 from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scene, Survey, Track
+from lidarpool.columns.parts import pack
+from lidarpool.pipeline import cast
 from lidarpool.scene.actors import box
+from lidarpool.scene.colours import Colours
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import Material
 from lidarpool.sensor.models import load_sensor
 from lidarpool.sensor.optics import Returns
 from lidarpool.sensor.trajectory import Stations
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.device import OPTIONS, DeviceReturns
+from lidarpool.simulator.memory import cast_bytes
 from lidarpool.simulator.rig import Rig
 from raybeam import registry
 
@@ -34,6 +41,12 @@ MATERIALS = (
     Material("copy 2", retro=True, semantic_class=7),
 )
 
+# One drives through the other, and both past what stands.
+WAYS = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
+ACTORS = tuple(
+    Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(WAYS)
+)
+
 
 @pytest.fixture
 def backend(source_backend, monkeypatch):  # noqa: F811
@@ -45,7 +58,10 @@ def backend(source_backend, monkeypatch):  # noqa: F811
 @pytest.fixture(scope="module")
 def scenes():
     """The same objects as parts of the scene, and as instances: all, or beside others."""
-    objects = seed_objects(rings=8, segments=12)
+    objects = []
+    for k, mesh in enumerate(seed_objects(rings=8, segments=12)):
+        colours = np.random.default_rng(k).integers(0, 256, (len(mesh.faces), 3), np.uint8)
+        objects.append(replace(mesh, colours=Colours.of_faces(colours)))
     copies = []
     for k, stretch in enumerate((1, 2, -1, 1, 1, 0.5)):
         matrix = np.diag([stretch, 1, 1, 1.0])
@@ -78,7 +94,7 @@ def same(scene, survey, backend, cuts):
     (got, tally), (want, counted) = (cast_between(rig, survey, cuts) for rig in rigs)
     for name, column in want.items():
         assert got[name] == column, name
-    assert tally == counted[: len(tally)] and not any(counted[len(tally) :])
+    assert tally == counted
     made, plain = (list(rig.cast(*cuts[:2])) for rig in rigs)
     for mine, other in zip(made, plain, strict=True):
         assert isinstance(mine, DeviceReturns)
@@ -101,24 +117,50 @@ def test_columns_of_instances(scene, name, scenes, backend):
     same(scenes[scene], survey, backend, (0, survey.scan_count))
 
 
+@pytest.mark.parametrize("scene", ["instances", "both"])
+def test_columns_after_instances_have_moved(scene, scenes, backend):
+    survey = replace(MADE["beams with offsets"], materials=MATERIALS)
+    rigs = [Rig(scenes[scene], survey, name) for name in (backend, "numpy")]
+    cast_between(rigs[0], survey, (0, 1))  # its tables are on the device
+    owner = int(scenes[scene].instances.owner[0])
+    for yaw in (40, 80):
+        rigs = [rig.moved(owner, Pose((1.0, 2.0, 0.1), yaw)) for rig in rigs]
+        got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
+        assert got == want
+    assert isinstance(next(rigs[0].cast(0, 1)), DeviceReturns)
+
+
 def test_a_survey_that_hits_nothing(scenes, backend):
     survey = replace(MADE["few columns"], trajectory=Stations((Pose((0, 0, 500)),)), poses=())
     same(scenes["plain"], survey, backend, (0, survey.scan_count))
 
 
 OWN = Column("own", "float32", "", "of a user", lambda returns: returns.range)
-OTHERS = {
+MORE = {
     "a user's column": {"columns": (*COLUMNS, OWN)},
-    "angles": {"columns": ("azimuth",)},
-    "sub-rays": {"returns": Returns("all", 7, 3.0)},
-    "noise": {"noise": Noise(range_m=0.01)},
+    "angles": {"columns": ("azimuth", "intensity")},
     "haze": {"visibility_km": 2.0},
     "the sensor's axes": {"coordinates": "sensor"},
+    "only angles": {"columns": ("elevation",), "keep_every": 4},
+    "colours": {"columns": ("red", "blue", "time")},
+    "textures": {"materials": [Material("*", "texture", scale=0.7)]},
+    "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
+    "a measured material": {"materials": [Material("*", material="asphalt, dry")]},
 }
 
 
+@pytest.mark.parametrize("actors", [(), ACTORS], ids=["", "actors"])
+@pytest.mark.parametrize("name", MORE)
+def test_numpy_makes_the_other_columns_of_the_hits(name, actors, scenes, backend):
+    survey = replace(MADE["on the move"], **MORE[name])
+    same(scenes["both"].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
+
+
+OTHERS = {"sub-rays": {"returns": Returns("all", 7, 3.0)}, "noise": {"noise": Noise(range_m=0.01)}}
+
+
 @pytest.mark.parametrize("name", OTHERS)
-def test_what_only_numpy_can_make_is_made_of_the_hits(name, scenes, backend):
+def test_pulses_and_noise_are_made_on_the_host(name, scenes, backend):
     survey = replace(MADE["on the move"], **OTHERS[name])
     rigs = [Rig(scenes["plain"], survey, which) for which in (backend, "numpy")]
     got, want = (cast_between(rig, survey, (0, survey.scan_count)) for rig in rigs)
@@ -129,15 +171,38 @@ def test_what_only_numpy_can_make_is_made_of_the_hits(name, scenes, backend):
 @pytest.mark.parametrize("scene", ["plain", "instances", "both"])
 @pytest.mark.parametrize("name", ["beams with offsets", "on the move, mounted", "few columns"])
 def test_columns_of_actors(scene, name, scenes, backend):
-    """One drives through the other, and both past what stands."""
-    ways = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
-    actors = tuple(
-        Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(ways)
-    )
     survey = replace(MADE[name], materials=[*MATERIALS, Material("Car*", 0.7, 40)])
     if scene == "plain":
         survey = replace(survey, materials=())
-    same(scenes[scene].with_actors(actors), survey, backend, (0, 3, survey.scan_count))
+    same(scenes[scene].with_actors(ACTORS), survey, backend, (0, 3, survey.scan_count))
+
+
+def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
+    survey, spans = MADE["on the move"], [(0, 9), (9, 28)]
+    monkeypatch.setattr(cast, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
+    tasks = []
+    for name in (backend, "numpy"):
+        rig = Rig(scenes["both"], survey, name)
+        monkeypatch.setattr(cast, "rig_of", lambda handle, rig=rig: rig)
+        tasks.append(pickle.loads(pickle.dumps(cast.intersect("a run", spans), protocol=5)))
+    for mine, other in zip(*tasks, strict=True):
+        assert pack(mine.part) == pack(other.part)
+        for field in ("hits", "points"):
+            assert np.array_equal(mine.summaries[field], other.summaries[field])
+        samples, exact = mine.summaries["samples"], other.summaries["samples"]
+        assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
+
+
+@pytest.mark.parametrize("more", [{}, MORE["a user's column"]], ids=["", "hits"])
+def test_the_hosts_memory_is_what_was_estimated(more, scenes, backend, monkeypatch):
+    taken = []
+    monkeypatch.setattr(HOST.cuda, "alloc_pinned_memory", lambda n: taken.append(n) or bytearray(n))
+    survey = replace(MADE["on the move"], **more)
+    columns_of(list(Rig(scenes["plain"], survey, backend).cast(0, 14)))
+    assert 0 < sum(taken) < cast_bytes(scenes["plain"], survey, 14, on_device=True)
+    assert cast_bytes(scenes["plain"], survey, 14, on_device=True) < cast_bytes(
+        scenes["plain"], survey, 14
+    )
 
 
 @pytest.mark.parametrize("card", ["75", "120"])

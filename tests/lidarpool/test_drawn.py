@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from lidarpool import Scene
-from lidarpool.scene.drawn import PART_LEAST, Drawn
-from lidarpool.scene.mesh import triangle_areas
+from lidarpool.scene.drawn import PART_LEAST, Drawn, cut
+from lidarpool.scene.mesh import Cutout, Mesh, triangle_areas
 from lidarpool.scene.plants import SPECIES, placed, tree
 
 
@@ -62,3 +62,36 @@ def test_hits_are_shared_by_area(avenue):
     counts = np.arange(40.0)
     hits = drawn.hits(counts)
     assert np.bincount(drawn.scene.face_object, hits) == pytest.approx(counts)
+
+
+@pytest.mark.parametrize("repeats", [1, 300], ids=["coarse", "finer than the pieces"])
+def test_what_masks_leave_is_drawn(repeats):
+    """A wall, and a card of 2 by 1 m whose mask is opaque in three quarters of its left half."""
+    mask = np.zeros((4, 4), bool)
+    mask[:3, :2] = True
+    corners = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uv = (corners[faces, :2] / [2, 1] * repeats).astype(np.float32)
+    wall, card = Mesh("Wall", corners, faces), Mesh("Card", corners, faces, (Cutout(mask, uv),))
+    scene = Scene.from_meshes([wall, card])
+    drawn, before = Drawn.of(cut(scene)), Drawn.of(scene)
+    own = drawn.scene.faces[drawn.scene.face_object == 1]
+    a, b, c = drawn.scene.vertices[own].transpose(1, 0, 2)
+    areas = np.cross(b - a, c - a) / 2
+    assert (areas[:, 2] > 0).all() and areas[:, 2].sum() == pytest.approx(2 * 3 / 8, rel=0.05)
+    middle = (a + b + c) / 3
+    assert (middle[:, 2] == 0).all() and (middle >= 0).all() and (middle[:, :2] <= [2, 1]).all()
+    if repeats == 1:
+        assert np.mean((middle[:, 0] < 1.01) & (middle[:, 1] < 0.76)) == 1
+    counts = np.array([3.0, 4, 5])
+    shared = np.bincount(drawn.counter, drawn.hits(counts))
+    assert np.allclose(shared, np.bincount(before.counter, before.hits(counts)))
+    assert cut(Scene.from_meshes([wall])).faces.shape == (2, 3)
+
+
+def test_a_card_that_is_transparent_everywhere_stays_a_speck():
+    uv = np.zeros((1, 3, 2), np.float32)
+    cutout = Cutout(np.zeros((2, 2), bool), uv)
+    scene = Scene.from_meshes([Mesh("Card", np.eye(3), np.arange(3)[None], (cutout,))])
+    drawn = Drawn.of(cut(scene)).scene
+    assert len(drawn.faces) == 1 and np.ptp(drawn.vertices, axis=0).max() < 0.1

@@ -38,7 +38,7 @@ from lidarpool.base.open3d_module import load_open3d
 from lidarpool.base.storage import Storage
 from lidarpool.base.yamlfile import load_yaml
 from lidarpool.columns.cloud_file import CloudFile
-from lidarpool.columns.table import TABLE
+from lidarpool.columns.table import COLOURS, TABLE
 from lidarpool.export import las as las_module
 from lidarpool.export import parquet, pieces
 from lidarpool.export.boxes import Boxes
@@ -325,6 +325,32 @@ def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     placed = np.stack([found[f"cartesian{axis}"] for axis in "XYZ"], axis=1)
     np.testing.assert_allclose(placed, points.positions, atol=1e-5)
     np.testing.assert_allclose(found["intensity"], points.intensity)
+
+
+def test_colours_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
+    rng = np.random.default_rng(6)
+    colours = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLOURS}
+    coloured = Cloud(cloud.positions, {**cloud.columns, **colours})
+    for name in ("las", "e57", "pcd"):
+        one = Format(name, "velodyne")
+        one.write(tmp_path / one.file, coloured, sweeps)
+    las = laspy.read(tmp_path / "cloud.las")
+    assert las.header.point_format.id == 7
+    assert not {*COLOURS} & {*las.point_format.extra_dimension_names}
+    with pye57.E57(str(tmp_path / "cloud.e57")) as file:
+        found = file.read_scan(0, colors=True, ignore_missing_fields=True)
+    pcd = PointCloud.from_path(tmp_path / "pcd" / "000000.pcd").pc_data
+    first = of_sweep(coloured, 0)
+    for name in COLOURS:
+        np.testing.assert_array_equal(las[name], colours[name].astype(int) * 257)
+        np.testing.assert_array_equal(found[f"color{name.capitalize()}"], first[name])
+        np.testing.assert_array_equal(pcd[name], first[name])
+    # One of them alone is a column like others.
+    alone = Cloud(cloud.positions, {**cloud.columns, "red": colours["red"]})
+    Format("laz", "velodyne").write(tmp_path / "red.laz", alone, sweeps)
+    las = laspy.read(tmp_path / "red.laz")
+    assert las.header.point_format.id == 6
+    np.testing.assert_array_equal(las["red"], colours["red"])
 
 
 @pytest.mark.parametrize("name", EXPORTS)

@@ -321,7 +321,7 @@ def test_materials_share_masks(tmp_path, monkeypatch):
 def test_clamped_coordinates_far_away_take_no_memory(tmp_path, caplog):
     header, body = card(uv=UV * np.float32(1e8) - 1, sampler={"wrapS": 33071, "wrapT": 33071})
     assert not load(tmp_path / "m.glb", header, body).masked
-    assert "Leaf (its mask would be too large)" in caplog.text
+    assert "Leaf (its image would be too large)" in caplog.text
 
 
 def test_draco(tmp_path):

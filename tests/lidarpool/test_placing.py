@@ -180,6 +180,15 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     assert "only the backs of its surfaces" in given.advice(given.build_scene())[-1]
 
 
+@pytest.mark.parametrize("far", [0.2, 5.0])
+def test_a_card_seen_from_behind_is_no_body(far):
+    corners = np.array([[0.0, -5, 0], [0, 5, 0], [0, 5, 2], [0, -5, 2]])
+    fence = Scene.from_meshes([Mesh("Fence", corners, np.array([[0, 1, 2], [0, 2, 3]]))])
+    views = Surroundings(fence).views([[-far, 0, 1]])
+    assert views.back[views.hit].all() and views.hit.any()
+    assert inside_note(fence, [[-far, 0, 1]], GRID) == ""
+
+
 @pytest.mark.parametrize(
     ("file", "length", "noted"),
     [

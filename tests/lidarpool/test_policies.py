@@ -9,7 +9,6 @@ import pytest
 from lidarpool.pipeline.batches import Batch, Batches, Place
 from lidarpool.pipeline.policies import (
     AHEAD,
-    BATCH_RAYS,
     COLLECTING,
     KILLS_MOST,
     LATE_FACTOR,
@@ -37,7 +36,7 @@ A, B = "tcp://a:1", "tcp://b:1"
 
 def batch(number, place=Place.WAITING, worker="", collector="", suspect=""):
     deaths = Counter({suspect: SUSPECT_DEATHS} if suspect else {})
-    return Batch(number, number + 1, number, place, 0.0, 1, str(number), worker, collector, deaths)
+    return Batch(number, number + 1, number, place, 0.0, str(number), worker, collector, deaths)
 
 
 def casting(number, worker, suspect=""):
@@ -56,21 +55,21 @@ def numbers(chosen):
 
 
 @pytest.mark.parametrize(
-    ("seconds", "scans", "rays", "count", "slots", "wanted"),
+    ("seconds", "scans", "fit", "count", "slots", "wanted"),
     [
-        (0.1, 10, 100, 10**6, 2, 20),  # twice as long
-        (0.4, 10, 100, 10**6, 2, 5),  # half
-        (0.001, 10, 100, 10**6, 2, 20),  # at most twice as many as the last
-        (0.0, 1, 100, 10**6, 2, 2),
-        (9.0, 1, 100, 10**6, 2, 1),  # a scan at least
-        (0.001, 10**5, 1000, 10**9, 1, BATCH_RAYS // 1000),
-        (0.001, 10**5, 10 * BATCH_RAYS, 10**9, 1, 1),
-        (0.001, 10**5, 0, 3200, 2, 100),  # so many that all slots are busy to the end
-        (0.001, 10**5, 100, 5, 2, 1),
+        (0.1, 10, 1000, 10**6, 2, 20),  # twice as long
+        (0.4, 10, 1000, 10**6, 2, 5),  # half
+        (0.001, 10, 1000, 10**6, 2, 20),  # at most twice as many as the last
+        (0.0, 1, 1000, 10**6, 2, 2),
+        (9.0, 1, 1000, 10**6, 2, 1),  # a scan at least
+        (0.001, 10**5, 1000, 10**9, 1, 1000),  # as many as fit into memory
+        (0.001, 10**5, 1, 10**9, 1, 1),
+        (0.001, 10**5, 1000, 3200, 2, 100),  # so many that all slots are busy to the end
+        (0.001, 10**5, 1000, 5, 2, 1),
     ],
 )
-def test_scans_of_a_batch(seconds, scans, rays, count, slots, wanted):
-    assert scans_per_batch(seconds, scans, rays, count, slots) == wanted
+def test_scans_of_a_batch(seconds, scans, fit, count, slots, wanted):
+    assert scans_per_batch(seconds, scans, fit, count, slots) == wanted
 
 
 def test_no_batches_are_taken_far_ahead_of_the_oldest():
@@ -104,11 +103,12 @@ def test_small_batches_share_tasks_and_wait_for_others_where_nobody_waits_for_th
 
 
 def test_a_task_has_as_many_batches_as_are_worth_it():
-    assert batches_per_task([]) == 1
-    assert batches_per_task([0.3, 0.2, 9.0]) == 1
-    assert batches_per_task([TASK_SECONDS / 4.5]) == 4
-    assert batches_per_task([0.0]) == TASK_BATCHES
-    assert batches_per_task([0.0], BATCH_RAYS // 5) == 5
+    assert batches_per_task([], 1, 100) == 1
+    assert batches_per_task([0.3, 0.2, 9.0], 1, 100) == 1
+    assert batches_per_task([TASK_SECONDS / 4.5], 1, 100) == 4
+    assert batches_per_task([0.0], 1, 100) == TASK_BATCHES
+    assert batches_per_task([0.0], 20, 100) == 5  # all of them fit into memory
+    assert batches_per_task([0.0], 101, 100) == 1
 
 
 def test_there_are_at_most_so_many_batches_under_way():

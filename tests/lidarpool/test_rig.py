@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.lidarpool.casting import Cart, cast_between
+from tests.lidarpool.casting import Cart, cast_between, tally_of
 
 from lidarpool import Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey
 from lidarpool.pipeline.failures import naming_scans
@@ -145,7 +145,7 @@ def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
             angles = 90 - np.degrees(np.arccos(cosines))
             assert np.allclose(made["grazing"][mine], angles, atol=0.05)
             scans += 1
-        assert np.array_equal(batch.found.tally, tally), "all hits, and not only those kept"
+        assert np.array_equal(tally_of([batch]), tally), "all hits, and not only those kept"
         assert np.array_equal(batch.scan, np.repeat([s.scan for s in batch.specs], batch.counts))
         assert len(batch) == batch.counts.sum() > 0
     assert scans == survey.scan_count

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tests.lidarpool.casting import tally_of
 
 from lidarpool import (
     Actor,
@@ -101,7 +102,7 @@ def scanned(scene, physics):
     table = (SCAN, *(c for c in survey.stored_columns if c.name not in "xyz"))
     cloud = columns_of(batches).cloud(table, survey.precision_m, scene.origin)
     keys = np.stack([cloud[name] for name in ("scan", "ray", "return_number")], axis=1).tolist()
-    hits = sum(hits_by_object(scene, batch.found.tally) for batch in batches)
+    hits = hits_by_object(scene, tally_of(batches))
     return {tuple(key): row for row, key in enumerate(keys)}, cloud, hits
 
 

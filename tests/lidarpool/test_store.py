@@ -108,7 +108,7 @@ def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
 
 
 def test_it_is_gone_on_with(unfinished):
-    again = replace(JOB, backend="auto", collectors=5, queue_capacity=3, patience_s=1.0)
+    again = replace(JOB, backend="auto", collectors=5, queue_capacity=3, batch_mb=9, patience_s=1.0)
     store = RunStore(again, unfinished, resume=True)
     assert (store.resumed, store.backend, store.notes) == (4, "numpy", [])
     assert store.db.missing(0, 6) == [(2, 3), (5, 6)]

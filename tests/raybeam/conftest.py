@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from benchmarks.cuda_scenes import grid_faces
+from benchmarks.gpu_scenes import grid_faces
 from tests.cuda_on_host import source_backend  # noqa: F401 - a fixture
 
 from raybeam import RayCaster, available_backends, registry

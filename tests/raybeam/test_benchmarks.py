@@ -3,9 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
+import sys
+from pathlib import Path
 
 import pytest
-from benchmarks import cuda_kernel, instances, raycast_moving
+from benchmarks import gpu, gpu_points, gpu_rays, instances, raycast_moving
+from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 
 from raybeam import available_backends
 
@@ -33,19 +37,94 @@ def test_forests_of_instances_hit_as_one_mesh_does(capsys):
 def test_the_devices_benchmark_says_so_without_a_device(capsys):
     if not available_backends()["cuda"]:
         pytest.skip("there is a device")
-    assert cuda_kernel.main(["--rays", "100"]) == 2
+    assert gpu.main(["--quick"]) == 2
     assert "Nothing was measured: " in capsys.readouterr().err
+
+
+def results_of(tmp_path, *options):
+    path = tmp_path / "gpu.json"
+    code = gpu.main(["--quick", "--json", str(path), "--folder", str(tmp_path), *options])
+    return code, json.loads(path.read_text())["sections"]
+
+
+@pytest.mark.slow
+def test_all_that_the_device_is_measured_at(played_cuda, tmp_path, capsys, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(gpu_points, "START", "fork")
+    names = [name for name in gpu.SECTIONS if name not in ("run", "peers", "mujoco")]
+    code, found = results_of(tmp_path, "--in-process", "--only", *names)
+    said = capsys.readouterr()
+    assert code == 0, said
+    assert [*found] == names
+    assert not any("error" in rows or "left out" in rows for rows in found.values())
+    for title, rows in found["kernels"].items():
+        if title.endswith(("coherent", "shuffled", "revolution")):
+            assert 0.1 < rows["hits"] < 1 and all(rate > 0 for rate in rows["grays_s"].values())
+    assert found["leaks"]["edges and corners"] == {"rays": 5000, "escaped": 0}
+    assert 0 < found["large"]["many rays"]["last ray"] < 6144
+    assert set(found["columns"]["a batch, ms"]) == {
+        "cast_pattern", "pack", "make_rays", "columns", "copy", "all",
+    }  # fmt: skip
+    assert found["columns"]["plain"]["bytes_a_point"] == 30
+    assert found["durable"]["disk"]["mpoints_s"] > 0 < found["sharing"]["two to one"]["ratio"]
+    assert "| values that differ from NumPy's in samples; rays that escape | 0, 0 |" in said.out
+
+
+def test_a_section_that_fails_leaves_the_others(played_cuda, tmp_path, capsys, monkeypatch):  # noqa: F811
+    def broken(here):
+        yield "first", {"figure": 1.0}
+        raise MemoryError("no room")
+
+    monkeypatch.setattr(gpu_rays, "moving", broken)
+    monkeypatch.setitem(gpu.SECTIONS, "peers", ("gpu_of_nobody", 1))
+    code, found = results_of(tmp_path, "--in-process", "--only", "moving", "peers", "leaks")
+    assert code == 1
+    assert found["moving"]["first"] == {"figure": 1.0}
+    assert found["moving"]["error"] == "MemoryError: no room"
+    assert found["leaks"]["edges and corners"]["escaped"] == 0
+    said = capsys.readouterr().out
+    assert "wrong: moving: MemoryError: no room" in said
+    assert "left out: peers, because benchmarks.gpu_of_nobody is not installed" in said
+
+
+# Stands for the interpreter that runs a section: without a device, or with one that is played.
+PYTHON = """#!{python}
+import sys
+sys.path[:0] = {path}
+from benchmarks import gpu
+from tests.cuda_on_host import SourceBackend
+if "device" in sys.argv:
+    gpu.choose = lambda name: SourceBackend
+    gpu.available_backends = lambda: {{"cuda": ""}}
+if "moving" in sys.argv:
+    sys.exit(-9)
+sys.exit(gpu.main(sys.argv[3:]))
+"""
+
+
+def test_sections_are_processes_of_their_own(played_cuda, tmp_path, monkeypatch):  # noqa: F811
+    script = tmp_path / "python"
+    script.write_text(PYTHON.format(python=sys.executable, path=sys.path))
+    script.chmod(0o755)
+    monkeypatch.setattr(sys, "executable", str(script))
+    code, found = results_of(tmp_path, "--only", "device", "moving", "leaks")
+    assert code == 1
+    assert found["device"]["device"]["name"] == "g++"
+    assert found["moving"] == {"error": "its process ended with 247"}
+    assert found["leaks"] == {"error": "its process ended with 2"}
+
+
+def test_the_page_has_the_rows_of_the_table():
+    page = Path(__file__).parents[2].joinpath("docs", "performance.md").read_text("utf-8")
+    names = [name for name, _, _ in gpu.ROWS]
+    rows = re.findall(r"^\| (.*) \| .* \|$", page[page.index("## On a GPU") :], re.M)
+    assert rows[: len(names)] == names
 
 
 @pytest.mark.gpu
 @pytest.mark.slow
-def test_the_devices_benchmark_runs(tmp_path, capsys):
+def test_the_device_is_measured(tmp_path):
     if reason := available_backends()["cuda"]:
         pytest.skip(f"cuda: {reason}")
-    out = tmp_path / "out.json"
-    options = ["--rays", "12800", "--triangles", "500", "--repeats", "3", "--leak-rays", "3000"]
-    assert cuda_kernel.main([*options, "--many-rays", "30000", "--json", str(out)]) == 0
-    results = json.loads(out.read_text())
-    assert results["leaks"] == {"rays": 3000, "escaped": 0}
-    assert results["many_rays"]["same_every_time"]
-    assert "differences from numpy: none" in capsys.readouterr().out
+    code, found = results_of(tmp_path)
+    assert code == 0
+    assert found["leaks"]["edges and corners"]["escaped"] == 0

@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
+from tests.cuda_on_host import played_cuda  # noqa: F401 - a fixture
 from tests.raybeam.test_scan import case_of
 
 from raybeam import BackendUnavailable, Instance, Mesh, OtherHits, Pattern, RayCaster, check_scan
@@ -48,13 +52,14 @@ def visited(caster, scan, counters=None, others=None):
 def test_a_visit_sees_what_a_scan_returns(vase, every):
     given = {"keep_every": every, "groups": [0, 0, 13, 1990], "tally": True}
     scan = scan_of(**given)
-    hits, (origins, directions), counts, tally = visited(vase, scan)
+    hits, (origins, directions), counts, (rows, counted) = visited(vase, scan)
     want = vase._engine.scan(scan)
     assert vase.on_device
     for got, name in zip(hits, ("ray", "distance", "triangle", "instance"), strict=True):
         np.testing.assert_array_equal(got, getattr(want, name))
     assert counts.tolist() == want.hits.tolist()
-    assert tally.tolist() == want.tally.tolist()
+    assert rows.tolist() == np.flatnonzero(want.tally).tolist()
+    assert counted.tolist() == want.tally[rows].tolist()
     pose = {"start": 700, "rays_per_pose": CASE["each"], "motion": CASE["motion"]}
     at, to = PATTERN.rays(want.ray, CASE["positions"], CASE["rotations"], **pose)
     np.testing.assert_array_equal(origins.T, at)
@@ -64,9 +69,9 @@ def test_a_visit_sees_what_a_scan_returns(vase, every):
 def test_instances_may_be_counted_as_a_whole(vase):
     one = np.stack([np.arange(vase.instance_count), np.zeros(vase.instance_count)], axis=1)
     counters = one.astype(np.int64), vase.instance_count
-    hits, _, counts, tally = visited(vase, scan_of(tally=True), counters)
-    assert tally.tolist() == np.bincount(hits[3], minlength=vase.instance_count).tolist()
-    assert counts.tolist() == [tally.sum()]
+    hits, _, counts, (rows, counted) = visited(vase, scan_of(tally=True), counters)
+    assert counted.tolist() == np.bincount(hits[3])[rows].tolist()
+    assert counts.tolist() == [counted.sum()] == [len(hits[0])]
 
 
 def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
@@ -77,7 +82,8 @@ def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
     table = np.array([[0, 1]] * many + [[vase.face_count, 1]])
     scan = scan_of(tally=True, keep_every=2)
     counters = table, vase.face_count + 9
-    (ray, distance, triangle, instance), _, counts, tally = visited(vase, scan, counters, others)
+    hits, _, counts, (met, counted) = visited(vase, scan, counters, others)
+    ray, distance, triangle, instance = hits
     own = vase._engine.scan(scan_of())
     found = {r: (d, t, i) for r, d, t, i in zip(*(a.tolist() for a in (
         own.ray, own.distance, own.triangle, own.instance)), strict=True)}  # fmt: skip
@@ -88,7 +94,7 @@ def test_nearer_hits_of_other_surfaces_replace_those_of_the_caster(vase):
     assert [*zip(ray, distance, triangle, instance, strict=True)] == want[::2]
     assert 100 < sum(i == many for *_, i in want) < len(want) - 100
     rows = [t + vase.face_count * (i == many) for _, _, t, i in want]
-    assert tally.tolist() == np.bincount(rows, minlength=counters[1]).tolist()
+    assert counted.tolist() == np.bincount(rows)[met].tolist() and counted.sum() == len(want)
 
 
 def test_other_backends_have_no_device(shapes):
@@ -96,3 +102,10 @@ def test_other_backends_have_no_device(shapes):
     assert not caster.on_device
     with pytest.raises(BackendUnavailable, match="use scan"):
         caster.visit(scan_of(), print)
+
+
+def test_the_example_of_the_page(played_cuda, capsys):  # noqa: F811
+    page = Path(__file__).parents[2].joinpath("docs/how-to/gpus.md").read_text("utf-8")
+    [code] = re.findall(r"^```python\n(.*?)^```$", page, re.M | re.S)
+    exec(code, {})
+    assert capsys.readouterr().out.splitlines() == re.findall(r"print\(.*\)  # (.*)", code)

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 import trimesh
-from tests.clusters import import_jobqueue, thread_cluster
+from tests.clusters import cluster_of, import_jobqueue, thread_cluster
 
 import lidarpool.run.connection
 import lidarpool.run.watch as lidarpool_watch
@@ -205,6 +205,29 @@ def test_a_cluster_that_lacks_something(case, refused):
     with thread_cluster(*resources) as cluster:
         command = ["run", "good.yaml", "--scheduler", cluster.scheduler_address]
         refused(command if case == "two resources" else [*command, "--wait", "0s"], says)
+
+
+# {scenario: what the message says}
+TOO_LARGE: dict[str, str] = {
+    "steps: 100000\npool: {batch_mb: 501}": "batch_mb is 501, more than the 500 MB",
+    "sensor: {rays_per_revolution: 100000, layers: 128, step_deg: 360}": (
+        "Casting one scan takes about 671 MB, more than the 500 MB"
+    ),
+}
+
+
+@pytest.mark.parametrize("scenario", TOO_LARGE)
+def test_what_does_not_fit_into_the_memory_of_a_worker(place, lidarpool, refused, scenario):
+    (place / "s.yaml").write_text(scenario)
+    workers = {
+        "caster": {"resources": {"GPU": 2}, "memory_limit": 1_000_000_000},
+        "others": {"resources": {"LIDAR": 4}},
+    }
+    with cluster_of(workers, {}, host="127.0.0.1") as cluster:
+        options = ["s.yaml", "--no-plan", "--scheduler", cluster.scheduler_address]
+        refused(["run", *options], TOO_LARGE[scenario])
+        outcome = lidarpool("check", *options)
+        assert outcome.code == 2 and TOO_LARGE[scenario] in outcome.err
 
 
 def test_workers_that_are_waited_for_are_named_meanwhile(place, lidarpool, monkeypatch):

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import json
+from contextlib import contextmanager
 
 import pytest
-from benchmarks import formats, live, pipeline, scale
+from benchmarks import formats, gpu, live, pipeline, scale
+from distributed import Client
 from tests.clusters import thread_cluster
+from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
+
+import lidarpool.api.simulation
 
 pytestmark = pytest.mark.slow
 
@@ -53,3 +58,22 @@ def test_live(tmp_path, capsys):
 def test_formats(capsys):
     formats.main(2000)
     assert len(capsys.readouterr().out.splitlines()) == 1 + len(formats.SCRIPTS)
+
+
+def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
+    @contextmanager
+    def threads(**options):
+        with (
+            thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
+            Client(cluster) as c,
+        ):
+            yield c
+
+    monkeypatch.setattr(lidarpool.api.simulation, "local_client", threads)
+    path = tmp_path / "gpu.json"
+    options = ["--quick", "--in-process", "--only", "run", "--json", str(path)]
+    assert gpu.main([*options, "--folder", str(tmp_path)]) == 0
+    rows = json.loads(path.read_text())["sections"]["run"]
+    points = {name: rows[name]["points"] for name in ("all points", "every fifth point")}
+    assert points["every fifth point"] == pytest.approx(points["all points"] / 5, rel=0.01)
+    assert all(rows[name]["grays_s"] > 0 for name in points)

@@ -7,6 +7,7 @@ import re
 import shutil
 from collections import namedtuple
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ import trimesh
 import yaml
 from distributed import Client
 from tests.clusters import thread_cluster
+from tests.lidarpool.meshes import PLY
 
 import lidarpool.cli.forecast
 from lidarpool import simulate
@@ -95,6 +97,19 @@ def test_json_is_all_that_is_printed(check):
     assert said["memory"]["needed"] > 200e6
 
 
+def test_colours_are_counted_by_file_where_they_are_read(check, tmp_path):
+    road = Path(__file__).parents[2] / "examples" / "road.glb"
+    shutil.copy(road, tmp_path)
+    (tmp_path / "m.ply").write_text(PLY)
+    scenario = SHORT | {"scene": ["road.glb", "m.ply"], "poses": [[0, 0, 2]]}
+    scenario["cloud"] = {"columns": ["red"]}
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    assert "colours     road.glb: 1 texture, 2 plain colours\n" in told
+    assert "colours     m.ply: no colours\n" in told
+    del scenario["cloud"]
+    assert "\ncolours" not in check("--no-plan", text=json.dumps(scenario)).out
+
+
 def test_objects_with_masks_are_named(check, tmp_path):
     plate = np.eye(3) * 3
     cut = Cutout(np.eye(2, dtype=bool), np.zeros((1, 3, 2), np.float32))
@@ -138,9 +153,19 @@ def test_all_reasons_are_given_at_once(check, tmp_path, monkeypatch):
     assert outcome.code == 2
     said = json.loads(outcome.out)
     assert said["can_run"] is False
-    assert len(said["reasons"]) == 2 and said["estimate"] is None
+    assert len(said["reasons"]) == 3 and said["estimate"] is None
     assert "is a file" in said["reasons"][0]
-    assert "There are 0.95 MiB of memory" in said["reasons"][1]
+    assert "Casting one scan takes about 1 MB, more than the 0 MB" in said["reasons"][1]
+    assert "There are 0.95 MiB of memory" in said["reasons"][2]
+
+
+def test_a_scenario_with_errors_gives_json_too(check):
+    outcome = check("--json", text=json.dumps(SHORT | {"poses": [[0, 0]]}))
+    assert outcome.code == 2 and "poses[0].position[2] is missing" in outcome.err
+    said = json.loads(outcome.out)
+    assert said["can_run"] is False and said["notes"] == []
+    assert f"lidarpool: {said['reasons'][0]}" == outcome.err.strip()
+    assert check(text="poses: 7").out == ""
 
 
 def test_a_backend_that_is_not_here(check, monkeypatch):

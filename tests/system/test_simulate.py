@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import re
 import urllib.error
 import urllib.request
 
@@ -12,6 +13,7 @@ from distributed import Client
 
 from lidarpool import LidarpoolError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
 from lidarpool.scene.mesh import Mesh
+from lidarpool.simulator.rig import Rig
 from poolpart import PoolError
 
 
@@ -145,7 +147,7 @@ def raise_at(scan: int | str | None, scan_of=None):
         (
             "lidarpool.simulator.rig.Rig.cast",
             raise_at(None),
-            r"stage intersect, scan (\d+) failed: scan \1: FloatingPointError",
+            r"stage intersect failed: scan \d+: FloatingPointError",
         ),
         (
             "lidarpool.simulator.world.RayCaster",
@@ -174,6 +176,24 @@ def test_a_failure_anywhere_ends_the_run_and_says_where(
     with pytest.raises(LidarpoolError, match=message):
         simulate(room(), survey, planning, client=client)
     assert left_over(client) == ([], [], [])
+
+
+def test_of_several_batches_in_a_task_the_one_that_fails_is_named(client, monkeypatch):
+    cast = Rig.cast
+
+    def fail(rig, first, stop):
+        if first <= 7 < stop:
+            raise FloatingPointError("the mirror is loose")
+        return cast(rig, first, stop)
+
+    monkeypatch.setattr(Rig, "cast", fail)
+    monkeypatch.setattr("lidarpool.pipeline.policies.batches_per_task", lambda *_: 4)
+    with pytest.raises(LidarpoolError) as raised:
+        simulate(room(), Survey(SENSOR, [(0, 0, 0)], 20), client=client)
+    first, last = re.match(
+        r"stage intersect failed: scans? (\d+)(?: to (\d+))?: FloatingPointError", str(raised.value)
+    ).groups()
+    assert int(first) <= 7 <= int(last or first)
 
 
 @pytest.mark.parametrize(

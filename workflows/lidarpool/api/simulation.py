@@ -41,6 +41,7 @@ def simulate(
     live: bool = False,
     queue_capacity: int = 10,
     collectors: int = 2,
+    batch_mb: int = 256,
     gpu_workers: int | None = None,
     other_workers: int | None = None,
     tls: bool = False,
@@ -78,6 +79,9 @@ def simulate(
         How many items stage 1 may be ahead of stage 2.
     collectors
         Tasks of stage 4.
+    batch_mb
+        Most memory, in megabytes, that a GPU worker takes to cast a batch of scans; a scan is never
+        split.
     gpu_workers, other_workers
         Workers of a local cluster; by default chosen for the machine.
     tls
@@ -129,6 +133,7 @@ def simulate(
         backend=backend,
         queue_capacity=queue_capacity,
         collectors=collectors,
+        batch_mb=batch_mb,
         wait_s=wait_s,
         patience_s=patience_s,
     )

@@ -154,6 +154,8 @@ def _check(name: str, value: object, kind: Kind, limits: dict[str, Any]) -> None
         words += f", such as {example}" if example else ""
         raise LidarpoolError(f"{name} is {shown(value)}; it must be {words}.")
     for limit in limits if value is not None else ():
+        if isinstance(value, str) and limit != "min_length":
+            continue  # of the numbers that are also allowed
         if not _LIMITS[limit][0](value, limits[limit]):  # nor NaN
             raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
 

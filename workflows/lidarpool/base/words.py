@@ -32,7 +32,7 @@ def as_text(name: bytes) -> str:
         return name.decode("latin-1")
 
 
-def printable(text: str, letters: int = 200) -> str:
-    """Text from a file as one line of limited length, without control characters."""
+def printable(text: str) -> str:
+    """Text from a file as one line of 200 letters at most, without control characters."""
     kept = "".join(c if c.isprintable() else " " for c in text)
-    return " ".join(kept.split())[:letters]
+    return " ".join(kept.split())[:200]

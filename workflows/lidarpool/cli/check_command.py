@@ -58,14 +58,21 @@ def check(
     from .run_command import formats_of
     from .terminal import shown_status
 
-    file = None if cluster is None else ClusterFile.load(cluster)
-    read = Scenario.load(scenario)
-    with shown_status("reading the scene", as_json, logged=False):
-        job = make_job(read, backend, no_plan)
-    running = nullcontext() if scheduler is None else connected(scheduler, files)
-    with running as client, shown_status("casting some rays", as_json):
-        found = forecast(job, read.pool, out, client, formats_of(read), file)
-    found["notes"] += read.advice(job.scene)
+    try:
+        file = None if cluster is None else ClusterFile.load(cluster)
+        read = Scenario.load(scenario)
+        with shown_status("reading the scene", as_json, logged=False):
+            job = make_job(read, backend, no_plan)
+        running = nullcontext() if scheduler is None else connected(scheduler, files)
+        with running as client, shown_status("casting some rays", as_json):
+            found = forecast(job, read.pool, out, client, formats_of(read), file)
+        found["notes"] += read.advice(job.scene)
+        found["colours"] = read.colours
+    except LidarpoolError as error:
+        if as_json:
+            found = {"can_run": False, "reasons": [str(error)], "notes": []}
+            click.echo(json.dumps(found, indent=1))
+        raise
     if as_json:
         click.echo(json.dumps(found, indent=1, allow_nan=False))
     else:
@@ -99,6 +106,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
         have = "object has masks" if len(masked) == 1 else "objects have masks"
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
         yield f"masks       {len(masked):,} {have}: {shown}"
+    for file, colours in found["colours"].items():
+        yield f"colours     {file}: {colours}"
     drive = found["drive"]
     where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
     several = len(job.survey.carried) > 1

@@ -26,9 +26,9 @@ from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
-from ..pipeline.policies import BATCH_RAYS
+from ..pipeline.policies import most_scans
 from ..report.output import ROOM_BYTES, refuse_to_replace
-from ..run.checks import find_workers, gpu_note, slots_needed
+from ..run.checks import check_memory, find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
 from ..run.job import Job
@@ -39,6 +39,7 @@ from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.echoes import PATTERN_RAYS
+from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
 from ..simulator.world import check_backend_here
 from .run_command import no_hits
@@ -48,10 +49,12 @@ from .run_command import no_hits
 PROCESS_BYTES = 300 << 20  # 110 MiB of these for numba, which compiles what calls Embree
 TRIANGLE_BYTES = 360
 SCENE_BYTES = 80  # of a triangle, in every process that knows the scene
+COLOURED_BYTES = 160  # of a triangle with colours, and four times the bytes of images
 COPY_BYTES = 2000  # of an instance, likewise
 RAY_BYTES = 48  # of a turn, and of the pattern made of it
 PARTICLE_BYTES = 140  # of a swarm, for each corner of its path
 PART_BYTES = 2500  # its head, and its row in the database
+FIRST_PARTS = 60  # of a scan or a few, taken before batches become large
 SCAN_BYTES = 64  # in the driver
 WAY_POSES = 1000  # that the length of a way is measured by
 SUMMARY_BYTES = 28  # of a scan, in the database
@@ -59,6 +62,7 @@ FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most
 
 # Rays that are cast at most, whole scans of them, and the least and most scans.
 SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
+SAMPLE_MOST = 20_000_000  # rays beyond which fewer scans are cast, one at least
 
 
 def forecast(
@@ -101,6 +105,8 @@ def forecast(
             check_backend_here(job.backend)
             usable = [name for name, reason in available_backends().items() if not reason]
             backend = usable[0] if job.backend == "auto" else job.backend
+            # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
+            check_memory(job, backend, MEMORY_LIMIT / CPU_COUNT, "a GPU worker of this machine")
         else:
             try:
                 everybody, casting, backend, _ = find_workers(client, job, job.backend)
@@ -111,13 +117,17 @@ def forecast(
             notes += filter(None, [gpu_note(everybody, casting, backend)])
     estimate = None
     # Casting here needs as much memory as on a worker: it would fail or be killed.
-    if _worker_bytes(job) <= MEMORY_LIMIT:
+    if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
         estimate = sample_survey(job.scene, job.survey)
         if not estimate["hits"]:
             notes.append(no_hits(job))
     # Without an estimate every ray may hit.
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
-    disk = _disk(job, points, len(formats), out)
+    # Scans of the largest batches; small ones take less.
+    on_device = backend == "cuda"
+    fit = scans_that_fit(job.scene, job.survey, job.batch_mb * MB, on_device=on_device)
+    batch = most_scans(fit, job.survey.scan_count, max(1, slots[GPU]["there"]))
+    disk = _disk(job, points, batch, len(formats), out)
     stored = isinstance(out, Storage)
     if disk["free"] < (least := disk["result"] + (0 if stored else disk["parts"])):
         mistakes.lines.append(
@@ -125,12 +135,14 @@ def forecast(
             f"needs about {format_bytes(least)}: make room, name another folder with "
             f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
         )
-    needed = _worker_bytes(job) if client or file else _machine_bytes(job, points, slots)
+    needed = _worker_bytes(job) + cast_bytes(job.scene, job.survey, batch, on_device=on_device)
+    if not (client or file):
+        needed = needed * casters + _rest_bytes(job, points, slots)
     if memory and memory < needed:
         mistakes.lines.append(
             f"There are {format_bytes(memory)} of memory, and the run needs about "
-            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), "
-            "rays_per_revolution or planning.particles, or a machine with more."
+            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), a smaller "
+            "batch_mb, rays_per_revolution or planning.particles, or a machine with more."
         )
     return {
         "can_run": not mistakes.lines,
@@ -154,12 +166,17 @@ def forecast(
     }
 
 
-def _disk(job: Job, points: int, exports: int, out: Path | Storage) -> dict[str, Any]:
-    """Disk that parts and database need during the run, that the result needs, and what is free."""
+def _disk(job: Job, points: int, batch: int, exports: int, out: Path | Storage) -> dict[str, Any]:
+    """Disk that parts and database need during the run, that the result needs, and what is free.
+
+    Later parts are of `batch` scans.
+    """
     survey, faces, point = job.survey, job.scene.kept_triangles, _point_bytes(job)
-    parts = min(survey.scan_count, max(16, survey.ray_count // BATCH_RAYS + 1))
-    tally = 12 * min(faces, BATCH_RAYS // 10)  # names each triangle that the rays of a part hit
-    run = point * points + (PART_BYTES + tally) * parts + SUMMARY_BYTES * survey.scan_count
+    full = -(-survey.scan_count // batch)
+    parts = min(survey.scan_count, full + FIRST_PARTS)
+    # Each part names the triangles that its rays hit.
+    tally = 12 * min(faces, survey.ray_count // full // 10) * full
+    run = point * points + PART_BYTES * parts + tally + SUMMARY_BYTES * survey.scan_count
     # A row of the PLY has doubles for coordinates at most; one piece exists twice.
     cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
     result = cloud + (point + FORMAT_BYTES) * points * exports + ROOM_BYTES + 36 * faces
@@ -198,7 +215,9 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     """
     rig = Rig(scene, survey, backend)
     all_rays = survey.ray_count * survey.returns.subrays
-    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, *SAMPLE_SCANS)
+    least, most = SAMPLE_SCANS
+    few = max(1, SAMPLE_MOST * survey.scan_count // all_rays)
+    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, min(least, few), most)
     rays = hits = points = 0
     for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
         rays += survey.scan(scan).ray_count
@@ -248,31 +267,33 @@ def _look_at_folder(out: Path | Storage) -> list[str]:
 
 
 def _worker_bytes(job: Job) -> int:
-    """Memory of a GPU worker."""
+    """Memory of a GPU worker, without what it casts."""
     sensors = [carried.sensor for carried in job.survey.carried]
     each = job.survey.returns.subrays
     rays = sum(min((s.period or 0) * s.channels * each, PATTERN_RAYS) for s in sensors)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
-    return PROCESS_BYTES + triangles + _copies_bytes(job) + RAY_BYTES * rays
+    images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
+    coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())
+    return PROCESS_BYTES + triangles + coloured + _copies_bytes(job) + RAY_BYTES * rays
 
 
 def _copies_bytes(job: Job) -> int:
     return COPY_BYTES * len(job.scene.instances) if job.scene.instances else 0
 
 
-def _machine_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
-    """Memory of all workers and of the driver, on one machine."""
+def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
+    """Memory of the driver and of all workers but those of GPU, on one machine."""
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
     other = PROCESS_BYTES + PARTICLE_BYTES * swarm
     piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
-    shown = min(job.scene.triangles, job.scene.kept_triangles + DRAWN_TRIANGLES)
+    shown = job.scene.kept_triangles + DRAWN_TRIANGLES
+    if not job.scene.masked:  # which is cut into more
+        shown = min(job.scene.triangles, shown)
     driver = (
         2 * SCENE_BYTES * shown + _copies_bytes(job) + SCAN_BYTES * job.survey.scan_count + piece
     )
-    workers = _worker_bytes(job) * slots[GPU]["there"]
-    if OTHER in slots:
-        workers += other * slots[OTHER]["there"]
-    return workers + driver + 2 * PROCESS_BYTES  # of LIDAR and the driver
+    planning = other * slots[OTHER]["there"] if OTHER in slots else 0
+    return planning + driver + 2 * PROCESS_BYTES  # of LIDAR and the driver
 
 
 def _point_bytes(job: Job) -> int:

@@ -96,7 +96,7 @@ class Column:
                 f"for each of the {len(returns)} points."
             )
         wanted = np.dtype(self.dtype)
-        if wanted.kind in "iu" and len(values):
+        if wanted.kind in "iu" and len(values) and values.dtype != wanted:
             limits = np.iinfo(wanted)
             if values.dtype.kind == "f" and not np.isfinite(values).all():
                 raise LidarpoolError(f"Column {self.name!r} holds NaN or infinity as {wanted}.")
@@ -168,7 +168,11 @@ OPTIONAL = (
     ),
     Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
     Column("triangle", "int32", "", "triangle of the scene that was hit", "triangle"),
+    Column("red", "uint8", "", "red of the surface, sRGB; what has no colour is grey, 188", "red"),
+    Column("green", "uint8", "", "green of the surface, sRGB", "green"),
+    Column("blue", "uint8", "", "blue of the surface, sRGB", "blue"),
 )
+COLOURS = ("red", "green", "blue")
 
 TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
 

@@ -16,11 +16,12 @@ from pye57 import libe57
 
 from ..base.fingerprint import fingerprint
 from ..columns.cloud import Cloud, CloudLike
+from ..columns.table import COLOURS
 from .sweeps import Sweeps
 
 
 def write_e57(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
-    """Write each sweep that has points, in the sensor's axes, with its pose and intensity."""
+    """Write each sweep that has points, in the sensor's axes: pose, intensity, colours."""
     content = fingerprint(sweeps, len(cloud), np.asarray(cloud.bounds))
     with _named_by(content), pye57.E57(str(path), mode="w") as file:
         try:
@@ -38,6 +39,8 @@ def _write_scan(file: Any, sweeps: Sweeps, sweep: int, points: Cloud) -> None:
     data = {"cartesianX": x, "cartesianY": y, "cartesianZ": z}
     if "intensity" in points.columns:
         data["intensity"] = points["intensity"]
+    if {*COLOURS} <= {*points.columns}:
+        data |= {f"color{name.capitalize()}": points[name] for name in COLOURS}
     turn = np.roll(sweeps.pose.quaternions[sweep], 1)  # w first
     place = sweeps.pose.positions[sweep]
     file.write_scan_raw(data, name=f"sweep {sweep}", rotation=turn, translation=place)

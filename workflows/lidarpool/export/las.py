@@ -1,4 +1,4 @@
-"""LAS and LAZ 1.4, point format 6, through laspy."""
+"""LAS and LAZ 1.4, point formats 6 and 7, through laspy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import TABLE
+from ..columns.table import COLOURS, TABLE
 from .sweeps import Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
@@ -42,12 +42,14 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
 
     `time` is adjusted standard GPS time of a survey with a start, else seconds since the survey's
     start. A coordinate system is stored as WKT. `return_number` and `returns` are as they are,
-    `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. Intensity is
+    `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. With `red`,
+    `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
     the column `intensity` times 65,535, at most that, and classification `class` if it is below
     256; because of these limits, both columns are in the extra bytes as well. Return numbers are
     15 at most, and angles in steps of 0.006 degrees.
     """
-    header = laspy.LasHeader(version="1.4", point_format=6)
+    coloured = {*COLOURS} <= {column.name for column in cloud.table}
+    header = laspy.LasHeader(version="1.4", point_format=7 if coloured else 6)
     header.generating_software = "lidarpool"
     header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys without a date begin
     begins_s = 0.0
@@ -68,7 +70,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
             f"{path.suffix[1:].upper()} holds 2^32 steps of {sweeps.precision_m} m along an axis, "
             f"and the cloud is {(high - low).max():.6g} m wide: use a coarser precision_m."
         )
-    extra = [column for column in cloud.table if column.name not in _OF_FORMAT]
+    own = (*_OF_FORMAT, *COLOURS) if coloured else _OF_FORMAT
+    extra = [column for column in cloud.table if column.name not in own]
     header.add_extra_dims(
         [
             laspy.ExtraBytesParams(
@@ -113,6 +116,9 @@ def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: f
         record.scan_angle = np.round(turned / ANGLE_DEG).astype(np.int16)
     if "class" in there:
         record.classification = np.where(there["class"] < 256, there["class"], 0).astype(np.uint8)
+    if {*COLOURS} <= {*there}:
+        for name in COLOURS:
+            record[name] = there[name].astype(np.uint16) * 257
     if "sensor" in there:
         record.point_source_id = there["sensor"].astype(np.uint16) + 1
     for name in extra:

@@ -34,6 +34,7 @@ LAYOUTS = {
     "autoware": ("intensity", "time", "azimuth", "elevation", "range"),
     "ouster": ("intensity", "time", "reflectivity", "range"),
 }
+_E57 = ("intensity", "red", "green", "blue")
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
 _RINGS = ("channel", "intensity")
@@ -45,7 +46,7 @@ FORMATS = {
     "laz": FormatRow("cloud.laz", "las", False, _LAS),
     "parquet": FormatRow("cloud.parquet", "parquet", True, ("pyarrow",)),
     "pcd": FormatRow("pcd", "pcd", True, ("pypcd4",), ("scan",)),
-    "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), ("intensity",)),
+    "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), _E57),
     "kitti": FormatRow("kitti", "kitti", True, (), ("scan", *_LABELS), _LABELS),
     "nuscenes": FormatRow("nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS),
     "mcap": FormatRow("cloud.mcap", "ros", *_BAG),

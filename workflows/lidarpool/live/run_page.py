@@ -29,12 +29,11 @@ from ..plan import best
 from ..run.bars import Pace, standing_still
 from ..run.conductor import Page
 from ..run.job import Job
-from ..run.picture_file import Pictured, sensor_ways
+from ..run.picture_file import Pictured, reflectances_of, sensor_ways
 from ..run.progress import STAGES, Progress, Show
 from ..run.result import RunResult
 from ..run.store import RunStore
-from ..scene.drawn import Drawn
-from ..sensor.materials import MaterialTable
+from ..scene.drawn import Drawn, cut
 from .live_points import LivePoints
 from .points import HeldPoints, no_points
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
@@ -55,11 +54,11 @@ class LiveRun(Page):
         self.stopped = threading.Event()  # by a user of the page; --resume continues
         survey, scene = job.survey, job.scene
         ways = sensor_ways(survey)
-        self._drawn = Drawn.of(scene, near=[way.positions for way in ways])
+        self._drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         pictured = Pictured(
             self._drawn.scene, ways, np.zeros(0, np.int64),
             np.zeros((0, 2, 3), np.float32), job.planning, None, (), survey.duration_ns, (),
-            MaterialTable.of(survey.materials, scene.all_names).reflectance,
+            reflectances_of(scene, survey),
         )  # fmt: skip
         self._view = View("lidarpool", no_points((SCAN, *survey.stored_columns)), pictured)
         if survey.coordinates != "world":

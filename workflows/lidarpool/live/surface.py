@@ -66,6 +66,8 @@ class Surface:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
             greys = mapped("gray", np.linspace(0.1, 1.0, 9))
             legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+        elif by == "colour" and self.coarse.colours is not None:
+            colours = self.coarse.colours.means() / 255
         else:
             return arrays, None
         corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
@@ -90,6 +92,7 @@ class Surface:
 
 
 def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:
-    """List the ways to colour a scene, with or without known reflectance."""
+    """List the ways to colour a scene, with or without known reflectance, and its own colours."""
+    own = ("colour",) if scene.colours is not None else ()
     more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
-    return ("grey", "hits", "object", *more)
+    return ("grey", "hits", "object", *more, *own)

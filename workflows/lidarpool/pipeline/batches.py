@@ -28,7 +28,6 @@ class Batch:
     number: int  # of earlier batches: limits how far the last is ahead of the first
     place: Place = Place.WAITING
     since: float = 0.0  # since when it is in its state
-    offers: int = 0  # how often it was offered to a GPU worker; receipts of all offers count
     key: str = ""  # of the casting task; "" while waiting
     worker: str = ""  # address of the GPU worker
     collector: str = ""  # name of the task of stage 4

@@ -58,7 +58,8 @@ class SurveyDriver:
     `workers` are stage 2 and `stages` the others: all that it asks of Dask, so that tests can play
     the cluster. Scans in `db` are not cast again, and `storage` is where parts go. `read` reads the
     points of a committed scan. `on_frame` is called with each frame, in scan order, in the driver's
-    thread, and `on_parts` with parts that were committed.
+    thread, and `on_parts` with parts that were committed. So many scans `fit` into the memory of a
+    batch.
     """
 
     def __init__(
@@ -71,8 +72,10 @@ class SurveyDriver:
         read: Callable[[int], Cloud],
         on_frame: Callable[[Frame], None],
         on_parts: Callable[[list[Receipt]], None],
+        fit: int,
     ) -> None:
         self.survey = survey
+        self._fit = fit
         self._workers, self._stages = workers, stages
         self._db, self._storage = db, storage
         self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
@@ -179,9 +182,8 @@ class SurveyDriver:
 
     @property
     def _per_task(self) -> int:
-        rays = self.survey.ray_count // self.survey.scan_count
-        largest = rays * max(map(len, self.batches), default=1)
-        return policies.batches_per_task(self._seconds, largest)
+        largest = max(map(len, self.batches), default=1)
+        return policies.batches_per_task(self._seconds, largest, self._fit)
 
     def _trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
         trace(f"driver.{event}", run=self._stages.run, stage=stage, scans=list(scans), **more)
@@ -205,7 +207,6 @@ class SurveyDriver:
         for task, worker in chosen:
             key = self._workers.cast([(batch.first, batch.stop) for batch in task], worker)
             for batch in task:
-                batch.offers += 1
                 batch.key, batch.worker, batch.collector = key, worker, ""
                 batch.to(Place.CASTING, time.monotonic())
                 self._trace("submit", INTERSECT, batch.scans)
@@ -214,7 +215,7 @@ class SurveyDriver:
     def _check_casts(self) -> bool:
         moved = False
         for batch in self.batches.at(Place.CASTING):
-            outcome = self._workers.outcome(batch.key, batch.name)
+            outcome = self._workers.outcome(batch.key)
             if outcome is Outcome.DONE:
                 batch.to(Place.CAST, time.monotonic())
                 self.cast += len(batch)
@@ -329,10 +330,9 @@ class SurveyDriver:
         """Record a task of stage 2, and advise stage 1 on the scans in one item."""
         self.book.add(record)
         self._seconds.append(record.seconds)
-        count = self.survey.scan_count
-        rays, slots = self.survey.ray_count // count, self._workers.slot_count
+        count, slots = self.survey.scan_count, self._workers.slot_count
         self._stages.advise(
-            policies.scans_per_batch(record.seconds, record.items, rays, count, slots)
+            policies.scans_per_batch(record.seconds, record.items, self._fit, count, slots)
         )
 
     # -- stage 3: frames in order --------------------------------------------------------------

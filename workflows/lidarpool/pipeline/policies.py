@@ -16,7 +16,6 @@ from .batches import Batch, Place
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
-BATCH_RAYS = 1_000_000  # bounds a batch's memory
 BATCHES_LEAST = 16  # batches for each slot, so that none idles for long at the end
 TASK_SECONDS = 0.1  # casting time that makes a task worth its overhead
 TASK_BATCHES = 32  # batches of one task, at most
@@ -32,26 +31,32 @@ LATE_FACTOR = 20.0  # so much longer than others
 # -- how much is under way -------------------------------------------------------------------
 
 
-def scans_per_batch(
-    seconds: float, scans: int, rays_per_scan: int, scan_count: int, slots: int
-) -> int:
+def most_scans(fit: int, scan_count: int, slots: int) -> int:
+    """Find how many scans a batch may have: so many `fit` into its memory, and all slots get some.
+
+    One at least: a scan is never split.
+    """
+    return max(1, min(fit, scan_count // (BATCHES_LEAST * slots)))
+
+
+def scans_per_batch(seconds: float, scans: int, fit: int, scan_count: int, slots: int) -> int:
     """Choose how many scans a batch should have, at most twice as many as the last.
 
-    The last had so many `scans`, and took so many `seconds` to cast; `slots` are cast at a time.
+    The last had so many `scans`, and took so many `seconds` to cast; the others see `most_scans`.
     """
-    most = min(BATCH_RAYS // max(1, rays_per_scan), scan_count // (BATCHES_LEAST * slots))
-    return max(1, min(int(BATCH_SECONDS * scans / max(seconds, 1e-6)), 2 * scans, most))
+    wanted = int(BATCH_SECONDS * scans / max(seconds, 1e-6))
+    return max(1, min(wanted, 2 * scans, most_scans(fit, scan_count, slots)))
 
 
-def batches_per_task(seconds: Sequence[float], rays: int = 1) -> int:
-    """Choose how many batches of so many rays a casting task has, from the casting times of others.
+def batches_per_task(seconds: Sequence[float], scans: int, fit: int) -> int:
+    """Choose how many batches of so many scans a casting task has, from casting times of others.
 
-    All of its batches are in a worker's memory at a time.
+    All of its batches are in a worker's memory at a time, into which so many scans `fit`.
     """
     if not seconds:
         return 1
     typical = max(statistics.median(seconds), 1e-6)
-    most = min(TASK_BATCHES, BATCH_RAYS // max(1, rays))
+    most = min(TASK_BATCHES, fit // max(1, scans))
     return max(1, min(int(TASK_SECONDS / typical), most))
 
 

@@ -99,8 +99,8 @@ class CastingWorkers:
         )
         return key
 
-    def outcome(self, key: str, what: str) -> Outcome:
-        """State of a casting task; LidarpoolError, with the words `what`, if it has failed."""
+    def outcome(self, key: str) -> Outcome:
+        """State of a casting task; LidarpoolError if it has failed."""
         future = self._casts[key]
         if future.status == "finished":
             return Outcome.DONE
@@ -108,7 +108,7 @@ class CastingWorkers:
             return Outcome.NO_RIG
         if future.status == "error" and was_killed(future):
             return Outcome.KILLED
-        raise_if_failed(future, f"stage {INTERSECT}, {what}")
+        raise_if_failed(future, f"stage {INTERSECT}")  # the error names the scans
         return Outcome.PENDING
 
     def forget(self, key: str) -> None:

@@ -27,6 +27,7 @@ _NOTHING = np.float32(1e-15)  # added to steps, so that one of length 0 has a di
 # Most elements of a buffer, to limit the memory. Smaller blocks, which fit a second-level cache,
 # were slower: NumPy takes 0.7 µs to start each of some 35 operations on a block.
 _BLOCK_ELEMENTS = 160_000
+_BLOCK_DISCS = 16  # least in a block, if there are so many; more particles make longer loops
 
 
 class PathCost:
@@ -47,7 +48,7 @@ class PathCost:
         # The boundaries of all discs together are at least as long as any path around them.
         self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
         self._cost = np.empty(particles, np.float32)
-        pairs = len(radii) * (waypoints + 1) * particles
+        pairs = min(len(radii), _BLOCK_DISCS) * (waypoints + 1) * particles
         blocks = min(particles, max(1, -(-pairs // _BLOCK_ELEMENTS)))  # rounded up
         ends = [particles * block // blocks for block in range(blocks + 1)]
         self._blocks = [slice(*span) for span in itertools.pairwise(ends)]
@@ -75,7 +76,7 @@ def _grown(centres: Floats, radii: Floats) -> Floats:
 
 
 class _Workspace:
-    """Buffers for a block of paths, and the arithmetic on them.
+    """Buffers for a block of paths and some discs at a time, and the arithmetic on them.
 
     For a segment with unit direction e, middle M and half length h, and a disc around C, let
     u = (C - M) · e and c = (C - M) x e. The point of the segment closest to C is
@@ -91,21 +92,24 @@ class _Workspace:
         def singles(*shape: int) -> Singles:
             return np.empty(shape, np.float32)
 
-        discs = len(radii)
+        discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # at a time
+        self._parts = [slice(i, i + discs) for i in range(0, len(radii), discs or 1)]
         doubled = (2 * centres).astype(np.float32)
         self._x, self._y = doubled[:, 0, None, None], doubled[:, 1, None, None]
-        squared = (4 * radii**2).astype(np.float32)
-        self._squared_radii = np.repeat(squared[:, None], width, axis=1)  # (disc, particle)
+        self._squared_radii = (4 * radii**2).astype(np.float32)[:, None]
         self._weights = (_SLOPE / (4 * radii)).astype(np.float32)[:, None]
         # (x and y, segment, particle)
         self._direction, self._middle, self._products = (
             singles(2, segments, width) for _ in range(3)
         )
-        self._length = singles(segments, width)
+        self._length, self._along_middle, self._across_middle = (
+            singles(segments, width) for _ in range(3)
+        )
         # (disc, segment, particle)
         self._along, self._across, self._spare = (singles(discs, segments, width) for _ in range(3))
-        self._nearest = singles(discs, width)
+        self._prices = singles(1 + discs, width)  # of the discs before, and of each of these
         self._price, self._entered = singles(width), np.empty(width, np.bool_)
+        self._zeros = np.zeros(width, np.float32)  # as an array, see above
 
     def evaluate(self, points: Singles, cost: Singles, entry_price: float) -> None:
         """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""
@@ -117,31 +121,39 @@ class _Workspace:
         np.add(products[0], products[1], out=length)
         np.sqrt(length, out=length)
         np.add.reduce(length, axis=0, out=cost)
-        if len(self._nearest):
-            np.divide(direction, length, out=direction)
-            np.add(last, first, out=self._middle)
-            self._measure()
-            self._charge(cost, entry_price)
-
-    def _measure(self) -> None:
-        """Write to `_nearest` the squared distance, times 4, of each path to each disc."""
-        direction, middle, products = self._direction, self._middle, self._products
-        along, across, spare = self._along, self._across, self._spare
-        (east, north), offset = direction, products[0]
-
-        np.multiply(self._x, east, out=along)
-        np.multiply(self._y, north, out=spare)
-        np.add(along, spare, out=along)
+        if not self._parts:
+            return
+        middle, price = self._middle, self._price
+        np.divide(direction, length, out=direction)
+        np.add(last, first, out=middle)
         np.multiply(middle, direction, out=products)
-        np.add(products[0], products[1], out=offset)
-        np.subtract(along, offset, out=along)
-
-        np.multiply(self._x, north, out=across)
-        np.multiply(self._y, east, out=spare)
-        np.subtract(across, spare, out=across)
+        np.add(products[0], products[1], out=self._along_middle)
         np.multiply(middle, direction[::-1], out=products)
-        np.subtract(products[0], products[1], out=offset)
-        np.subtract(across, offset, out=across)
+        np.subtract(products[0], products[1], out=self._across_middle)
+        price.fill(0)
+        for discs in self._parts:
+            self._add_price(discs)
+        np.greater(price, _TOUCH, out=self._entered)
+        np.add(cost, price, out=cost)
+        np.multiply(self._entered, np.float32(entry_price), out=price)
+        np.add(cost, price, out=cost)
+
+    def _add_price(self, discs: slice) -> None:
+        """Add to `_price` the penalty for entering some discs."""
+        x, y, squared_radii = self._x[discs], self._y[discs], self._squared_radii[discs]
+        count = len(x)
+        along, across, spare = self._along[:count], self._across[:count], self._spare[:count]
+        (east, north), prices = self._direction, self._prices[: 1 + count]
+
+        np.multiply(x, east, out=along)
+        np.multiply(y, north, out=spare)
+        np.add(along, spare, out=along)
+        np.subtract(along, self._along_middle, out=along)
+
+        np.multiply(x, north, out=across)
+        np.multiply(y, east, out=spare)
+        np.subtract(across, spare, out=across)
+        np.subtract(across, self._across_middle, out=across)
 
         np.abs(along, out=along)
         np.minimum(along, self._length, out=spare)
@@ -149,17 +161,11 @@ class _Workspace:
         np.square(along, out=along)
         np.square(across, out=across)
         np.add(along, across, out=along)
-        np.minimum.reduce(along, axis=1, out=self._nearest)
+        nearest = np.minimum.reduce(along, axis=1, out=prices[1:])  # squared distances, times 4
 
-    def _charge(self, cost: Singles, entry_price: float) -> None:
-        """Add to `cost` the penalty for entering discs, from `_nearest`."""
-        nearest, price = self._nearest, self._price
         # (r² - d²) / r lies between the depth and twice the depth
-        np.minimum(nearest, self._squared_radii, out=nearest)
-        np.subtract(self._squared_radii, nearest, out=nearest)
-        np.multiply(nearest, self._weights, out=nearest)
-        np.add.reduce(nearest, axis=0, out=price)
-        np.greater(price, _TOUCH, out=self._entered)
-        np.add(cost, price, out=cost)
-        np.multiply(self._entered, np.float32(entry_price), out=price)
-        np.add(cost, price, out=cost)
+        np.subtract(squared_radii, nearest, out=nearest)
+        np.multiply(nearest, self._weights[discs], out=nearest)
+        np.maximum(nearest, self._zeros, out=nearest)
+        prices[0] = self._price  # added one after the other, whatever the parts
+        np.add.reduce(prices, axis=0, out=self._price)

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from .geometry import Floats, segment_distances
+from .geometry import Floats, PathAxes, segment_distances
 
 # A tangent this close to a disc, as a share of the scene's size, passes it. Three discs with one
 # common tangent are usual in constructed scenes, and rounding must not close the path.
@@ -64,10 +64,14 @@ def shortest_path_length(
     ends = np.asarray([start, target], float)
     size = float(np.ptp(np.vstack([ends, centres_]), axis=0).max() + radii_.max(initial=0.0))
     tolerance = _TOLERANCE * size
-    # A path by way of a disc is at least as long as one that reaches its edge and goes on.
-    by_way = np.hypot(*(centres_ - ends[0]).T) + np.hypot(*(centres_ - ends[1]).T) - 2 * radii_
+    # A path by way of a disc is at least as long as one by way of the square around it: by the
+    # corner or side of that which is nearest to the straight line and its middle.
+    axes = PathAxes(start, target)
+    beside = np.abs(axes.to_local(centres_)) * axes.unit_m - radii_[:, None]
+    x, y = np.maximum(beside, 0.0).T
+    limit = axes.unit_m
+    by_way = np.hypot(x + limit / 2, y) + np.hypot(x - limit / 2, y)
     by_way_sorted = np.sort(by_way)
-    limit = float(np.hypot(*(ends[1] - ends[0])))
     while True:
         near = by_way <= limit + tolerance
         length = _around(ends, centres_[near], radii_[near], tolerance)

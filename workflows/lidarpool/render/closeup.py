@@ -113,7 +113,10 @@ class Part:
         if not len(faces):
             return self
         owners = scene.face_object[own]
-        part = Scene(vertices, faces.astype(np.int32), owners, scene.names, scene.origin)
+        colours = scene.colours and scene.colours.take(own)
+        part = Scene(
+            vertices, faces.astype(np.int32), owners, scene.names, scene.origin, colours=colours
+        )
         was = triangle_areas(scene.vertices[scene.faces[own]])
         shares = np.divide(
             triangle_areas(vertices[faces]), was, out=np.ones(len(was)), where=was > 0

@@ -31,9 +31,16 @@ SURROUNDING = 0.6
 def draw_scene(shot: Shot, triangles: int) -> Page:
     """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number.
 
-    Of more objects than a legend has rows, copies of one thing share a colour.
+    Of more objects than a legend has rows, copies of one thing share a colour. A scene that has
+    colours is drawn in these, without a legend.
     """
     scene = shot.scene
+    words = f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')}"
+    if scene.colours is not None:
+        page = Page(shot.camera.size)
+        page.show(shot, shot.paint(scene.colours.means() / 255))
+        page.title("Scene", f"{words} · {shot.when}", shot.models)
+        return page
     kinds, names = _kinds(scene.names, shot.actors)
     colours = _object_colours(scene, kinds)
     page = Page(shot.camera.size)
@@ -50,11 +57,7 @@ def draw_scene(shot: Shot, triangles: int) -> Page:
     if seen.sum() > LEGEND_ROWS:
         order.sort(key=lambda k: k < first and counts[k] == 1)  # then copies
     page.legend([(labels[k], colours[firsts[k]]) for k in order if seen[k]])
-    page.title(
-        "Scene",
-        f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')} · {shot.when}",
-        shot.models,
-    )
+    page.title("Scene", f"{words} · {shot.when}", shot.models)
     return page
 
 

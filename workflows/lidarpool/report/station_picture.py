@@ -23,13 +23,13 @@ COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY)])
 _BLOCK = 4  # pixels a side
 
 
-def draw_stations(scene: Scene, plan: StationPlan, size: tuple[int, int] = SIZE) -> Page:
+def draw_stations(scene: Scene, plan: StationPlan) -> Page:
     """Draw the scene of a plan by what its stations see: exactly, in each pixel, with shadows.
 
     Actors are left out.
     """
-    shot = take_shot(replace(scene, actors=()), plan.stations, size=size)
-    page = Page(size)
+    shot = take_shot(replace(scene, actors=()), plan.stations)
+    page = Page(SIZE)
     axes = page.show(shot, _by_coverage(shot, plan).paint(COLOURS, 0.6))
     page.numbers(axes, shot)
     names = ("covered", "not covered", "out of sight")

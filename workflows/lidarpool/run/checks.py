@@ -6,6 +6,7 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 from distributed import Client
@@ -17,6 +18,7 @@ from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
 from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from ..simulator.memory import MB, cast_bytes
 from ..simulator.world import AUTO_TAKES
 from .job import Job
 from .watch import Waiting
@@ -47,7 +49,7 @@ def find_workers(
     software that a resumed run was cast with. Workers that are missing or just died are waited
     for as long as `waiting` says.
 
-    LidarpoolError if workers, slots or the backend are missing, or versions differ.
+    LidarpoolError if workers, slots, memory or the backend are missing, or versions differ.
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
@@ -58,6 +60,10 @@ def find_workers(
             pool = _survey_pool(client, slots_needed(job))
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             backend = common_backend(client, wanted, casting, advice)
+            for worker in casting:
+                if worker.memory:
+                    each = worker.memory / max(1, worker.resources[GPU])
+                    check_memory(job, backend, each, f"the GPU worker at {worker.address}")
             casts = common_software(client, backend, casting, earlier or {})
             return pool, casting, backend, casts
         except TooFewWorkersError as error:
@@ -68,6 +74,23 @@ def find_workers(
             # Who waits has started them.
             waiting.tell("workers", str(error).partition(": start ")[0])
         time.sleep(LOOK_EVERY_S)
+
+
+def check_memory(job: Job, backend: str, room: float, worker: str) -> None:
+    """Refuse scans and batches for which a worker has too little memory: `room`, bytes a slot."""
+    takes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
+    scan, all_scans = map(takes, (1, job.survey.scan_count))
+    limit = f"more than the {room / MB:,.0f} MB that {worker} has for each slot"
+    if scan > room:
+        raise LidarpoolError(
+            f"Casting one scan takes about {scan / MB:,.0f} MB, {limit}: take a smaller step_deg, "
+            "fewer rays or columns, or give GPU workers a larger --memory-limit."
+        )
+    if min(job.batch_mb * MB, all_scans) > room:
+        raise LidarpoolError(
+            f"batch_mb is {job.batch_mb:,}, {limit}: make it smaller, or give GPU workers a larger "
+            "--memory-limit."
+        )
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:

@@ -18,6 +18,7 @@ from ..scenario.sections import TaskOptions
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.materials import MaterialTable
+from ..simulator.surfaces import warn_of_grey
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +42,7 @@ class Job(TaskOptions):
         for actor in self.scene.actors:
             actor.check(0.0, self.survey.duration_ns)
         _check_precision(self.scene, self.survey)
+        warn_of_grey(self.scene, self.survey)
 
     @property
     def trials(self) -> int:

@@ -17,7 +17,8 @@ from ..base.words import counted
 from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
 from ..scene.actors import Actor
-from ..scene.drawn import Drawn
+from ..scene.colours import Colours
+from ..scene.drawn import Drawn, cut
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..sensor import Survey, Track
@@ -77,7 +78,7 @@ class Pictured:
         scene, survey = result.scene, result.survey
         actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
         ways = sensor_ways(survey)
-        drawn = Drawn.of(scene, near=[way.positions for way in ways])
+        drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         return cls(
             replace(drawn.scene, actors=actors),
             ways,
@@ -88,7 +89,7 @@ class Pictured:
             [trial.waypoints for trial in result.trials],
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
-            MaterialTable.of(survey.materials, scene.all_names).reflectance,
+            reflectances_of(scene, survey),
             survey.coordinates,
             scene.triangles,
         )
@@ -143,6 +144,8 @@ class Pictured:
         }
         if self.reflectance is not None:
             arrays["reflectance"] = self.reflectance
+        if self.scene.colours is not None:
+            arrays["colours"] = self.scene.colours.means()
         for number, way in enumerate(self.sensors):
             arrays |= {f"sensor{number}_times": way.times_ns, f"sensor{number}": way.positions}
         for number, actor in enumerate(self.scene.actors):
@@ -153,6 +156,8 @@ class Pictured:
             made = (mesh.vertices, mesh.faces, track.times_s, track.positions, track.quaternions)
             values = zip(_ACTOR, made, strict=True)
             arrays |= {f"actor{number}_{part}": value for part, value in values}
+            if mesh.colours is not None:
+                arrays[f"actor{number}_colours"] = mesh.colours.means()
         if self.planning is not None and self.plan is not None:
             arrays |= {
                 "ends": [self.planning.start, self.planning.target],
@@ -181,7 +186,8 @@ class Pictured:
         actors = []
         for number, name in enumerate(names["actors"]):
             vertices, faces, *track = (arrays[f"actor{number}_{part}"] for part in _ACTOR)
-            actors.append(Actor(Mesh(name, vertices, faces), Track(*track)))
+            shown = _colours(arrays, f"actor{number}_colours")
+            actors.append(Actor(Mesh(name, vertices, faces, colours=shown), Track(*track)))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -189,6 +195,7 @@ class Pictured:
             tuple(map(str, names["objects"])),
             arrays["origin"],
             tuple(actors),
+            colours=_colours(arrays, "colours"),
         )
         sensors = [
             SensorWay(arrays[f"sensor{k}_times"], arrays[f"sensor{k}"], moves, name, model)
@@ -207,6 +214,17 @@ class Pictured:
         numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
         plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
         return cls(scene, sensors, counts, rays, planning, plan, trials, *rest)
+
+
+def reflectances_of(scene: Scene, survey: Survey) -> NDArray[np.float64]:
+    """Share of light that each object reflects, at the wavelength of the first sensor."""
+    light = survey.carried[0].sensor.optics
+    return MaterialTable.of(survey.materials, scene.all_names, light.wavelength_nm).reflectance
+
+
+def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:
+    """Colours of faces, if there are some."""
+    return Colours.of_faces(arrays[name]) if name in arrays else None
 
 
 def sensor_ways(survey: Survey) -> list[SensorWay]:

@@ -25,6 +25,7 @@ from ..base.errors import LidarpoolError
 from ..pipeline import GPU, LIDAR, OTHER, CastingWorkers, Frame, LongStages, RigPlan, SurveyDriver
 from ..pipeline.task_book import TaskBook
 from ..plan import best
+from ..simulator.memory import MB, scans_that_fit
 from .checks import find_workers, gpu_note
 from .progress import Progress
 from .result import RunResult
@@ -174,6 +175,9 @@ class Run:
             store.points_of_scan,
             partial(self._call, on_frame),
             store.on_parts,
+            scans_that_fit(
+                job.scene, job.survey, job.batch_mb * MB, on_device=store.backend == "cuda"
+            ),
         )
 
     def _call(self, callback: Callable[[T], None], argument: T) -> None:

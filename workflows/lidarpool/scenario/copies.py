@@ -166,8 +166,6 @@ def _of_table(path: Path, columns: dict[str, str]) -> tuple[Float, Float, Float]
         at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
         if "scale" in at and any(name in at for name in _SCALES):
             raise ValueError("it has both scale and scales of axes: leave one out in columns")
-        if wrong := next((name for name in at if not np.isfinite(at[name]).all()), None):
-            raise ValueError(f"its column {columns.get(wrong, wrong)!r} has a nan or inf")
     except (OSError, ValueError, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
     count = len(at["x"])

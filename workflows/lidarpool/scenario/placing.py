@@ -109,13 +109,13 @@ def _local(poses: Sequence[Pose], scene: Scene) -> Real:
 
 
 def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
-    """Say that only backs of surfaces are seen from local positions (k, 3); else empty."""
+    """Say that local positions (k, 3) are inside a closed body; else empty."""
     looker = _looker(Drawn.of(scene).scene)
     return "" if looker is None else _inside(looker.views(positions), scene, carried)
 
 
 def _inside(seen: Views, scene: Scene, carried: Mounted) -> str:
-    if not seen.only_backs:
+    if not seen.in_a_body:
         return ""
     return (
         "the sensor is inside a closed body, and hits only the backs of its surfaces; "

@@ -18,9 +18,11 @@ from ..base.declared import Text, declared
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
+from ..columns.table import COLOURS
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
+from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
@@ -169,6 +171,7 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
+    _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -275,6 +278,11 @@ class Scenario(Section):
         poses = self._of_poses(scene)  # first, because that finds out whether it is an object
         return [*notes, *filter(None, (self._of_size(scene), poses))]
 
+    @property
+    def colours(self) -> dict[str, str]:
+        """Colours that `build_scene` found: {mesh file: what it has}; empty if it read none."""
+        return dict(self._colours)
+
     def _of_size(self, scene: Scene) -> str:
         files = [entry.file for entry in self.scene.files if entry.unit is None]
         unitless = [
@@ -318,6 +326,7 @@ class Scenario(Section):
         """
         self._notes.clear()
         self._remarks.clear()
+        self._colours.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
@@ -480,15 +489,26 @@ class Scenario(Section):
     def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
-        return load_meshes(
+        meshes = load_meshes(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
             opacity=entry.opacity,
+            colours=self.coloured,
             tell=self._notes.append,
             axes=self._remarks.append,
         )
+        if self.coloured:
+            shown = [one.mesh if isinstance(one, Instance) else one for one in meshes]
+            self._colours[entry.file] = told_colours(mesh.colours for mesh in shown)
+        return meshes
+
+    @property
+    def coloured(self) -> bool:
+        """Whether colours of meshes are read: a column or a material needs them."""
+        columns = {*self.cloud.columns, *self.output.needs}
+        return bool(columns & {*COLOURS}) or any(m.reflectance == "texture" for m in self.materials)
 
     def _path(self, file: str) -> Path:
         try:

@@ -505,6 +505,14 @@ class TaskOptions:
     queue_capacity: Annotated[
         int, told("how many items stage 1 may be ahead of stage 2", ge=1, le=100_000)
     ] = 10
+    batch_mb: Annotated[
+        int,
+        told(
+            "most memory of a batch, the scans that a GPU worker casts at a time, megabytes",
+            ge=1,
+            le=1_000_000,
+        ),
+    ] = 256
     backend: Annotated[
         Literal[BACKENDS],  # type: ignore[valid-type]
         told("cuda, embree or numpy; auto takes the fastest available"),
@@ -528,7 +536,7 @@ class PoolSection(Section, TaskOptions, _Workers):
     """The partitions and their tasks; default sizes depend on the machine.
 
     `gpu` and `other` set the workers of a local cluster, not of one that is running already.
-    `collectors` and `queue_capacity` apply to both.
+    The others apply to both.
     """
 
 

@@ -11,6 +11,7 @@ from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE
+from .colours import joined
 from .instances import Instance
 from .mesh import Cutout, Mesh, stacked
 
@@ -43,7 +44,8 @@ class Actor:
         """Its mesh at a time, in the scene's local coordinates."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
-        return Mesh(self.name, vertices + positions[0], self.mesh.faces)  # masks do not show
+        # Masks do not show.
+        return Mesh(self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours)
 
     def check(self, begin_ns: float, end_ns: float) -> None:
         """Check that its trajectory covers a time; LidarpoolError if not."""
@@ -64,12 +66,18 @@ def one_mesh(name: str, objects: Iterable[Mesh | Instance]) -> Mesh:
     first, solid, cut = 0, [], []
     cutouts: list[Cutout] = []
     for part in flat:
-        ends = len(part.faces) - sum(len(one.uv) for one in part.cutouts)
-        solid.append(part.faces[:ends] + first)
-        cut.append(part.faces[ends:] + first)
+        end = len(part.faces) - sum(len(one.uv) for one in part.cutouts)
+        solid.append(part.faces[:end] + first)
+        cut.append(part.faces[end:] + first)
         cutouts += part.cutouts
         first += len(part.vertices)
-    return Mesh(name, vertices, np.concatenate(solid + cut), tuple(cutouts))
+    faces = solid + cut
+    rows = [slice(0, len(some)) for some in solid] + [slice(len(some), None) for some in solid]
+    pieces = [
+        part.colours and part.colours.take(some) for part, some in zip(flat * 2, rows, strict=True)
+    ]
+    colours = joined(pieces, [len(some) for some in faces])
+    return Mesh(name, vertices, np.concatenate(faces), tuple(cutouts), colours)
 
 
 def box(name: str, size_m: tuple[float, float, float]) -> Mesh:

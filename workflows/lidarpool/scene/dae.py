@@ -4,14 +4,16 @@ This is not pycollada, which drops geometry with a material, a skin or a morph t
 resolve, holes in polygons and offsets of accessors, refuses comments, pictures without paths and
 odd colours, and keeps single precision; nor assimp 5.4, which refused twice as many of 661 public
 files, skips missing geometries, keeps single precision, and ends the process if nodes contain each
-other. Only triangles are read, not materials, pictures, lights, cameras and animations.
+other. Only triangles are read, and the diffuse colours and images of materials; not lights, cameras
+and animations.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from functools import cache
-from pathlib import Path
+from collections.abc import Callable, Iterator
+from contextlib import suppress
+from functools import cache, partial
+from pathlib import Path, PureWindowsPath
 from urllib.parse import unquote
 from xml.etree.ElementTree import Element
 
@@ -20,26 +22,33 @@ from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
 from ..base.xmlfile import xml_root
+from .beside import file_beside, spellings
+from .colours import Colours, as_bytes
+from .masks import Colour, MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
 from .mesh import Mesh
 from .nodes import SMALLER, Content, MeshFileError, Node, Piece, instances, joined, settled
-from .polygons import fanned, triangulated, unrolled, with_holes
+from .polygons import check_corners, fanned, triangulated, unrolled, with_holes
 from .transform import rotation_about
 
 Float = NDArray[np.float64]
 Int = NDArray[np.int64]
 
+_WRAPS: dict[str, Wrap] = {"CLAMP": "clamp", "BORDER": "clamp", "MIRROR": "mirror"}
 _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
-def read_dae(data: bytes, path: Path) -> Content:
-    """Read the visual scene of a file."""
+def read_dae(data: bytes, path: Path, colours: bool = False) -> Content:
+    """Read the visual scene of a file; `colours` are those of its materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
-    document = _Document(root, Allowance(len(data), SMALLER))
+    allowance = Allowance(len(data), SMALLER)
+    paint = _Effects(path, allowance) if colours else None
+    document = _Document(root, allowance, paint)
     content = settled(instances(document.roots(), document.node, path.stem))
+    content.notes = paint.notes.lines() if paint else []
     unit = root.find("asset/unit[@meter]")
     if unit is not None:
         content.unit_m = float(unit.attrib["meter"])
@@ -53,8 +62,8 @@ def read_dae(data: bytes, path: Path) -> Content:
 class _Document:
     """Elements by their ids; each geometry is read once."""
 
-    def __init__(self, root: Element, allowance: Allowance) -> None:
-        self._root, self._allowance = root, allowance
+    def __init__(self, root: Element, allowance: Allowance, paint: _Effects | None) -> None:
+        self._root, self._allowance, self._paint = root, allowance, paint
         # By kind, too: some programs give a scene and a node in it the same id.
         self._ids: dict[tuple[str, str], Element] = {}
         for element in root.iter():
@@ -81,7 +90,8 @@ class _Document:
             elif child.tag == "instance_node":
                 children.append(self._target(child, "node"))
             elif child.tag == "instance_geometry":
-                meshes += self._geometry(self._target(child, "geometry"))
+                bound = self._bound(child) if self._paint else ()
+                meshes += self._geometry(self._target(child, "geometry"), bound)
             elif child.tag == "instance_controller":
                 raise MeshFileError(
                     "moves vertices by a skin (a skeleton) or a morph, which is not supported: "
@@ -104,21 +114,76 @@ class _Document:
             )
         return found
 
-    def _read_geometry(self, geometry: Element) -> list[Mesh]:
-        """One mesh of all primitives, which differ by material only; none without triangles."""
+    def _read_geometry(
+        self, geometry: Element, bound: tuple[tuple[str, Element], ...]
+    ) -> list[Mesh]:
+        """One mesh of all primitives, which differ by material only; none without triangles.
+
+        `bound` are symbols of materials, and the elements for which they stand.
+        """
         name = geometry.get("name") or geometry.get("id") or ""
         for kind in ("convex_mesh", "brep"):
             if geometry.find(kind) is not None:
                 raise MeshFileError(f"has a <{kind}>, which is not read: export it as triangles")
         faces: dict[Element, list[Int]] = {}  # {where their points are: faces}
+        painted: list[Piece] = []
         for primitive in geometry.findall("mesh/*"):
             if primitive.tag in _SURFACES:
                 vertices, offset, stride = self._inputs(primitive)
                 points = self._points(vertices)
-                made = [f for f in _faces(primitive, points, offset, stride) if len(f)]
+                material = dict(bound).get(primitive.get("material", ""))
+                if material is not None:
+                    painted.append(self._painted(primitive, points, offset, stride, material))
+                    continue
+                lists = partial(_corners, offset=offset, stride=stride)
+                made = [f for f in _faces(primitive, points, lists) if len(f)]
                 faces.setdefault(vertices, []).extend(made)
-        parts = (Piece(self._points(v), np.concatenate(f)) for v, f in faces.items() if f)
-        return joined(name, parts, self._allowance)
+        parts = [Piece(self._points(v), np.concatenate(f)) for v, f in faces.items() if f]
+        return joined(name, parts + painted, self._allowance)
+
+    def _bound(self, instance: Element) -> tuple[tuple[str, Element], ...]:
+        """Materials that an instance of a geometry gives to its symbols."""
+        entries = instance.findall("bind_material/technique_common/instance_material")
+        found = [
+            (entry.get("symbol", ""), self._ids.get(("material", entry.get("target", "")[1:])))
+            for entry in entries
+        ]
+        return tuple((symbol, material) for symbol, material in found if material is not None)
+
+    def _painted(
+        self, primitive: Element, points: Float, offset: int, stride: int, material: Element
+    ) -> Piece:
+        """Triangles of a primitive, in the colours of a material."""
+        assert self._paint is not None
+        lists = [e for e in primitive.iter() if e.tag in ("p", "h")]
+        rows = [_integers(e)[: len(_integers(e)) // stride * stride] for e in lists]
+        corners = np.concatenate([np.zeros(0, np.int64), *rows]).reshape(-1, stride)
+        ends = np.cumsum([0, *(len(row) // stride for row in rows)])
+        numbers = {e: np.arange(*ends[at : at + 2]) for at, e in enumerate(lists)}
+        check_corners(corners[:, offset], len(points))
+        made = _faces(primitive, points[corners[:, offset]], numbers.__getitem__)
+        own = np.concatenate([np.zeros((0, 3), np.int64), *made])
+        faces, colours = corners[:, offset][own], None
+        if len(faces):
+            with self._paint.notes.without_colour(material.get("name") or material.get("id") or ""):
+                url = material.find("instance_effect[@url]")
+                assert url is not None
+                shade = self._paint.shade(self._target(url, "effect"), self._ids)
+                if isinstance(shade, Texture):
+                    uv, at = self._coordinates(primitive)
+                    colours = shade.colours(uv, corners[:, at][own])
+                elif shade is not None:
+                    colours = Colours.plain(shade, len(faces))
+        return Piece(points, faces, colours=colours)
+
+    def _coordinates(self, primitive: Element) -> tuple[Float, int]:
+        """Texture coordinates (c, 2) of a primitive, and the place of their numbers in <p>."""
+        inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
+        if not inputs:
+            raise MaskError("texture coordinates are missing")
+        first = min(inputs, key=lambda entry: int(entry.get("set", 0)))
+        s, t = self._rows(self._target(first, "source"))[:, :2].T
+        return np.column_stack([s, 1 - t]), int(first.get("offset", 0))
 
     def _inputs(self, primitive: Element) -> tuple[Element, int, int]:
         """<vertices> of a primitive; place of their numbers in <p>, and numbers of each corner."""
@@ -138,6 +203,18 @@ class _Document:
         if entry is None:
             raise ValueError("<vertices> without positions")
         source = self._target(entry, "source")
+        rows = self._rows(source)
+        accessor = source.findall("technique_common/accessor/param")
+        # Skip a parameter without a name.
+        names = [parameter.get("name") for parameter in accessor]
+        columns = [names.index(axis) for axis in "XYZ" if axis in names]
+        if len(columns) != 3:
+            return rows[:, :3]
+        self._allowance.take(24 * len(rows))
+        return rows[:, columns]
+
+    def _rows(self, source: Element) -> Float:
+        """Numbers (count, stride) of a <source>."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
             raise ValueError("positions without <accessor>")
@@ -148,42 +225,98 @@ class _Document:
             raise ValueError(
                 f"{count:,} positions of {stride} numbers announced, {len(numbers):,} numbers there"
             )
-        rows = numbers[offset : offset + count * stride].reshape(count, stride)
-        # Skip a parameter without a name.
-        names = [parameter.get("name") for parameter in accessor.findall("param")]
-        columns = [names.index(axis) for axis in "XYZ" if axis in names]
-        if len(columns) != 3:
-            return rows[:, :3]
-        self._allowance.take(24 * count)
-        return rows[:, columns]
+        return numbers[offset : offset + count * stride].reshape(count, stride)
 
 
-def _faces(primitive: Element, points: Float, offset: int, stride: int) -> Iterator[Int]:
-    """Triangles (t, 3) of a primitive, piece by piece."""
-    lists = [_corners(p, offset, stride) for p in primitive.findall("p")]
+class _Effects:
+    """Diffuse colours of effects, each read once."""
+
+    def __init__(self, path: Path, allowance: Allowance) -> None:
+        self.notes = MaskNotes()
+        self._path, self._allowance = path, allowance
+        self._texture = remembered(self._read_texture)
+        self._made: dict[Element, Texture | Colour | None] = {}
+
+    def shade(
+        self, effect: Element, ids: dict[tuple[str, str], Element]
+    ) -> Texture | Colour | None:
+        """Image or colour, (1, 1, 3), of an effect; None if it has none."""
+        if effect not in self._made:
+            self._made[effect] = self._read(effect, ids)
+        return self._made[effect]
+
+    def _read(
+        self, effect: Element, ids: dict[tuple[str, str], Element]
+    ) -> Texture | Colour | None:
+        diffuse = effect.find(".//technique/*/diffuse")
+        if diffuse is None:
+            return None
+        texture, colour = diffuse.find("texture"), diffuse.findtext("color")
+        if texture is None:
+            if colour is None:
+                return None
+            return as_bytes(np.array(colour.split()[:3], np.float64)).reshape(1, 1, 3)
+        # A sampler's surface names an image; some programs leave out one or both of them.
+        parameters = {e.get("sid", ""): e for e in effect.iter("newparam")}
+        name, along, across = texture.get("texture", ""), "", ""
+        for _ in range(2):
+            if (found := parameters.get(name)) is not None:
+                along = found.findtext(".//wrap_s", along)
+                across = found.findtext(".//wrap_t", across)
+                named = found.findtext(".//source") or found.findtext(".//init_from") or ""
+                linked = found.find(".//instance_image")
+                name = named.strip() if linked is None else linked.get("url", "")[1:]
+        image = ids.get(("image", name))
+        if image is None:
+            raise MaskError(f"its image {name[-80:]!r} is not in the file")
+        file = image.findtext("init_from/ref") or image.findtext("init_from") or ""
+        return self._texture((file.strip(), along, across))
+
+    def _read_texture(self, key: tuple[str, str, str]) -> Texture:
+        name, *wraps = key
+        last = PureWindowsPath(unquote(name)).name
+        found = None
+        for one in (*spellings(name.removeprefix("file://")), last):
+            with suppress(MeshFileError, OSError, ValueError):
+                found = found or file_beside(self._path, [one])
+        if found is None:
+            raise MaskError(f"its image {name[-80:]!r} is not there")
+        self._allowance.grow(found.stat().st_size)
+        along, across = (_WRAPS.get(wrap, "repeat") for wrap in wraps)
+        image = read_colours(found, self._allowance, self.notes)
+        return Texture(image, (along, across), self._allowance)
+
+
+def _faces(primitive: Element, points: Float, corners: Callable[[Element], Int]) -> Iterator[Int]:
+    """Triangles (t, 3) of a primitive, piece by piece; `corners` are those of a <p> or <h>."""
+    lists = [corners(p) for p in primitive.findall("p")]
     if primitive.tag == "triangles":
-        yield from (corners[: len(corners) // 3 * 3].reshape(-1, 3) for corners in lists)
+        yield from (some[: len(some) // 3 * 3].reshape(-1, 3) for some in lists)
     elif primitive.tag == "tristrips":
         yield from map(unrolled, lists)
     elif primitive.tag == "trifans":
         yield from map(fanned, lists)
     elif primitive.tag == "polylist" and lists:
         sizes = np.array((primitive.findtext("vcount") or "").split(), np.int64)
-        corners = np.concatenate(lists)
-        if (sizes < 0).any() or sizes.sum() != len(corners):
-            raise ValueError(f"polygons of {sizes.sum():,} corners, {len(corners):,} are there")
-        yield triangulated(points, corners, sizes)
+        some = np.concatenate(lists)
+        if (sizes < 0).any() or sizes.sum() != len(some):
+            raise ValueError(f"polygons of {sizes.sum():,} corners, {len(some):,} are there")
+        yield triangulated(points, some, sizes)
     elif primitive.tag == "polygons":
         if lists:
-            sizes = np.array([len(corners) for corners in lists])
+            sizes = np.array([len(some) for some in lists])
             yield triangulated(points, np.concatenate(lists), sizes)
         for holed in primitive.findall("ph"):
-            yield with_holes(points, [_corners(ring, offset, stride) for ring in holed])
+            yield with_holes(points, [corners(ring) for ring in holed])
 
 
 def _corners(element: Element, offset: int, stride: int) -> Int:
     """Numbers of vertices in a <p> or <h>."""
-    return np.array((element.text or "").split(), np.int64)[offset::stride]
+    return _integers(element)[offset::stride]
+
+
+def _integers(element: Element) -> Int:
+    return np.array((element.text or "").split(), np.int64)
 
 
 def _numbers(element: Element) -> Float:

@@ -3,18 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from .colours import Colours, joined
 from .instances import Instances, Part
 from .mesh import stacked, triangle_areas
 from .scene import Scene
 
 DRAWN_TRIANGLES = 2_000_000  # of instances; of more, each gets its share of fewer
 PART_LEAST = 32  # triangles of a simplified part
+CUT_TRIANGLES, CUT_STEPS = 50_000, 128  # of a part with a mask, and of a triangle's edge
 _PLACES = 200  # to which distances are measured
 
 
@@ -43,22 +45,28 @@ class Drawn:
         shares = _shares(shared, most, near)
         meshes = [(scene.vertices, scene.faces)]
         owners, counters = [scene.face_object], [np.arange(faces)]
+        colours = [scene.colours]
         mirrored = np.linalg.det(shared.transforms[:, :, :3]) < 0
         for number, share in sorted(set(zip(shared.part.tolist(), shares.tolist(), strict=True))):
             part = shared.parts[number]
-            vertices, own = part.vertices, part.faces
+            vertices, own, kept = part.vertices, part.faces, np.arange(len(part.faces))
             size = max(PART_LEAST, int(len(own) * share))
             if size < len(own):
-                vertices, own = _fewer(part, size)
+                vertices, own, kept = _fewer(part, size)
+            shown = part.colours and Colours.of_faces(part.colours.take(kept).means())
             for row in np.flatnonzero((shared.part == number) & (shares == share)):
                 matrix = shared.transforms[row]
                 corners = own[:, ::-1] if mirrored[row] else own
                 meshes.append((vertices @ matrix[:, :3].T + matrix[:, 3], corners))
                 owners.append(np.full(len(own), shared.owner[row]))
                 counters.append(np.full(len(own), faces + row))
+                colours.append(shown)
         vertices, triangles = stacked(meshes)
         owner = np.concatenate(owners).astype(np.int32)
-        drawn = Scene(vertices, triangles, owner, scene.names, scene.origin, scene.actors)
+        coloured = joined(colours, map(len, owners))
+        drawn = Scene(
+            vertices, triangles, owner, scene.names, scene.origin, scene.actors, colours=coloured
+        )
         return cls(drawn, np.concatenate(counters))
 
     def hits(self, counts: NDArray[Any]) -> NDArray[Any]:
@@ -69,6 +77,48 @@ class Drawn:
         share = area / np.bincount(self.counter, area, len(counts))[self.counter]
         moving = sum(len(actor.mesh.faces) for actor in self.scene.actors)
         return np.append(counts[self.counter] * share, counts[len(counts) - moving :])
+
+
+def cut(scene: Scene) -> Scene:
+    """Return a scene for pictures: in place of triangles with masks small ones, where it is opaque.
+
+    Its counters are the same.
+    """
+    shared = scene.instances
+    masked = sum(part.mask is not None for part in shared.parts) if shared else 0
+    if shared is None or not masked:
+        return scene
+    places = np.bincount(shared.part, minlength=len(shared.parts))
+    parts = tuple(
+        _cut(part, min(CUT_TRIANGLES, DRAWN_TRIANGLES / (masked * count)))
+        for part, count in zip(shared.parts, places.tolist(), strict=True)
+    )
+    return replace(scene, instances=replace(shared, parts=parts))
+
+
+def _cut(part: Part, most: float) -> Part:
+    """Divide a part with a mask into about so many pieces, and keep those that are opaque.
+
+    A piece is asked at a random place: the share that is kept is right, however fine the mask.
+    """
+    if part.mask is None or part.uv is None:
+        return part
+    steps = int(np.clip((most / len(part.faces)) ** 0.5, 1, CUT_STEPS))  # of an edge
+    i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
+    # Those beyond the diagonal are turned by 180 degrees, into the gaps between the others.
+    first = np.stack([[i, j], [i + 1, j], [i, j + 1]], axis=-1).transpose(1, 2, 0)
+    pieces = np.where((i + j < steps)[:, None, None], first, steps - first)
+    corners = np.concatenate([pieces, steps - pieces.sum(axis=2, keepdims=True)], axis=2) / steps
+    places = np.random.default_rng(0).dirichlet(np.ones(3), (len(part.faces), len(pieces)))
+    u, v = np.einsum("fpc,pck,fkx->xfp", places, corners, part.uv.astype(np.float64), optimize=True)
+    height, width = part.mask.shape
+    row, column = (v % 1 * height).astype(int), (u % 1 * width).astype(int)
+    opaque = part.mask[np.minimum(row, height - 1), np.minimum(column, width - 1)]
+    opaque[0, 0] |= not opaque.any()  # no part is empty
+    face, piece = np.nonzero(opaque)
+    vertices = (corners[piece] @ part.vertices[part.faces[face]]).reshape(-1, 3)
+    colours = part.colours and part.colours.divided(face, corners[piece])
+    return Part(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), colours=colours)
 
 
 def _shares(
@@ -97,8 +147,10 @@ def _shares(
         full *= 0.9
 
 
-def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32]]:
-    """Vertices and at most so many faces that stand for a part.
+def _fewer(
+    part: Part, most: int
+) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.intp]]:
+    """Vertices and at most so many faces that stand for a part, and which each was.
 
     Of many small pieces, as a tree's leaves are, merged vertices would leave little. There the
     largest triangles stay, as of trunk and boughs, and a choice of the others, made larger for all
@@ -107,7 +159,7 @@ def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32
     pieces = len(np.unique(part.vertices, axis=0)) > len(part.faces)  # half as many in one surface
     vertices, faces, kept, _ = _merged(part.vertices, part.faces, most)
     if not pieces and len(kept) >= most // 4:
-        return vertices, faces[kept]
+        return vertices, faces[kept], kept
     corners = part.vertices[part.faces]
     order = np.argsort(-triangle_areas(corners), kind="stable")
     large, small = np.split(order, [most // 4])
@@ -115,10 +167,11 @@ def _fewer(part: Part, most: int) -> tuple[NDArray[np.float64], NDArray[np.int32
     scale = np.ones(most)
     long = np.linalg.norm(corners[some] - np.roll(corners[some], 1, axis=1), axis=2).max(axis=1)
     scale[len(large) :] = (len(small) / len(some)) ** 0.5 * np.minimum(1, np.median(long) / long)
-    chosen = corners[np.append(large, some)]
+    kept = np.append(large, some)
+    chosen = corners[kept]
     middle = chosen.mean(axis=1, keepdims=True)
     larger = middle + (chosen - middle) * np.maximum(1, scale)[:, None, None]
-    return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3)
+    return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3), kept
 
 
 def simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
@@ -128,7 +181,9 @@ def simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
     """
     vertices, faces, kept, stands = _merged(scene.vertices, scene.faces, most)
     owners = scene.face_object[kept]
-    return Scene(vertices, faces[kept], owners, scene.names, scene.origin), stands
+    colours = scene.colours and scene.colours.take(kept)
+    made = Scene(vertices, faces[kept], owners, scene.names, scene.origin, colours=colours)
+    return made, stands
 
 
 def _merged(

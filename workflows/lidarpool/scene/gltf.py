@@ -3,7 +3,7 @@
 This is not trimesh 5.2, which puts a node of several parents into one place, loses what hangs on a
 camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
 fans nor files without scenes; nor assimp, which skips what it cannot read. Only triangles are read,
-and of materials where they are transparent.
+and of materials where they are transparent, and their base colours.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ import base64
 import json
 import re
 import struct
-from functools import cache
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
@@ -22,7 +24,18 @@ from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
 from .beside import file_beside, spellings
-from .masks import MaskError, MaskNotes, Texture, Wrap, read_opacity, remembered
+from .colours import LINEAR, WHITE, Colours, as_srgb
+from .masks import (
+    FACE_BYTES,
+    Colour,
+    MaskError,
+    MaskNotes,
+    Texture,
+    Wrap,
+    read_colours,
+    read_opacity,
+    remembered,
+)
 from .mesh import Mesh
 from .nodes import (
     MOST_NODES,
@@ -35,7 +48,7 @@ from .nodes import (
     joined,
     settled,
 )
-from .polygons import fanned, unrolled
+from .polygons import check_corners, fanned, unrolled
 
 # Extensions that do not change shapes, or that are supported here.
 _READ = re.compile(
@@ -48,18 +61,19 @@ _GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
-def read_gltf(data: bytes, path: Path, masks: bool = True) -> Content:
+def read_gltf(data: bytes, path: Path, masks: bool = True, colours: bool = False) -> Content:
     """Read the default scene of a file, or all nodes if it has no scenes.
 
     Files that it names are read only from the folder of `path` and below. Without `masks`,
-    triangles are solid, and no image is read.
+    triangles are solid; without both, no image is read.
     """
     header, body = _chunks(data)
     _check(header)
-    reader = _Reader(header, body, path, len(data), masks)
+    reader = _Reader(header, body, path, len(data), masks, colours)
     content = settled(instances(_roots(header), reader.node, path.stem))
     content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
     content.notes = reader.notes.lines()
@@ -128,15 +142,23 @@ class _Reader:
     """Nodes, meshes, accessors and buffers by their numbers, each read once."""
 
     def __init__(
-        self, header: dict[str, Any], body: bytes, path: Path, size: int, masks: bool
+        self,
+        header: dict[str, Any],
+        body: bytes,
+        path: Path,
+        size: int,
+        masks: bool,
+        colours: bool,
     ) -> None:
-        self._header, self._body, self._path, self._masks = header, body, path, masks
+        self._header, self._body, self._path = header, body, path
+        self._masks, self._colours = masks, colours
         self._allowance = Allowance(size, SMALLER)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
         self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
         self._mask = remembered(self._read_mask)
+        self._base, self._shades = remembered(self._read_base), remembered(self._read_shades)
         self._image_files: set[Path] = set()
         self.notes = MaskNotes()
 
@@ -192,7 +214,7 @@ class _Reader:
             mesh = _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
             vertices = np.asarray(mesh.points).reshape(-1, 3)
             faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
-            return self._cut(Piece(vertices, faces), primitive, mesh)
+            return self._dressed(Piece(vertices, faces), primitive, mesh)
         vertices = self._accessor(position)
         mode = primitive.get("mode", 4)
         # The corners, and the triangles of strips and fans, before they are checked.
@@ -205,10 +227,61 @@ class _Reader:
             faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
         else:
             faces = unrolled(corners) if mode == 5 else fanned(corners)
-        return self._cut(Piece(vertices, faces), primitive)
+        return self._dressed(Piece(vertices, faces), primitive)
 
-    def _cut(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
-        """Return a piece with the mask of its material; `mesh` is unpacked by Draco."""
+    def _dressed(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
+        """Return a piece with mask and colours; `mesh` is unpacked by Draco."""
+        if self._colours and len(piece.faces):
+            with self.notes.without_colour(self._material_name(primitive.get("material"))):
+                piece = piece._replace(colours=self._coloured(primitive, piece.faces, mesh))
+        return self._cut(piece, primitive, mesh)
+
+    def _coloured(
+        self, primitive: dict[str, Any], faces: NDArray[np.int64], mesh: Any
+    ) -> Colours | None:
+        """Colours of triangles; None if they have none."""
+        number, corners, colours = primitive.get("material"), None, None
+        if not self._allowance.fits(FACE_BYTES * len(faces)):
+            raise MaskError("there are too many triangles")
+        if "COLOR_0" in primitive["attributes"]:
+            light = self._normalised(self._attribute("COLOR_0", primitive, mesh))
+            check_corners(faces, len(light))
+            corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
+            colours = Colours.plain(WHITE, len(faces))
+        if number is not None:
+            base, info = self._base(_natural(number))
+            if isinstance(base, Texture):
+                colours = base.colours(self._coordinates(info, primitive, mesh), faces)
+            else:
+                colours = Colours.plain(base, len(faces))
+        return colours and replace(colours, corners=corners)
+
+    def _read_base(self, number: int) -> tuple[Texture | Colour, dict[str, Any]]:
+        """Return the texture of a material's base colour, and its use, or one colour (1, 1, 3)."""
+        material = self._part("materials", number)
+        info, factor = _base_of(material)
+        light = tuple(float(np.clip(one, 0, 1)) for one in factor[:3])
+        if info is None:
+            return as_srgb(light).reshape(1, 1, 3), {}
+        texture = self._part("textures", info["index"])
+        return self._shades((_image_of(texture), light, *self._wraps(texture))), info
+
+    def _read_shades(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
+        """Texture of an image, by which a colour is multiplied, and how it goes on."""
+        image, light, along, across = key
+        found = self._image(image, partial(read_colours, notes=self.notes))
+        if light != (1.0, 1.0, 1.0):
+            scaled = [as_srgb(LINEAR * share) for share in light]
+            found = np.stack([by[found[..., k]] for k, by in enumerate(scaled)], axis=-1)
+        return Texture(found, (along, across), self._allowance)
+
+    def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
+        sampler = self._part("samplers", texture["sampler"]) if "sampler" in texture else {}
+        along, across = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
+        return along, across
+
+    def _cut(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
+        """Return a piece with the mask of its material."""
         number = primitive.get("material")
         if number is None or not self._masks or not len(piece.faces):
             return piece
@@ -240,9 +313,7 @@ class _Reader:
             if _extension(material, _TRANSMISSION).get("transmissionFactor", 0) > 0:
                 self.notes.glass[self._material_name(number)] = None
             return None
-        usual, glossy = material.get("pbrMetallicRoughness", {}), _extension(material, _GLOSSY)
-        info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
-        factor = usual.get("baseColorFactor") or glossy.get("diffuseFactor") or (1, 1, 1, 1)
+        info, factor = _base_of(material)
         cutoff = material.get("alphaCutoff", 0.5) if mode == "MASK" else 0.5
         passing = np.flatnonzero(np.arange(256) / 255 * factor[3] >= cutoff)
         least = int(passing[0]) if len(passing) else 256
@@ -255,9 +326,7 @@ class _Reader:
             return None
         if opacity.min() >= least:
             return None
-        sampler = self._part("samplers", texture["sampler"]) if "sampler" in texture else {}
-        along, across = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
-        return self._mask((image, least, along, across)), info
+        return self._mask((image, least, *self._wraps(texture))), info
 
     def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
         """Texture of an image, its least alpha that stops light, and how it goes on."""
@@ -268,12 +337,16 @@ class _Reader:
 
     def _read_opacity(self, index: int) -> NDArray[np.uint8] | None:
         """Opacity of an image; None if it is opaque everywhere."""
+        return self._image(index, read_opacity)
+
+    def _image(self, index: int, read: Callable[[Path | bytes, Allowance], V]) -> V:
+        """Decode an image."""
         image = self._part("images", index)
         if "bufferView" in image:
-            return read_opacity(bytes(self._view(image["bufferView"])), self._allowance)
+            return read(bytes(self._view(image["bufferView"])), self._allowance)
         uri = image["uri"]
         if uri.startswith("data:"):
-            return read_opacity(_inline(uri), self._allowance)
+            return read(_inline(uri), self._allowance)
         try:
             file = file_beside(self._path, spellings(uri))
         except MeshFileError as error:
@@ -283,7 +356,7 @@ class _Reader:
         if file not in self._image_files:
             self._image_files.add(file)
             self._allowance.grow(file.stat().st_size)
-        return read_opacity(file, self._allowance)
+        return read(file, self._allowance)
 
     def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
         """Texture coordinates (v, 2) of a primitive."""
@@ -291,14 +364,7 @@ class _Reader:
         name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
         if name not in primitive["attributes"]:
             raise MaskError("texture coordinates are missing")
-        accessor = primitive["attributes"][name]
-        if mesh is None:
-            uv = self._accessor(accessor)
-        else:
-            packed = primitive["extensions"][_DRACO]["attributes"][name]
-            uv = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
-            if self._part("accessors", accessor).get("normalized"):
-                uv = self._normalised(uv)
+        uv = self._attribute(name, primitive, mesh)
         if uv.shape[1] != 2:
             raise MaskError("its texture coordinates are not pairs")
         if moved:
@@ -309,6 +375,16 @@ class _Reader:
             uv = uv * np.array(moved.get("scale", (1, 1)), np.float64)
             uv = uv @ np.array([[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
         return uv
+
+    def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> NDArray[Any]:
+        """Numbers (v, width) of the vertices of a primitive."""
+        accessor = primitive["attributes"][name]
+        if mesh is None:
+            return self._accessor(accessor)
+        packed = primitive["extensions"][_DRACO]["attributes"][name]
+        rows = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
+        normal = self._part("accessors", accessor).get("normalized")
+        return self._normalised(rows) if normal else rows
 
     def _read_accessor(self, index: int) -> NDArray[Any]:
         """Numbers (count, width) of an accessor; those of a buffer are not copied."""
@@ -399,6 +475,13 @@ def _inline(uri: str) -> bytes:
 def _extension(part: dict[str, Any], name: str) -> dict[str, Any]:
     found: dict[str, Any] = part.get("extensions", {}).get(name, {})
     return found
+
+
+def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
+    """Use of the texture of a material's base colour, if it has one, and its factors."""
+    usual, glossy = material.get("pbrMetallicRoughness", {}), _extension(material, _GLOSSY)
+    info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
+    return info, usual.get("baseColorFactor") or glossy.get("diffuseFactor") or (1, 1, 1, 1)
 
 
 def _image_of(texture: dict[str, Any]) -> int:

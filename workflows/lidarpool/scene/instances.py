@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..sensor import Pose
+from .colours import Colours
 from .mesh import Mesh
 from .transform import Transform
 
@@ -108,16 +109,20 @@ class Part(NamedTuple):
     faces: NDArray[np.int32]  # (f, 3)
     mask: NDArray[np.bool_] | None = None  # (h, w), see `Cutout`
     uv: NDArray[np.float32] | None = None  # (f, 3, 2)
+    colours: Colours | None = None
 
 
 def parts_of(mesh: Mesh) -> Iterator[Part]:
     """Divide a mesh by its masks; the triangles stay in order."""
     start = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
+    whole = mesh.colours
     if start:
-        yield Part(*_used(mesh.vertices, mesh.faces[:start]))
+        own = whole and whole.take(slice(0, start))
+        yield Part(*_used(mesh.vertices, mesh.faces[:start]), colours=own)
     for cut in mesh.cutouts:
         stop = start + len(cut.uv)
-        yield Part(*_used(mesh.vertices, mesh.faces[start:stop]), cut.mask, cut.uv)
+        own = whole and whole.take(slice(start, stop))
+        yield Part(*_used(mesh.vertices, mesh.faces[start:stop]), cut.mask, cut.uv, own)
         start = stop
 
 

@@ -1,4 +1,4 @@
-"""Masks from images: where the triangles of a material stop light."""
+"""Images of materials: where their triangles stop light, and colours."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from PIL import Image
 
 from ..base.allowance import Allowance
 from ..base.words import printable
+from .colours import Colours
 from .mesh import UV_MOST, Cutout
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")  # Pillow has more, some run programs
@@ -23,8 +24,10 @@ HALF = 128  # least 8-bit opacity that stops light, unless a file states another
 PIXEL_BYTES = 10  # of an image while it is decoded
 FACE_BYTES = 120  # of a triangle while its texture coordinates are made
 NAMED = 3  # materials that a note names
+SIDE_MOST = 4096  # pixels of an image of colours; larger ones are made smaller
 
 Mask = NDArray[np.bool_]
+Colour = NDArray[np.uint8]
 Wrap = Literal["repeat", "mirror", "clamp"]
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -48,6 +51,23 @@ def read_opacity(
     MaskError
         If it cannot be decoded, or takes more than allowed.
     """
+    return _read(image, lambda opened: _decoded(opened, allowance, grey))
+
+
+def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Colour:
+    """Colours of an image: (h, w, 3), sRGB.
+
+    It is made smaller if it is more than `SIDE_MOST` wide or high, and noted.
+
+    Raises
+    ------
+    MaskError
+        As `read_opacity`.
+    """
+    return _read(image, lambda opened: _in_colour(opened, allowance, notes))
+
+
+def _read(image: Path | bytes, decoded: Callable[[Image.Image], V]) -> V:
     name = image.name if isinstance(image, Path) else "its image"
     source = image if isinstance(image, Path) else BytesIO(image)
     try:
@@ -56,7 +76,7 @@ def read_opacity(
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(source, formats=FORMATS) as opened:
-                return _decoded(opened, allowance, grey)
+                return decoded(opened)
     except Image.UnidentifiedImageError as error:
         raise MaskError(f"{name} is no {', '.join(FORMATS)}") from error
     except (Image.DecompressionBombError, Image.DecompressionBombWarning, _TooLargeError) as error:
@@ -109,8 +129,21 @@ def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np
     return np.asarray(image.convert("L"))
 
 
+def _in_colour(image: Image.Image, allowance: Allowance, notes: MaskNotes) -> Colour:
+    if not allowance.fits(PIXEL_BYTES * image.width * image.height):
+        raise _TooLargeError
+    if image.mode.startswith("I;16"):  # which Pillow would clip
+        image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
+    image = image.convert("RGB")
+    if max(image.size) > SIDE_MOST:
+        notes.large.append(f"{image.width:,} x {image.height:,}")
+        image.thumbnail((SIDE_MOST, SIDE_MOST), Image.Resampling.BOX)
+    allowance.take(3 * image.width * image.height)
+    return np.asarray(image)
+
+
 class Texture:
-    """A mask, and how it goes on beyond its edges, along u and along v.
+    """A mask or an image, and how it goes on beyond its edges, along u and along v.
 
     Materials should share it, since every one takes memory.
 
@@ -120,19 +153,33 @@ class Texture:
         If it takes more than allowed.
     """
 
-    def __init__(self, mask: Mask, wraps: tuple[Wrap, Wrap], allowance: Allowance) -> None:
+    def __init__(
+        self, image: Mask | Colour, wraps: tuple[Wrap, Wrap], allowance: Allowance
+    ) -> None:
         self._wraps, self._allowance = wraps, allowance
-        _take(allowance, mask.size)
+        _take(allowance, image.size)
         for axis, wrap in zip((1, 0), wraps, strict=True):
             if wrap == "mirror":  # repeats with its mirror image
-                _take(allowance, 2 * mask.size)
-                mask = np.concatenate([mask, np.flip(mask, axis)], axis)
-        self._mask = mask
+                _take(allowance, 2 * image.size)
+                image = np.concatenate([image, np.flip(image, axis)], axis)
+        self._image = image
 
     def cutout(self, coordinates: NDArray[Any], corners: NDArray[np.int64]) -> Cutout:
-        """Cut it out of triangles, as in glTF.
+        """Cut it out of triangles, see `on`."""
+        return Cutout(*self.on(coordinates, corners))
 
-        `coordinates` are (c, 2), and `corners` (k, 3) which of them each triangle has.
+    def colours(self, coordinates: NDArray[Any], corners: NDArray[np.int64]) -> Colours:
+        """Colour triangles with it, see `on`."""
+        image, uv = self.on(coordinates, corners)
+        return Colours((image,), np.zeros(len(uv), np.int32), uv)
+
+    def on(
+        self, coordinates: NDArray[Any], corners: NDArray[np.int64]
+    ) -> tuple[NDArray[Any], NDArray[np.float32]]:
+        """Put it on triangles, as in glTF.
+
+        `coordinates` are (c, 2), and `corners` (k, 3) which of them each triangle has. Returns it
+        such that it repeats, and texture coordinates (k, 3, 2).
 
         Raises
         ------
@@ -146,59 +193,73 @@ class Texture:
         uv = coordinates[corners].astype(np.float64)
         if not (np.abs(uv) < UV_MOST / 2).all():  # half, for what rounding adds
             raise MaskError("texture coordinates are infinite or too large")
-        mask = self._mask
+        image = self._image
         for column, wrap in enumerate(self._wraps):
             if wrap == "mirror":
                 uv[..., column] /= 2
             elif wrap == "clamp":
-                mask = self._continued(mask, uv[..., column], 1 - column)
-        return Cutout(mask, uv.astype(np.float32))
+                image = self._continued(image, uv[..., column], 1 - column)
+        return image, uv.astype(np.float32)
 
-    def _continued(self, mask: Mask, places: NDArray[np.float64], axis: int) -> Mask:
-        """Repeat the edges of a mask as far as `places` (k, 3), which are changed, ask for it."""
-        size = mask.shape[axis]
+    def _continued(
+        self, image: NDArray[Any], places: NDArray[np.float64], axis: int
+    ) -> NDArray[Any]:
+        """Repeat the edges of an image as far as `places` (k, 3), which are changed, ask for it."""
+        size = image.shape[axis]
         # Triangles wholly beyond an edge are in its last texels.
         places[places.max(axis=1) <= 0] = 0.5 / size
         places[places.min(axis=1) >= 1] = 1 - 0.5 / size
         before = max(0, int(np.ceil(-places.min() * size)))
         after = max(0, int(np.ceil((places.max() - 1) * size)))
         if not before and not after:
-            return mask
+            return image
         whole = size + before + after
-        _take(self._allowance, mask.size // size * whole)
-        widths = [(0, 0), (0, 0)]
+        _take(self._allowance, image.size // size * whole)
+        widths = [(0, 0)] * image.ndim
         widths[axis] = before, after
         places *= size / whole
         places += before / whole
-        return np.pad(mask, widths, mode="edge")
+        return np.pad(image, widths, mode="edge")
 
 
 def _take(allowance: Allowance, count: int) -> None:
     if not allowance.fits(count):
-        raise MaskError("its mask would be too large")
+        raise MaskError("its image would be too large")
     allowance.take(count)
 
 
 class MaskNotes:
-    """What the materials of a file have that is no mask, by their names."""
+    """What the materials of a file have that is no mask or colour, by their names."""
 
     def __init__(self) -> None:
         self.unread: dict[str, str] = {}  # {material: why its triangles are solid}
+        self.grey: dict[str, str] = {}  # {material: why its triangles have no colour}
         self.glass: dict[str, None] = {}  # in order
+        self.large: list[str] = []  # sizes of images of colours that are made smaller
         self.gone: list[str] = []  # files of materials that are not there
 
     def instead(self, material: str) -> _Instead:
         """Note errors within a `with` block; the triangles can be read all the same."""
         return _Instead(self.unread, material)
 
+    def without_colour(self, material: str) -> _Instead:
+        """Note errors within a `with` block; the triangles have no colour then."""
+        return _Instead(self.grey, material)
+
     def lines(self) -> list[str]:
         """Return notes, as clauses that follow the file's name."""
         out = []
         if self.gone:
             out.append(f"names materials in {_some(self.gone)}, which cannot be read: all is solid")
-        if self.unread:
-            shown = _some([f"{name} ({why})" for name, why in self.unread.items()])
-            out.append(f"has masks that cannot be read, so that these materials are solid: {shown}")
+        for found, what, so in (
+            (self.unread, "masks", "are solid"), (self.grey, "colours", "are grey")
+        ):  # fmt: skip
+            if found:
+                shown = _some([f"{name} ({why})" for name, why in found.items()])
+                out.append(f"has {what} that cannot be read, so that these materials {so}: {shown}")
+        if self.large:
+            sizes = _some(self.large)
+            out.append(f"has images of {sizes} pixels, taken at {SIDE_MOST:,} at most on a side")
         if self.glass:
             out.append(
                 f"has transparent materials without holes, taken as solid: {_some([*self.glass])}; "

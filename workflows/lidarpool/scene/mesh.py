@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.arguments import as_array, checked_fields
 from ..base.errors import LidarpoolError
+from .colours import Colours
 
 UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
 
@@ -49,6 +50,8 @@ class Mesh:
         int64 (f, 3), indices into `vertices`, at least one face.
     cutouts
         Of the last faces, one cutout after the other.
+    colours
+        Of the faces, see `lidarpool.scene.colours.Colours`; None if it has none.
 
     Raises
     ------
@@ -61,6 +64,7 @@ class Mesh:
     vertices: NDArray[np.float64]
     faces: NDArray[np.int64]
     cutouts: tuple[Cutout, ...] = ()
+    colours: Colours | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
@@ -80,6 +84,8 @@ class Mesh:
         object.__setattr__(self, "faces", np.ascontiguousarray(faces, dtype=np.int64))
         object.__setattr__(self, "cutouts", tuple(self.cutouts))
         _check_cutouts(self.name, self.cutouts, len(faces))
+        if self.colours is not None:
+            self.colours.check(self.name, len(faces))
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -88,11 +94,12 @@ class Mesh:
 
     def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
-        faces, cutouts = self.faces, self.cutouts
+        faces, cutouts, colours = self.faces, self.cutouts, self.colours
         if np.linalg.det(linear) < 0:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
-        return Mesh(name, self.vertices @ linear.T + offset, faces, cutouts)
+            colours = colours and colours.mirrored()
+        return Mesh(name, self.vertices @ linear.T + offset, faces, cutouts, colours)
 
 
 def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:

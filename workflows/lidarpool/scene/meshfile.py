@@ -28,23 +28,28 @@ from .threemf import read_3mf
 from .transform import UP_AXES, Transform
 from .usd import read_usd
 
+_USD = (".usd", ".usda", ".usdc", ".usdz")
+
 # A reader gets the content of a file and its path. It raises MeshFileError for unsupported content,
 # and any error for a broken file. All but read_usd are our own; their modules say why no library
 # is used.
-_MASKED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether to read masks
+_MASKED: dict[str, Callable[[bytes, Path, bool, bool], Content]] = {
+    # And whether to read masks, and colours.
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".obj": read_obj,
 }
-_READERS: dict[str, Callable[[bytes, Path], Content]] = {
-    ".stl": read_stl,
+_COLOURED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether to read colours
     ".ply": read_ply_mesh,
     ".off": read_off,
     ".dae": read_dae,
-    ".3mf": read_3mf,
-    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
 }
-SUFFIXES = (*_MASKED, *_READERS)
+_READERS: dict[str, Callable[[bytes, Path], Content]] = {
+    ".stl": read_stl,
+    ".3mf": read_3mf,
+    **dict.fromkeys(_USD, read_usd),
+}
+SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf", *_USD)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -65,6 +70,7 @@ def load_meshes(
     up_axis: Literal[tuple(UP_AXES)] | None = None,  # type: ignore[valid-type]
     transform: Transform | None = None,
     opacity: Opacity = "mask",
+    colours: bool = False,
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
 ) -> tuple[Mesh | Instance, ...]:
@@ -87,9 +93,11 @@ def load_meshes(
         Placement in the world, in metres, after unit and up axis.
     opacity
         With "mask", light passes where the image of a material is transparent (.glb, .gltf, .obj).
-        With "ignore", triangles are solid, and no image is read.
+        With "ignore", triangles are solid, and no image is read for it.
+    colours
+        Whether to read colours: base colours and their images, and those of vertices.
     tell
-        Called with a line on objects left out, on masks that cannot be read, or on materials that
+        Called with a line on objects left out, on images that cannot be read, or on materials that
         may be glass; by default this module's logger warns.
     axes
         Called with a line on axes that a file did not state, or that were turned; by default this
@@ -110,7 +118,7 @@ def load_meshes(
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
-            content = _read_whole(path, data, opacity)
+            content = _read_whole(path, data, opacity, colours)
         except LidarpoolError as error:
             raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
@@ -164,7 +172,7 @@ def _lies(content: Content, meshes: Sequence[Mesh | Instance]) -> str:
     return ""
 
 
-def _read_whole(path: Path, data: bytes, opacity: Opacity) -> Content:
+def _read_whole(path: Path, data: bytes, opacity: Opacity, colours: bool) -> Content:
     """Read any file: returns at least one mesh, or raises LidarpoolError."""
     try:
         for beginning, what in _FOREIGN.items():
@@ -172,7 +180,9 @@ def _read_whole(path: Path, data: bytes, opacity: Opacity) -> Content:
                 raise MeshFileError(what)
         suffix = path.suffix.lower()
         if suffix in _MASKED:
-            content = _MASKED[suffix](data, path, opacity == "mask")
+            content = _MASKED[suffix](data, path, opacity == "mask", colours)
+        elif suffix in _COLOURED:
+            content = _COLOURED[suffix](data, path, colours)
         else:
             content = _READERS[suffix](data, path)
         if not content.meshes:

@@ -1,4 +1,4 @@
-"""Materials of Wavefront files: which images make them transparent in places."""
+"""Materials of Wavefront files: colours, and images that make them transparent in places."""
 
 from __future__ import annotations
 
@@ -15,7 +15,18 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.words import as_text
 from .beside import file_beside
-from .masks import HALF, MaskError, MaskNotes, Texture, Wrap, read_opacity, remembered
+from .colours import Colours, as_bytes
+from .masks import (
+    HALF,
+    Colour,
+    MaskError,
+    MaskNotes,
+    Texture,
+    Wrap,
+    read_colours,
+    read_opacity,
+    remembered,
+)
 from .mesh import Cutout
 from .nodes import SMALLER, MeshFileError
 
@@ -53,6 +64,11 @@ class _Image:
                 rest = rest[len(word) :].lstrip()
         return cls(as_text(rest), options)
 
+    @property
+    def clamped(self) -> bool:
+        """Whether it does not repeat."""
+        return [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
+
     def numbers(self, option: bytes, usual: float) -> NDArray[np.float64]:
         """Two numbers of an option."""
         given = [float(word) for word in self.options.get(option, [])]
@@ -60,8 +76,16 @@ class _Image:
 
 
 @dataclass
+class _Entry:
+    """What a file says of a material."""
+
+    images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
+    colour: Colour | None = None  # uint8 (1, 1, 3)
+
+
+@dataclass
 class ObjTexture:
-    """The mask of a material."""
+    """The mask or the image of a material."""
 
     texture: Texture
     scale: NDArray[np.float64]  # (2,)
@@ -69,34 +93,55 @@ class ObjTexture:
 
     def cutout(self, vt: NDArray[np.float64], corners: NDArray[np.int64]) -> Cutout:
         """As `Texture.cutout`, but v of the coordinates (c, 2) grows upwards."""
+        return self.texture.cutout(self._turned(vt), corners)
+
+    def colours(self, vt: NDArray[np.float64], corners: NDArray[np.int64]) -> Colours:
+        """As `Texture.colours`, but v of the coordinates (c, 2) grows upwards."""
+        return self.texture.colours(self._turned(vt), corners)
+
+    def _turned(self, vt: NDArray[np.float64]) -> NDArray[np.float64]:
         u, v = (vt * self.scale + self.offset).T
-        return self.texture.cutout(np.column_stack([u, 1 - v]), corners)
+        return np.column_stack([u, 1 - v])
 
 
 class Materials:
-    """Masks of the materials of a .obj file, each read once.
+    """Masks and colours of the materials of a .obj file, each read once.
 
-    Masks are the images `map_d`, or else the alpha channels of `map_Kd`. Constant opacities, `d`
-    and `Tr`, count for nothing: some programs write one for the other.
+    They are in files named by the lines `libraries`. Masks are the images `map_d`, or else the
+    alpha channels of `map_Kd`. Constant opacities, `d` and `Tr`, count for nothing: some programs
+    write one for the other. Colours are the images `map_Kd`, or else `Kd`; with an image, `Kd`
+    counts for nothing, since some programs write black there.
     """
 
-    def __init__(self, mesh: Path, size: int, notes: MaskNotes) -> None:
+    def __init__(self, mesh: Path, size: int, notes: MaskNotes, libraries: Sequence[bytes]) -> None:
         self._mesh, self._notes, self._allowance = mesh, notes, Allowance(size, SMALLER)
         self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
-
-    def textures(
-        self, libraries: Sequence[bytes], used: Sequence[bytes]
-    ) -> dict[bytes, ObjTexture]:
-        """Masks of the used materials that have one, from files named by the lines `libraries`."""
-        images: dict[bytes, dict[bytes, _Image]] = {}
+        self._image = remembered(self._read_image)
+        self._entries: dict[bytes, _Entry] = {}
         for data in self._files(libraries):
-            images |= _read_mtl(data)
+            self._entries |= _read_mtl(data)
+
+    def masks(self, used: Sequence[bytes]) -> dict[bytes, ObjTexture]:
+        """Masks of the used materials that have one."""
         found: dict[bytes, ObjTexture] = {}
         for name in used:
-            if name in images:
+            if name in self._entries:
                 with self._notes.instead(as_text(name)):
-                    if texture := self._texture(as_text(name), images[name]):
+                    if texture := self._texture(as_text(name), self._entries[name].images):
                         found[name] = texture
+        return found
+
+    def colours(self, used: Sequence[bytes]) -> dict[bytes, ObjTexture | Colour]:
+        """Images or colours, (1, 1, 3), of the used materials that have one."""
+        found: dict[bytes, ObjTexture | Colour] = {}
+        for name in used:
+            entry = self._entries.get(name, _Entry())
+            if (image := entry.images.get(b"map_kd")) is not None:
+                with self._notes.without_colour(as_text(name)):
+                    texture = self._image((image.name, image.clamped))
+                    found[name] = _placed(texture, image)
+            elif entry.colour is not None:
+                found[name] = entry.colour
         return found
 
     def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
@@ -136,10 +181,9 @@ class Materials:
         # Some programs name the same image twice: then its brightness is its colour's.
         grey = image is not colour and not (colour and colour.name == image.name)
         base, gain = map(float, image.options.get(b"-mm", (0, 1)))
-        clamped = [word.lower() for word in image.options.get(b"-clamp", [])] == [b"on"]
-        texture = self._mask((image.name, grey, base, gain, clamped))
+        texture = self._mask((image.name, grey, base, gain, image.clamped))
         if isinstance(texture, Texture):
-            return ObjTexture(texture, image.numbers(b"-s", 1), image.numbers(b"-o", 0))
+            return _placed(texture, image)
         if texture == "glass":
             self._notes.glass[name] = None
         return None
@@ -160,21 +204,38 @@ class Materials:
 
     def _read_opacity(self, key: tuple[str, bool]) -> NDArray[np.uint8] | None:
         name, grey = key
+        return read_opacity(self._there(name), self._allowance, grey=grey)
+
+    def _read_image(self, key: tuple[str, bool]) -> Texture:
+        name, clamped = key
+        wrap: Wrap = "clamp" if clamped else "repeat"
+        image = read_colours(self._there(name), self._allowance, self._notes)
+        return Texture(image, (wrap, wrap), self._allowance)
+
+    def _there(self, name: str) -> Path:
+        """File of an image."""
         path = self._file(name)
         if path is None:
             raise MaskError(f"its image {name[-80:]!r} is not there")
         self._allowance.grow(path.stat().st_size)
-        return read_opacity(path, self._allowance, grey=grey)
+        return path
 
 
-def _read_mtl(data: bytes) -> dict[bytes, dict[bytes, _Image]]:
-    """Images of the materials that have any: {material: {b"map_d": image}}."""
-    images: dict[bytes, dict[bytes, _Image]] = {}
-    name = b""
+def _placed(texture: Texture, image: _Image) -> ObjTexture:
+    return ObjTexture(texture, image.numbers(b"-s", 1), image.numbers(b"-o", 0))
+
+
+def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
+    """Find what a file says of materials."""
+    entries: dict[bytes, _Entry] = {}
+    entry = _Entry()
     for line in data.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
         key, _, rest = line.strip().partition(b" ")
         if key == b"newmtl":
-            name = rest.strip()
+            entry = entries.setdefault(rest.strip(), _Entry())
         elif key.lower() in (b"map_d", b"map_kd") and rest.strip():
-            images.setdefault(name, {})[key.lower()] = _Image.of(rest)
-    return images
+            entry.images[key.lower()] = _Image.of(rest)
+        elif key == b"Kd":
+            with suppress(ValueError):  # of spectra, which nobody writes
+                entry.colour = as_bytes([*map(float, rest.split()[:3])]).reshape(1, 1, 3)
+    return entries

@@ -13,6 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, bytes_of, memory_share
+from . import colours
+from .colours import Colours
 from .instances import Instance
 from .mesh import Cutout, Mesh, stacked
 from .polygons import check_corners
@@ -154,6 +156,7 @@ class Piece(NamedTuple):
     vertices: NDArray[Any]  # (v, 3)
     faces: NDArray[np.int64]  # (f, 3)
     cutout: Cutout | None = None
+    colours: Colours | None = None
 
 
 def joined(name: str, pieces: Iterable[Piece], allowance: Allowance) -> list[Mesh]:
@@ -177,17 +180,21 @@ def joined(name: str, pieces: Iterable[Piece], allowance: Allowance) -> list[Mes
     for some in masked.values():
         cuts = [piece.cutout for piece in some if piece.cutout]
         cutouts.append(Cutout(cuts[0].mask, np.concatenate([cut.uv for cut in cuts])))
-    ordered = [(one.vertices, one.faces) for one in chain(solid, *masked.values())]
-    return [Mesh(name, *stacked(ordered), tuple(cutouts))]
+    ordered = [*chain(solid, *masked.values())]
+    coloured = colours.joined([one.colours for one in ordered], [len(one.faces) for one in ordered])
+    parts = stacked((one.vertices, one.faces) for one in ordered)
+    return [Mesh(name, *parts, tuple(cutouts), coloured)]
 
 
 def _own(piece: Piece, allowance: Allowance) -> Piece:
     """Return a piece without unused vertices, if many pieces may share all of them."""
-    vertices, faces, cutout = piece
+    vertices, faces, cutout, painted = piece
     check_corners(faces, len(vertices))
     allowance.take(faces.nbytes + (0 if cutout is None else cutout.uv.nbytes))
+    if painted is not None:
+        allowance.take(40 * len(faces))
     if faces.size < len(vertices):
         used, faces = np.unique(faces, return_inverse=True)
         vertices, faces = vertices[used], faces.reshape(-1, 3)
     allowance.take(24 * len(vertices))  # in double precision
-    return Piece(vertices, faces, cutout)
+    return Piece(vertices, faces, cutout, painted)

@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from array import array
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any
@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.words import as_text
-from .masks import MaskNotes
+from .colours import WHITE, Colours, as_bytes, joined
+from .masks import Colour, MaskNotes
 from .mesh import Cutout, Mesh
 from .mtl import Materials, ObjTexture
 from .nodes import Content, MeshFileError
@@ -54,12 +55,18 @@ def _ints(numbers: array[int]) -> Int:
     return np.frombuffer(numbers, np.int64)
 
 
-def _mesh(name: str, vertices: Float, faces: Int, cutouts: tuple[Cutout, ...] = ()) -> list[Mesh]:
+def _mesh(
+    name: str,
+    vertices: Float,
+    faces: Int,
+    cutouts: tuple[Cutout, ...] = (),
+    colours: Colours | None = None,
+) -> list[Mesh]:
     """One mesh of triangles, with the vertices that it uses; none without triangles."""
     if not len(faces):
         return []
     used, own = np.unique(faces, return_inverse=True)
-    return [Mesh(name, vertices[used], own.reshape(-1, 3), cutouts)]
+    return [Mesh(name, vertices[used], own.reshape(-1, 3), cutouts, colours)]
 
 
 # -- .obj ----------------------------------------------------------------------------------------
@@ -68,84 +75,131 @@ _MOST = 1 << 62  # texture coordinates that a number may name
 
 
 @dataclass
-class _Object(_Polygons):
-    """An object: its opaque polygons, and those with masks."""
-
-    masked: dict[bytes, _Masked] = field(default_factory=dict)  # {material: polygons}
-
-
-@dataclass
-class _Masked(_Polygons):
-    """Polygons of one material, with the texture coordinates of each corner, from 0."""
+class _Placed(_Polygons):
+    """Polygons with texture coordinates, from 0, and the material of each corner, a number."""
 
     places: array[int] = field(default_factory=lambda: array("q"))
+    kinds: array[int] = field(default_factory=lambda: array("q"))
 
-    def triangles(self, vertices: Float) -> tuple[Int, Int]:
-        """Vertices (t, 3) and texture coordinates (t, 3) of triangles."""
+    def put(self, corners: list[int], places: list[int], kind: int) -> None:
+        """Add a polygon."""
+        self.add(corners)
+        self.places.extend(places)
+        self.kinds.extend([kind] * len(corners))
+
+    def triangles(self, vertices: Float) -> tuple[Int, Int, Int]:
+        """Vertices (t, 3), texture coordinates (t, 3) and materials (t,) of triangles."""
         corners = _ints(self.corners)
         check_corners(corners, len(vertices))
         own = triangulated(vertices[corners], np.arange(len(corners)), _ints(self.sizes))
-        return corners[own], _ints(self.places)[own]
+        return corners[own], _ints(self.places)[own], _ints(self.kinds)[own[:, 0]]
 
 
-def read_obj(data: bytes, path: Path, masks: bool = True) -> Content:
+@dataclass
+class _Object(_Placed):
+    """An object: its opaque polygons, and those with masks."""
+
+    masked: dict[bytes, _Placed] = field(default_factory=dict)  # {material: polygons}
+
+
+def read_obj(data: bytes, path: Path, masks: bool = True, colours: bool = False) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
     Objects are in order of their first face; materials do not divide them. Without `masks`,
-    triangles are solid, and neither materials nor images are read.
+    triangles are solid; without both, neither materials nor images are read.
     """
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     notes = MaskNotes()
     textures: dict[bytes, ObjTexture] = {}  # {material: its mask}
-    if masks and (libraries := _obj_names(b"mtllib", text)):
-        textures = Materials(path, len(data), notes).textures(
-            libraries, _obj_names(b"usemtl", text)
-        )
-    numbers, coordinates = array("d"), array("d")
+    paint = _Paint(notes)
+    used = _obj_names(b"usemtl", text) if masks or colours else []
+    kinds = {name: kind for kind, name in enumerate([b"", *used])}
+    if (masks or colours) and (libraries := _obj_names(b"mtllib", text)):
+        materials = Materials(path, len(data), notes, libraries)
+        textures = materials.masks(used) if masks else {}
+        paint.shades = materials.colours(used) if colours else {}
+    numbers, coordinates, tints = array("d"), array("d"), array("d")
     parts = {path.stem: _Object()}
     part, material = parts[path.stem], b""
     for line in text.split(b"\n"):
         key, _, rest = line.lstrip(b" ").partition(b" ")
         if key == b"v":
-            words = rest.partition(b"#")[0].split()[:3]  # a weight or a colour may follow
+            words = rest.partition(b"#")[0].split()  # a weight or a colour may follow
             if len(words) < 3:
                 raise ValueError(f"a vertex has {len(words)} numbers, '{_shown(line)}'")
-            numbers.extend(map(float, words))
+            numbers.extend(map(float, words[:3]))
+            if colours and len(words) >= 6:
+                tints.extend(map(float, words[-3:]))
         elif key == b"f":
             rest = rest.partition(b"#")[0]
             corners = _obj_corners(rest, len(numbers) // 3, line)
-            if material in textures and len(corners) > 2:
-                masked = part.masked.setdefault(material, _Masked())
-                masked.add(corners)
-                masked.places.extend(_obj_places(rest, len(coordinates) // 2))
+            hidden = material in textures and len(corners) > 2
+            if hidden or colours:
+                to = part.masked.setdefault(material, _Placed()) if hidden else part
+                to.put(corners, _obj_places(rest, len(coordinates) // 2), kinds[material])
             else:
                 part.add(corners)
         elif key == divider:
             part = parts.setdefault(as_text(rest.strip()) or path.stem, _Object())
         elif key == b"usemtl":
             material = rest.strip()
-        elif key == b"vt" and textures:
+        elif key == b"vt" and (textures or colours):
             coordinates.extend(_obj_coordinates(rest))
     vertices = np.frombuffer(numbers).reshape(-1, 3)
     uv = np.frombuffer(coordinates).reshape(-1, 2)
+    if len(tints) == len(numbers):
+        paint.tints = as_bytes(np.frombuffer(tints).reshape(-1, 3))
+    paint.names, paint.uv = list(kinds), uv
     meshes = []
     for name, part in parts.items():
-        faces, cutouts = [part.faces(vertices)], []
+        solid, *at = part.triangles(vertices) if colours else (part.faces(vertices),)
+        faces, cutouts = [solid], []
+        shown = [paint.on(solid, *at) if colours else None]
         for material, masked in part.masked.items():
-            own, places = masked.triangles(vertices)
+            own, *at = masked.triangles(vertices)
             cutout = None
             if len(own):
                 with notes.instead(as_text(material)):
-                    cutout = textures[material].cutout(uv, places)
-            if cutout is None:
-                faces.insert(0, own)
-            else:
-                faces.append(own)
-                cutouts.append(cutout)
-        meshes += _mesh(name, vertices, np.concatenate(faces), tuple(cutouts))
+                    cutout = textures[material].cutout(uv, at[0])
+            place = 0 if cutout is None else len(faces)
+            faces.insert(place, own)
+            shown.insert(place, paint.on(own, *at) if colours else None)
+            cutouts += [] if cutout is None else [cutout]
+        all_of = joined(shown, map(len, faces))
+        meshes += _mesh(name, vertices, np.concatenate(faces), tuple(cutouts), all_of)
     return Content(meshes, notes=notes.lines())
+
+
+@dataclass
+class _Paint:
+    """Colours of materials and vertices."""
+
+    notes: MaskNotes
+    shades: dict[bytes, ObjTexture | Colour] = field(default_factory=dict)
+    tints: Colour | None = None  # (v, 3), of vertices
+    names: list[bytes] = field(default_factory=list)  # of materials, by their numbers
+    uv: Float = field(default_factory=lambda: np.empty((0, 2)))
+
+    def on(self, faces: Int, places: Int, kinds: Int) -> Colours | None:
+        """Colours of faces (t, 3): the images of their materials, or vertices, or materials."""
+        order, parts, sizes = [np.zeros(0, np.int64)], [], []
+        for kind in np.unique(kinds):
+            rows, name, part = np.flatnonzero(kinds == kind), self.names[kind], None
+            shade = self.shades.get(name)
+            if isinstance(shade, ObjTexture):
+                with self.notes.without_colour(as_text(name)):
+                    part = shade.colours(self.uv, places[rows])
+            elif self.tints is not None:
+                part = replace(Colours.plain(WHITE, len(rows)), corners=self.tints[faces[rows]])
+            elif shade is not None:
+                part = Colours.plain(shade, len(rows))
+            order.append(rows)
+            parts.append(part)
+            sizes.append(len(rows))
+        whole = joined(parts, sizes)
+        return whole and whole.take(np.argsort(np.concatenate(order)))
 
 
 def _obj_names(key: bytes, text: bytes) -> list[bytes]:
@@ -197,8 +251,8 @@ def _shown(line: bytes) -> str:
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
-def read_off(data: bytes, path: Path) -> Content:
-    """Read an Object File Format file: one mesh, with or without colours."""
+def read_off(data: bytes, path: Path, colours: bool = False) -> Content:
+    """Read an Object File Format file: one mesh; `colours` are those of vertices (COFF)."""
     text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
     found = _OFF.match(text)
     text = text[found.end() if found else 0 :]
@@ -214,18 +268,30 @@ def read_off(data: bytes, path: Path) -> Content:
             f"{points:,} vertices and {polygons:,} faces announced, each in a line of its own, and "
             f"{len(lines):,} lines there"
         )
-    numbers, polygon = array("d"), _Polygons()
+    numbers, tints, polygon = array("d"), array("d"), _Polygons()
+    coloured = colours and found is not None and found[0].upper() == b"COFF"
     for line in lines[:points]:
         if len(line) < 3:
             raise ValueError(f"a vertex has {len(line)} numbers")
         numbers.extend(map(float, line[:3]))  # a colour may follow
+        if coloured and len(line) >= 6:
+            tints.extend(map(float, line[3:6]))
     for line in lines[points:]:
         size = int(line[0])
         if not 0 <= size < len(line):
             raise ValueError(f"a face of {size} corners has {len(line) - 1}")
         polygon.add(list(map(int, line[1 : size + 1])))
     vertices = np.frombuffer(numbers).reshape(-1, 3)
-    return Content(_mesh(path.stem, vertices, polygon.faces(vertices)))
+    faces, shown = polygon.faces(vertices), None
+    if coloured and len(tints) == len(numbers):
+        given = np.frombuffer(tints).reshape(-1, 3)
+        shown = _tinted(given / (255 if given.max(initial=0) > 1 else 1), faces)
+    return Content(_mesh(path.stem, vertices, faces, colours=shown))
+
+
+def _tinted(shares: Float, faces: Int) -> Colours:
+    """Colours of vertices, (v, 3), 0 to 1."""
+    return replace(Colours.plain(WHITE, len(faces)), corners=as_bytes(shares)[faces])
 
 
 # -- .stl ----------------------------------------------------------------------------------------
@@ -273,6 +339,7 @@ _PLY_TYPES = {
     "int32": "i4", "uint32": "u4", "float32": "f4", "float64": "f8",
 }  # fmt: skip
 _PLY_LISTS = ("vertex_indices", "vertex_index")
+_PLY_COLOURS = ("red", "green", "blue")
 
 
 @dataclass
@@ -285,10 +352,20 @@ class _Element:
     properties: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def read_ply_mesh(data: bytes, path: Path) -> Content:
-    """Read a Stanford polygon file: text or binary, faces of any mixture."""
+def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
+    """Read a Stanford polygon file: text or binary, faces of any mixture.
+
+    `colours` are red, green and blue of its vertices: bytes, or real numbers from 0 to 1.
+    """
     elements, order, body = _ply_header(data)
     counts = {element.name: element.count for element in elements}
+    # Their types, before text is read as real numbers.
+    kinds = {
+        name: kind
+        for e in elements
+        for name, (kind, _) in e.properties.items()
+        if e.name == "vertex"
+    }
     if counts.get("tristrips"):
         raise MeshFileError("has triangle strips, which are not read: export it with faces")
     if not counts.get("face"):
@@ -304,7 +381,13 @@ def read_ply_mesh(data: bytes, path: Path) -> Content:
     corners = numbers.astype(np.int64)
     if not np.array_equal(corners, numbers):
         raise ValueError("vertex indices of faces are not whole numbers")
-    return Content(_mesh(path.stem, vertices, triangulated(vertices, corners, sizes)))
+    faces, shown = triangulated(vertices, corners, sizes), None
+    if colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
+        given = np.stack([rows["vertex"][name][0] for name in _PLY_COLOURS], axis=1)
+        whole = kinds.get("red", "f4")[0] in "iu"
+        most = np.iinfo(kinds["red"]).max if whole else 1
+        shown = _tinted(given.astype(np.float64) / most, faces)
+    return Content(_mesh(path.stem, vertices, faces, colours=shown))
 
 
 def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:

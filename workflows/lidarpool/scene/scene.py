@@ -15,7 +15,9 @@ from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
 from ..sensor import Pose
+from . import colours as coloured
 from .actors import Actor
+from .colours import Colours
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
 from .meshfile import Opacity, load_meshes
@@ -52,6 +54,8 @@ class Scene:
     instances
         Triangles that are kept once and are in several places, or have a mask; they are numbered
         after `faces`, instance by instance. Those of actors follow.
+    colours
+        Of `faces`; None if they have none.
 
     Raises
     ------
@@ -66,6 +70,7 @@ class Scene:
     origin: NDArray[np.float64]
     actors: tuple[Actor, ...] = ()
     instances: Instances | None = None
+    colours: Colours | None = None
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
@@ -93,6 +98,8 @@ class Scene:
             object.__setattr__(self, name, array)
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "actors", tuple(self.actors))
+        if self.colours is not None:
+            self.colours.check("the scene", len(faces))
 
     @classmethod
     def seed(cls) -> Scene:
@@ -114,6 +121,7 @@ class Scene:
         up_axis: str | None = None,
         transform: Transform | None = None,
         opacity: Opacity = "mask",
+        colours: bool = False,
     ) -> Scene:
         """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf .usd .usda .usdc .usdz.
 
@@ -133,6 +141,9 @@ class Scene:
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj). With "ignore", triangles are solid, and no image is read.
+        colours
+            Whether to read base colours and their images (.glb, .gltf, .obj, .dae), and colours of
+            vertices (.glb, .gltf, .obj, .ply, .off).
 
         Raises
         ------
@@ -140,7 +151,14 @@ class Scene:
             If the file cannot be read completely, or has no triangles.
         """
         return cls.from_meshes(
-            load_meshes(path, unit=unit, up_axis=up_axis, transform=transform, opacity=opacity)
+            load_meshes(
+                path,
+                unit=unit,
+                up_axis=up_axis,
+                transform=transform,
+                opacity=opacity,
+                colours=colours,
+            )
         )
 
     @classmethod
@@ -183,8 +201,10 @@ class Scene:
                 parts += made
             for part in known[mesh]:
                 if isinstance(one, Mesh) and parts[part].mask is None:
-                    vertices, faces = parts[part].vertices, parts[part].faces
-                    plain.append((number, Mesh(one.name, vertices, faces.astype(np.int64))))
+                    solid = parts[part]
+                    corners = solid.faces.astype(np.int64)
+                    mesh = Mesh(one.name, solid.vertices, corners, colours=solid.colours)
+                    plain.append((number, mesh))
                 else:
                     shared.append((number, part, matrix))
         sizes = [len(mesh.faces) for _, mesh in plain]
@@ -220,6 +240,7 @@ class Scene:
             names=unique_names([one.name for one in objects]),
             origin=origin,
             instances=instances,
+            colours=coloured.joined([mesh.colours for _, mesh in plain], sizes),
         )
 
     def with_actors(self, actors: Iterable[Actor]) -> Scene:
@@ -272,6 +293,14 @@ class Scene:
         return tuple(name for i, name in enumerate(self.all_names) if i in owners)
 
     @property
+    def coloured(self) -> list[Colours]:
+        """Colours of all that has some: the faces, parts of instances, actors."""
+        parts = self.instances.parts if self.instances else ()
+        found = [self.colours, *(part.colours for part in parts)]
+        found += [actor.mesh.colours for actor in self.actors]
+        return [colours for colours in found if colours is not None]
+
+    @property
     def triangles(self) -> int:
         """Number of triangles, including those of instances and actors."""
         shared = self.instances.triangles if self.instances else 0
@@ -308,11 +337,13 @@ class Scene:
             np.arange(len(self.names), len(self.all_names), dtype=np.int32),
             [len(mesh.faces) for mesh in meshes],
         )
+        sizes = [len(self.faces), *(len(faces) for _, faces in moving)]
         return Scene(
             *stacked([(self.vertices, self.faces), *moving]),
             np.append(self.face_object, owners),
             self.all_names,
             self.origin,
+            colours=coloured.joined([self.colours, *(mesh.colours for mesh in meshes)], sizes),
         )
 
     def meshes(self) -> tuple[Mesh | Instance, ...]:
@@ -326,7 +357,9 @@ class Scene:
         for name, rows, found in zip(self.names, np.split(order, ends), out, strict=True):
             if len(rows):
                 used, faces = np.unique(self.faces[rows], return_inverse=True)
-                found.append(Mesh(name, self.vertices[used] + self.origin, faces.reshape(-1, 3)))
+                own = self.colours and self.colours.take(rows)
+                points = self.vertices[used] + self.origin
+                found.append(Mesh(name, points, faces.reshape(-1, 3), colours=own))
         if (shared := self.instances) is not None:
             meshes = [
                 Mesh(
@@ -334,6 +367,7 @@ class Scene:
                     part.vertices,
                     part.faces.astype(np.int64),
                     () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),),
+                    part.colours,
                 )
                 for number, part in enumerate(shared.parts)
             ]

@@ -27,6 +27,8 @@ _GROUND, _SKY, _ENCLOSED, _CLOSED, _UPRIGHT, _FLOOR = 0.4, 0.3, 0.95, 0.8, 0.9, 
 _OPEN, _LEAVES = 0.1, 0.4
 # A closed body whose inside has a floor and upright walls is a room of these sizes.
 _WIDE_M, _HIGH_M = 2.0, 15.0
+# A body is around a position; a flat surface, however near, takes half of the directions.
+_AROUND = 0.6
 
 
 def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
@@ -56,9 +58,10 @@ class Views:
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
     @property
-    def only_backs(self) -> bool:
-        """Whether all that there is to see is the backs of surfaces."""
-        return bool(self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
+    def in_a_body(self) -> bool:
+        """Whether there are surfaces around, of which only backs are to see."""
+        around = np.mean(np.isfinite(self.distance)) > _AROUND
+        return bool(around and self.hit.any() and np.mean(self.back[self.hit]) > 1 - 1 / RAYS)
 
 
 class Surroundings:

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import csv
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase, translate
-from typing import Annotated, Any, Literal
+from functools import cache
+from importlib.resources import files
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from ..base.arguments import checked_fields
+from ..base.arguments import checked_fields, shown
 from ..base.declared import Share, TextOrTexts, written_as
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
@@ -23,9 +26,39 @@ REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white
 RETRO_GAIN = 220.0
 GLASS_INDEX = 1.5
 NEAREST_M = 1e-3  # energies do not grow below this distance
+NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
+POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
+DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
 SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass", "mirror"]
+
+
+class Measured(NamedTuple):
+    """Reflectance of a material in a public spectral library."""
+
+    shares: tuple[float, float]  # at 905 and 1550 nm
+    library: str
+    sample: str
+
+
+@cache
+def reflectances() -> dict[str, Measured]:
+    """Return the table of reflectances: {name of a material: what was measured}."""
+    text = (files("lidarpool.sensor") / "reflectances.csv").read_text("utf-8")
+    return {
+        row["name"]: Measured(
+            (float(row["at_905_nm"]), float(row["at_1550_nm"])), row["library"], row["sample"]
+        )
+        for row in csv.DictReader(text.splitlines())
+    }
+
+
+def _share_or_texture(value: Any) -> Any:
+    """Refuse what is neither, in one line instead of pydantic's for each."""
+    if value in (None, "texture") or (type(value) in (int, float) and 0 <= value <= 1):
+        return value
+    raise ValueError(f"given is {shown(value)}; it must be 0 to 1, or texture.")
 
 
 @dataclass(frozen=True)
@@ -33,13 +66,14 @@ Transparent = Literal["none", "pass", "mirror"]
 class Material:
     """Material of objects; the last entry for an object counts.
 
-    Reflectance is that at the sensor's wavelength, in all directions. Of light that is not
-    scattered, "pass" reflects what glass reflects; with "none" it is lost.
+    Reflectance is that at the sensor's wavelength, in all directions but for a gloss. Of light that
+    is not scattered, "pass" reflects what glass reflects; with "none" it is lost.
 
     Raises
     ------
     LidarpoolError
-        If a value is outside its range.
+        If a value is outside its range, the table of reflectances has no such material, or two
+        values contradict each other.
     """
 
     objects: Annotated[
@@ -48,9 +82,11 @@ class Material:
         Field(min_length=1, description="names of objects, with * and ?"),
     ]
     reflectance: Annotated[
-        Share | None,
+        Share | Literal["texture"] | None,
+        BeforeValidator(_share_or_texture),
         Field(
-            description="share of light that is scattered; by default 0.5, for glass and mirrors 0"
+            description="share of light that is scattered; by default 0.5, for glass and mirrors "
+            "0; texture: the luminance of the colour that was hit",
         ),
     ] = None
     semantic_class: Annotated[
@@ -63,12 +99,63 @@ class Material:
         Transparent,
         Field(description="the rest of the light passes through (pass), or is reflected (mirror)"),
     ] = "none"
+    scale: Annotated[
+        float,
+        Field(gt=0, le=100, description="with reflectance: texture, a factor of the luminance"),
+    ] = 1.0
+    material: Annotated[
+        str | None,
+        Field(
+            description="instead of reflectance: a material of the table of reflectances",
+            examples=["asphalt, dry"],
+        ),
+    ] = None
+    roughness: Annotated[
+        float | None,
+        Field(ge=0.1, le=1, description="adds a gloss, as of paint or metal; by default none"),
+    ] = None
+    metalness: Annotated[
+        Share, Field(description="with roughness: 1 for metals, which scatter by their gloss alone")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
         if not all(names):
             raise LidarpoolError(f"objects is {self.objects!r}; it must be names of objects.")
         object.__setattr__(self, "objects", names)
+        if self.material is not None:
+            if self.material not in (known := reflectances()):
+                raise LidarpoolError(
+                    f"There is no material {self.material!r}."
+                    + (did_you_mean(self.material, known) or f" There are: {'; '.join(known)}.")
+                )
+            if self.reflectance is not None:
+                raise LidarpoolError("give either material or reflectance, not both.")
+        if self.reflectance == "texture":
+            if self.transparent != "none":
+                raise LidarpoolError(
+                    f"reflectance texture is for opaque objects: with transparent "
+                    f"{self.transparent}, give a number."
+                )
+        elif self.scale != 1:
+            raise LidarpoolError("scale is a factor of colours: give reflectance texture with it.")
+
+        if self.roughness is None and self.metalness:
+            raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
+        if self.roughness is not None and (self.retro or self.transparent != "none"):
+            raise LidarpoolError("roughness is for opaque surfaces that are not retro-reflective.")
+
+    def share(self, wavelength_nm: float) -> float:
+        """Share of light that is scattered; of textures, that of what has no colour."""
+        if self.material is not None:
+            near, far = reflectances()[self.material].shares
+            # The nearer of the two was measured; between them, leaves absorb more than either says.
+            return near if wavelength_nm < (NEAR_NM + FAR_NM) / 2 else far
+        if self.reflectance == "texture":
+            return min(1.0, self.scale * REFLECTANCE)
+        if self.reflectance is None:
+            return REFLECTANCE if self.transparent == "none" else 0.0
+        return float(self.reflectance)
 
     def named(self, name: str) -> bool:
         """Whether this material applies to an object."""
@@ -88,13 +175,18 @@ class MaterialTable:
     """Materials of objects: each array has one value for each."""
 
     reflectance: NDArray[np.float64]
+    scale: NDArray[np.float64]  # of the luminance of colours; 0 where the reflectance is a number
+    roughness: NDArray[np.float64]  # 0 for no gloss
+    metalness: NDArray[np.float64]
     retro: NDArray[np.bool_]
     passes: NDArray[np.bool_]
     mirrors: NDArray[np.bool_]
     semantic_class: NDArray[np.uint16]
 
     @classmethod
-    def of(cls, materials: Sequence[Material], names: Sequence[str]) -> MaterialTable:
+    def of(
+        cls, materials: Sequence[Material], names: Sequence[str], wavelength_nm: float = NEAR_NM
+    ) -> MaterialTable:
         """Find the materials of objects by name: the last that names an object counts.
 
         Raises
@@ -120,13 +212,12 @@ class MaterialTable:
                 'for all the others, such as {objects: "*"}.'
             )
         found = [*materials, Material("*")]  # the last is of all, if there are no materials
-        scattered = [
-            (REFLECTANCE if m.transparent == "none" else 0.0) if m.reflectance is None
-            else m.reflectance
-            for m in found
-        ]  # fmt: skip
+        textured = [m.scale * (m.reflectance == "texture") for m in found]
         return cls(
-            np.array(scattered, np.float64)[last],
+            np.array([m.share(wavelength_nm) for m in found], np.float64)[last],
+            np.array(textured, np.float64)[last],
+            np.array([m.roughness or 0.0 for m in found])[last],
+            np.array([m.metalness for m in found])[last],
             np.array([m.retro for m in found], np.bool_)[last],
             np.array([m.transparent == "pass" for m in found], np.bool_)[last],
             np.array([m.transparent == "mirror" for m in found], np.bool_)[last],
@@ -138,11 +229,34 @@ class MaterialTable:
         """Whether each ray ends at its first hit, with a return."""
         return bool((self.reflectance > 0).all() and not (self.passes | self.mirrors).any())
 
+    @property
+    def textured(self) -> bool:
+        """Whether the colours of an object are its reflectance."""
+        return bool(self.scale.any())
+
     def scattered(
-        self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
+        self,
+        rows: NDArray[np.integer[Any]],
+        cosine: NDArray[np.float64],
+        luminance: NDArray[np.float64] | None = None,
     ) -> NDArray[np.float64]:
-        """Share of the light returned by objects (n,): 1 for white at right angles."""
-        return self.reflectance[rows] * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        """Share of the light returned by objects (n,): 1 for white at right angles.
+
+        `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
+        """
+        shares = self.reflectance[rows]
+        if luminance is not None:
+            scale = self.scale[rows]
+            bright = np.minimum(np.maximum(scale * luminance, DARKEST), 1.0)
+            shares = bright if self.scale.all() else np.where(scale > 0, bright, shares)
+        back = shares * np.where(self.retro[rows], RETRO_GAIN, cosine)
+        if self.roughness.any():
+            on = np.flatnonzero(self.roughness[rows])
+            metal, some = self.metalness[rows[on]], shares[on]
+            front = POLISHED * (1 - metal) + some * metal
+            back[on] *= 1 - metal
+            back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
+        return back
 
     def goes_on(
         self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
@@ -150,6 +264,18 @@ class MaterialTable:
         """Share of the light that continues at glass or mirrors (n,)."""
         through = np.where(self.passes[rows], 1 - fresnel(cosine), 1.0)
         return np.asarray((1 - self.reflectance[rows]) * through)
+
+
+def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Light that facets of a rough surface mirror back to where it came from, of a white diffuser.
+
+    Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
+    is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, their
+    π D G / (4 cos θ) is what is left here. Multiply it by the reflection at right angles.
+    """
+    width, square = roughness**4, cosine**2
+    spread = 1 - square * (1 - width)
+    return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 
 
 def fresnel(cosine: NDArray[np.float64]) -> NDArray[np.float64]:

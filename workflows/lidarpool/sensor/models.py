@@ -237,8 +237,8 @@ def load_sensor(
         Turns, lines or frames a second.
     step_deg
         Part of a turn that is one scan. Ten degrees are 800 rays of a VLP-16 and 3,600 of an
-        OS1-128: a scan then costs little by itself, because batches join consecutive scans up to
-        a million rays, and several workers can share a turn.
+        OS1-128: a scan then costs little by itself, because batches join consecutive scans, and
+        several workers can share a turn.
     min_range_m, max_range_m
         Instead of the model's.
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Callable, Container, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -141,6 +142,8 @@ def columns_of_table(
 ) -> dict[str, NDArray[np.float64]]:
     """Columns (k,) of a table with a header, by their names here; others are left out.
 
+    Capital letters count only in `names`.
+
     Parameters
     ----------
     names
@@ -153,7 +156,7 @@ def columns_of_table(
     Raises
     ------
     ValueError
-        If a column is missing, or what it holds are no numbers.
+        If a column is missing, or a cell holds no finite number.
     """
     lines = text.splitlines()
     # Remarks may come first, and some programs write # before the header as well.
@@ -162,16 +165,44 @@ def columns_of_table(
     head = [name.strip().strip('"') for name in lines[first].split(mark)]
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"columns names {unknown[0]!r}; possible names are {', '.join(known)}")
-    at = {
-        name: head.index(names.get(name, name)) for name in known if names.get(name, name) in head
-    }
+    small = [name.lower() for name in head]
+    at = {}  # {name here: index}
+    for name in known:
+        if (there := names.get(name, name)) in head:
+            at[name] = head.index(there)
+        elif name not in names and name in small:
+            at[name] = small.index(name)
     must = {**dict.fromkeys(needed(at)), **names}
     if missing := [names.get(name, name) for name in must if name not in at]:
         raise ValueError(f"it has no column {missing[0]!r}; it has {', '.join(head)}")
     used = list(at.values())  # others may hold text
-    rest = "\n".join(lines[first + 1 :])
-    rows = _numbers(rest, delimiter=mark, quotechar='"', usecols=used)
+    body = lines[first + 1 :]
+    try:
+        rows = _numbers("\n".join(body), delimiter=mark, quotechar='"', usecols=used)
+        if not np.isfinite(rows).all():
+            raise ValueError("it has a nan or inf")
+    except ValueError as error:
+        reader = csv.reader(body, delimiter=mark)
+        for cells in reader:
+            remark = not cells or cells[0].lstrip().startswith("#")
+            for name, index in () if remark else at.items():
+                cell = cells[index] if index < len(cells) else ""
+                if not _is_finite(cell):
+                    line = first + 1 + reader.line_num
+                    more = "" if name in must else ", or leave the column out"
+                    raise ValueError(
+                        f"its column {head[index]!r} has {cell!r} in line {line}: give a number in "
+                        f"every line{more}"
+                    ) from error
+        raise
     return dict(zip(at, rows.T, strict=True))
+
+
+def _is_finite(cell: str) -> bool:
+    try:
+        return bool(np.isfinite(float(cell)))
+    except ValueError:
+        return False
 
 
 def quaternions_from_degrees(angles: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -18,14 +18,17 @@ def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
         column.name: _joined([returns.column(column) for returns in found])
         for column in found[0].survey.stored_columns
     }
-    tally = np.sum([returns.tally for returns in found], axis=0)
-    triangles = np.flatnonzero(tally)
+    hits = np.zeros(found[0].scene.counters, np.int64)
+    for returns in found:
+        triangles, counts = returns.tally
+        hits[triangles] += counts
+    triangles = np.flatnonzero(hits)
     return PartColumns(
         found[0].specs[0].scan,
         _joined([returns.counts for returns in found]),
         columns,
         triangles.astype(np.int32),
-        tally[triangles].astype(np.int64),
+        hits[triangles],
     )
 
 

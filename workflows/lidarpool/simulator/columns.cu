@@ -56,7 +56,7 @@ KERNEL columns(
     if (k >= count) return;
     const double metres = distance[k];
     int* const cells[] = {x, y, z};
-    for (int axis = 0; axis < 3; ++axis) {
+    for (int axis = 0; axis < 3 && WANTED(X); ++axis) {
         const double end = directions[axis * count + k] * metres + origins[axis * count + k];
         cells[axis][k] = (int)rint(end / precision);
     }

@@ -1,14 +1,15 @@
 """Columns that are made on the CUDA device: only kept values cross the bus, in the types of files.
 
-The formulas are those of `BatchReturns`, with the same bits. A survey with a column that only NumPy
-can make, sub-rays, noise or haze takes the hits to the host instead. Hits on actors are found by
-`World`; the device merges them with its own, and NumPy makes their energies, for which it needs the
-actors' poses.
+The formulas are those of `BatchReturns`, with the same bits. If a survey has other columns too, its
+kept hits cross the bus as well, and NumPy makes those. So it does with the energies of hits on
+actors, for which it needs their poses; `World` finds these hits, and the device merges them with
+its own.
 """
 
 from __future__ import annotations
 
 import importlib.resources
+from copy import copy
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import DeviceHits, Outbox, Pattern, check_scan
+from raybeam.device import to_device
 
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
@@ -30,66 +32,92 @@ from .world import World
 
 OPTIONS = "-std=c++17", "-fmad=false"  # of the compiler
 _BLOCK = 128  # threads
-_ENERGIES = ("intensity", "reflectivity")
+_ENERGIES = "intensity", "reflectivity"
+_TRIANGLE = TABLE["triangle"]
 # In the order of columns.cu.
-_MADE = (*AXES, CHANNEL, OBJECT, *(TABLE[name] for name in (
-    "ray", "time", "range", *_ENERGIES, "class", "triangle",
-)))  # fmt: skip
-_EQUAL = ("sensor", "return_number", "returns")  # the same for all points
+_MADE = (
+    *AXES, CHANNEL, OBJECT,
+    *(TABLE[name] for name in ("ray", "time", "range", *_ENERGIES, "class")), _TRIANGLE,
+)  # fmt: skip
+_EQUAL = "sensor", "return_number", "returns"  # the same for all points
+_HITS = np.uint32, np.float64, np.int32  # rays, distances and triangles of hits for NumPy
+_NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
+
+
+def _able(survey: Survey) -> set[str]:
+    """Names of the columns that a device can make for a survey."""
+    hazy = any(survey.extinction(carried.sensor) for carried in survey.carried)
+    several = len({carried.sensor.optics.wavelength_nm for carried in survey.carried}) > 1
+    shining = any(
+        m.reflectance == "texture" or m.roughness is not None or (several and m.material)
+        for m in survey.materials
+    )
+    able = {column.name for column in _MADE} - {*(_ENERGIES if hazy or shining else ())}
+    return able - {axis.name for axis in AXES if survey.coordinates == "sensor"}
+
+
+def needs_hits(survey: Survey) -> bool:
+    """Whether NumPy makes a column, so that all kept hits leave the device."""
+    return not {column.name for column in survey.stored_columns} <= _able(survey) | {*_EQUAL}
 
 
 @dataclass(frozen=True, eq=False)
 class DeviceReturns:
     """Columns of some consecutive scans of one station, see `BatchReturns`."""
 
+    scene: Scene
     survey: Survey
     specs: list[ScanSpec]
     counts: NDArray[np.int64]  # of each scan
     hits: NDArray[np.int64]  # of each scan, kept or not
-    tally: NDArray[np.int64]
-    columns: dict[str, NDArray[Any]]
+    tally: tuple[NDArray[np.intp], NDArray[np.int64]]
+    columns: dict[str, NDArray[Any]]  # by name
+    returns: BatchReturns | None  # on the host, if there are columns that NumPy makes
 
     def __len__(self) -> int:
         return int(self.counts.sum())
 
     def column(self, column: Column) -> NDArray[Any]:
         """Values of a column."""
-        made = self.columns.get(column.name)
-        if made is not None:
-            return made
+        if column.name in self.columns:
+            return self.columns[column.name]
+        if self.returns is not None:
+            return column.make(self.returns)
         value = self.specs[0].sensor if column.name == "sensor" else 1
         return np.full(len(self), value, column.dtype)
 
     def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Positions of some points (k,), to the survey's precision: (k, 3)."""
+        """Positions of some points (k,), at least to the survey's precision: (k, 3)."""
+        if self.returns is not None:
+            return self.returns.ends(rows)
         cells = np.stack([self.columns[axis.name][rows] for axis in AXES], axis=1)
         return cells * self.survey.precision_m
 
 
 class DeviceColumns:
-    """Casts plain surveys and makes their columns on the device."""
+    """Casts surveys whose rays have one return each, and makes their columns on the device."""
 
     def __init__(self, world: World, scene: Scene, survey: Survey, surfaces: Surfaces) -> None:
         self._world, self._scene, self._surfaces = world, scene, surfaces
         self.survey = survey
-        self.wanted = [column for column in _MADE if column in survey.stored_columns]
-        self.energies = [column for column in self.wanted if column.name in _ENERGIES]
-        self.bodies, self._turns = surfaces.bodies()
+        wanted, able = {column.name for column in survey.stored_columns}, _able(survey)
+        self.all_hits = needs_hits(survey)
+        if self.all_hits and scene.actors:
+            able -= {*_ENERGIES}
+        self.made = [column for column in _MADE if column.name in wanted & able]
+        self.energies = [column for column in self.made if column.name in _ENERGIES]
+        # Whether NumPy needs hits on actors.
+        self.some_hits = bool(scene.actors and self.energies)
+        self.bodies, _ = surfaces.bodies()
+        self._counters = world.counters()
         self._sent: tuple[Any, ...] | None = None
+        self._turns: Any = None
 
-    @staticmethod
-    def can_make(world: World, survey: Survey) -> bool:
-        """Whether all of a survey's columns are made on a device, given one return for each ray."""
-        names = {column.name for column in survey.stored_columns}
-        known = {*(column.name for column in _MADE), *_EQUAL}
-        clear = not any(survey.extinction(carried.sensor) for carried in survey.carried)
-        return (
-            world.caster.on_device
-            and survey.coordinates == "world"
-            and all(column in TABLE.values() for column in survey.stored_columns)
-            and names <= known
-            and (clear or not names & {*_ENERGIES})
-        )
+    def moved(self, scene: Scene, surfaces: Surfaces) -> DeviceColumns:
+        """Return the same after instances have moved; what has not changed stays on the device."""
+        made = copy(self)
+        made._scene, made._surfaces, made._turns = scene, surfaces, None
+        return made
 
     def returns(
         self,
@@ -109,72 +137,51 @@ class DeviceColumns:
         others = self._world.on_actors(pattern, poses, window, reach) if poses.ways else None
         if others is not None:  # rows of the actors' body
             others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
-        most = -(-len(scan) // every) + len(groups)
-        making = _Making(self, specs, groups, most, moves=others is not None)
-        caster, counters = self._world.caster, self._world.counters()
-        hits, tally = caster.visit(scan, making.make, counters, others)
+        making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))
+        try:
+            hits, tally = self._world.caster.visit(scan, making.make, self._counters, others)
+        finally:  # else the device would write to memory that goes back to the pool
+            columns, (ray, distance, triangle) = making.done()
         assert tally is not None
-        columns = making.done()
-        if making.moving:
-            rows, *found = map(np.concatenate, zip(*making.moving, strict=True))
-            here = specs, pattern, window[0], poses
-            small = self._of_hits(*here, *found)
-            for column in self.energies:
-                columns[column.name][rows] = column.make(small)
-        return DeviceReturns(survey, specs, -(-hits // every), hits, tally, columns)
-
-    def _of_hits(
-        self,
-        specs: list[ScanSpec],
-        pattern: Pattern,
-        start: int,
-        poses: Poses,
-        ray: NDArray[np.uint32],
-        distance: NDArray[np.float64],
-        triangle: NDArray[np.int32],
-    ) -> BatchReturns:
-        """Make returns of some hits, for columns that NumPy makes."""
         one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
-        triangle = triangle + np.int32(self.bodies[-1, 0])
-        counts = np.zeros(len(specs), np.int64)
         found = Echoes(
-            ray, distance, triangle, counts, None, none,
+            ray, distance, triangle, hits, None, none,
             energy=None, number=one, returns=one, reported=distance,
         )  # fmt: skip
-        return BatchReturns(
-            self._scene, self.survey, self._surfaces, specs, found, pattern, start, poses
+        returns = BatchReturns(
+            self._scene, survey, self._surfaces, specs, found, pattern, window[0], poses
         )
+        if self.some_hits:
+            for column in self.energies:
+                columns[column.name][making.rows] = column.make(returns)
+        counts, on_host = -(-hits // every), returns if self.all_hits else None
+        return DeviceReturns(self._scene, survey, specs, counts, hits, tally, columns, on_host)
 
-    def sent(self, cupy: Any) -> tuple[Any, ...]:
+    def tables(self, cupy: Any) -> tuple[Any, ...]:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""
         if self._sent is None:
             surfaces, materials = self._surfaces, self._surfaces.materials
             normals = surfaces.unit_normals if self.energies else np.zeros((3, 1), np.float32)
             tables = (
-                self.bodies, surfaces.owners, normals, self._turns, materials.reflectance,
+                self.bodies, surfaces.owners, normals, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
             )  # fmt: skip
-            self._sent = tuple(map(cupy.asarray, tables))
-        return self._sent
+            self._sent = tuple(to_device(cupy, table) for table in tables)
+        if self._turns is None:
+            self._turns = to_device(cupy, self._surfaces.bodies()[1])
+        return *self._sent, self._turns
 
 
 class _Making:
     """Columns of a batch on their way from the device to the host."""
 
     def __init__(
-        self,
-        maker: DeviceColumns,
-        specs: list[ScanSpec],
-        groups: NDArray[np.int64],
-        most: int,
-        moves: bool,
+        self, maker: DeviceColumns, specs: list[ScanSpec], groups: NDArray[np.int64], most: int
     ) -> None:
-        self._maker, self._specs, self._groups = maker, specs, groups
-        self._most, self._moves = most, moves
+        self._maker, self._specs, self._groups, self._most = maker, specs, groups, most
         self._begun: _Begun | None = None
-        self._made = 0
-        # Rows of hits on actors, their rays, distances and triangles, if they have energies.
-        self.moving: list[tuple[NDArray[Any], ...]] = []
+        self._count = 0
+        self._on_actors: list[tuple[NDArray[Any], ...]] = [_NO_HITS]  # rows, and as `_HITS`
 
     def make(self, hits: DeviceHits) -> None:
         """Make the columns of some hits, and send them to the host."""
@@ -182,47 +189,60 @@ class _Making:
             return
         begun = self._begun = self._begun or self._begin(hits.cupy)
         cp, count = hits.cupy, np.int64(len(hits))
-        made = {
-            column: cp.empty(len(hits) if column in begun.out else 1, column.dtype)
-            for column in _MADE
-        }
+        asked = {*begun.out, *([_TRIANGLE] if begun.hits else [])}
+        made = {c: cp.empty(len(hits) if c in asked else 1, c.dtype) for c in _MADE}
+        wanted = np.int32(sum(1 << _MADE.index(column) for column in asked))
         found = hits.ray, hits.distance, hits.triangle, hits.instance, *hits.rays(), count
-        begun.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), (*found, *begun.given, *made.values()))
-        rows = slice(self._made, self._made + len(hits))
-        begun.outbox.send([(made[column], out[rows]) for column, out in begun.out.items()])
-        if self._maker.energies and self._moves:
+        given = (*found, wanted, *begun.given, *made.values())
+        begun.kernel((-(-len(hits) // _BLOCK),), (_BLOCK,), given)
+        rows = slice(self._count, self._count + len(hits))
+        pairs = [(made[column], out[rows]) for column, out in begun.out.items()]
+        raw = hits.ray, hits.distance, made[_TRIANGLE]
+        pairs += [(array, out[rows]) for array, out in zip(raw, begun.hits, strict=False)]
+        begun.outbox.send(pairs)
+        if self._maker.some_hits:
             on = cp.flatnonzero(hits.instance == len(self._maker.bodies) - 1)
-            given = (on, hits.ray[on], hits.distance[on], hits.triangle[on])
-            at, ray, distance, triangle = (array.get() for array in given)
-            self.moving.append((self._made + at, ray, distance, triangle))
-        self._made += len(hits)
+            some = (on, hits.ray[on], hits.distance[on], hits.triangle[on])
+            at, ray, distance, triangle = (array.get() for array in some)
+            triangle += np.int32(self._maker.bodies[-1, 0])
+            self._on_actors.append((self._count + at, ray, distance, triangle))
+        self._count += len(hits)
 
-    def done(self) -> dict[str, NDArray[Any]]:
-        """Wait for all columns: {name: values}."""
+    @property
+    def rows(self) -> NDArray[np.int64]:
+        """Rows of the hits on actors."""
+        return np.concatenate([rows for rows, *_ in self._on_actors])
+
+    def done(self) -> tuple[dict[str, NDArray[Any]], tuple[NDArray[Any], ...]]:
+        """Wait for all columns; returns them by name, and what NumPy needs of hits, as `_HITS`."""
         if self._begun is None:
-            return {column.name: np.zeros(0, column.dtype) for column in self._maker.wanted}
+            return {c.name: np.zeros(0, c.dtype) for c in self._maker.made}, _NO_HITS[1:]
         self._begun.outbox.wait()
-        return {column.name: out[: self._made] for column, out in self._begun.out.items()}
+        columns = {column.name: out[: self._count] for column, out in self._begun.out.items()}
+        if self._begun.hits:
+            return columns, tuple(out[: self._count] for out in self._begun.hits)
+        _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
+        return columns, tuple(hits)
 
     def _begin(self, cupy: Any) -> _Begun:
         """Send what the kernel reads besides hits."""
         maker, specs = self._maker, self._specs
         survey, sensor = maker.survey, maker.survey.carried[specs[0].sensor].sensor
-        bodies, owners, normals, turns, *materials, classes = maker.sent(cupy)
+        bodies, owners, normals, reflectance, retro, classes, turns = maker.tables(cupy)
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         outbox = Outbox(cupy)
         given = (
-            np.int32(sum(1 << _MADE.index(column) for column in maker.wanted)),
             np.float64(survey.precision_m),
             cupy.asarray(self._groups), np.int32(len(specs)),
             cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
             np.int32(sensor.channels), np.int64(specs[0].start_ns),
             bodies, owners, normals, np.int64(normals.shape[1]), turns,
-            *materials, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
+            reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
             np.float64(NEAREST_M), classes,
         )  # fmt: skip
-        out = {column: outbox.room(self._most, column.dtype) for column in maker.wanted}
-        return _Begun(_kernel(cupy, cupy.cuda.Device().id), given, outbox, out)
+        out = {column: outbox.room(self._most, column.dtype) for column in maker.made}
+        hits = [outbox.room(self._most, kind) for kind in _HITS] if maker.all_hits else []
+        return _Begun(_kernel(cupy, cupy.cuda.Device().id), given, outbox, out, hits)
 
 
 @dataclass(frozen=True, eq=False)
@@ -232,7 +252,8 @@ class _Begun:
     kernel: Any
     given: tuple[Any, ...]  # arguments between hits and columns
     outbox: Outbox
-    out: dict[Column, NDArray[Any]]  # page-locked
+    out: dict[Column, NDArray[Any]]  # page-locked, as all of these
+    hits: list[NDArray[Any]]  # as `_HITS`, if NumPy needs all of them
 
 
 @lru_cache(maxsize=16)

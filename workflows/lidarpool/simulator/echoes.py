@@ -14,12 +14,13 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern, ScanReturns
 
+from ..columns.table import COLOURS
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.disc import disc, neighbours
 from ..sensor.optics import Mode, spread
 from .motion import Clock, Poses, products
-from .surfaces import Surfaces
+from .surfaces import Surfaces, light_of
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
@@ -40,10 +41,13 @@ class Hits(NamedTuple):
     distance: Real
     triangle: NDArray[np.int32]
     energy: Real
+    colour: NDArray[np.uint32] | None = None  # packed, see `Surfaces.colours`
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
-        return Hits(self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows])
+        colour = None if self.colour is None else self.colour[rows]
+        own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
+        return Hits(*own, colour)
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
@@ -53,7 +57,9 @@ Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
 
 def joined(parts: list[Hits]) -> Hits:
     """Concatenate hits."""
-    return Hits(*map(np.concatenate, zip(*parts, strict=True)))
+    *own, colours = zip(*parts, strict=True)
+    colour = None if parts[0].colour is None else np.concatenate(colours)
+    return Hits(*map(np.concatenate, own))._replace(colour=colour)
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,8 @@ class Echoes(ScanReturns):
     number: NDArray[np.uint8]  # (k,): among the reported returns of its pulse, from 1
     returns: NDArray[np.uint8]  # (k,): how many these are
     reported: Real  # (k,): distance with noise; `distance` has none
+    # (k,): packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
+    colour: NDArray[np.uint32] | None = None
 
 
 @dataclass(frozen=True)
@@ -89,6 +97,9 @@ class EchoCaster:
         # Whether each ray that hits something has one return.
         several = survey.returns.subrays > 1 or survey.noise.loses
         self._one_each = surfaces.materials.plain and not several
+        shown = any(column.name in COLOURS for column in survey.stored_columns)
+        self._textured = surfaces.materials.textured
+        self._coloured = shown or self._textured
         noisy = survey.noise.angle_deg or survey.noise.range_m or survey.noise.range_per_m
         self.plain = self._one_each and not noisy  # whether its returns are the caster's hits
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
@@ -199,28 +210,45 @@ class EchoCaster:
             groups=groups,
             tally=tally,
         )
-        energy = None
+        energy = colour = None
         if self._noise.angle_deg:
-            _, directions = poses.rays(pattern, found.ray, window[0])
-            normals = self._surfaces.normals(found.triangle, poses.times(found.ray), poses.ways)
+            origins, directions = poses.rays(pattern, found.ray, window[0])
+            times = poses.times(found.ray)
+            if self._textured:
+                ends = directions * found.distance[:, None]
+                ends += origins
+                colour = self._surfaces.colours(found.triangle, ends, times, poses.ways)
+                del ends  # which takes as much memory as the normals
+            normals = self._surfaces.normals(found.triangle, times, poses.ways)
             along = products(normals.T, directions.T)
-            energy = self._energy(sensor, found.triangle, np.abs(along), found.distance)
+            energy = self._energy(sensor, found.triangle, np.abs(along), found.distance, colour)
         one = np.ones(len(found), np.uint8)
         return Echoes(
-            **vars(found), energy=energy, number=one, returns=one, reported=found.distance
+            **vars(found),
+            energy=energy,
+            number=one,
+            returns=one,
+            reported=found.distance,
+            colour=colour,
         )
 
     def _energy(
-        self, sensor: Sensor, triangle: NDArray[np.int32], cosine: Real, distance: Real
+        self,
+        sensor: Sensor,
+        triangle: NDArray[np.int32],
+        cosine: Real,
+        distance: Real,
+        colour: NDArray[np.uint32] | None,
     ) -> Real:
-        extinction = self._survey.extinction(sensor)
-        return self._surfaces.energy(triangle, cosine, distance, extinction)
+        light = light_of(self._survey, sensor)
+        return self._surfaces.energy(triangle, cosine, distance, light, colour)
 
     def _hits(
         self, sensor: Sensor, beams: Pattern, poses: Poses, window: tuple[int, int]
     ) -> tuple[Hits, Planes]:
         """Cast sub-rays, and follow the light through glass and off mirrors."""
-        surfaces, materials = self._surfaces, self._surfaces.materials
+        surfaces = self._surfaces
+        materials = surfaces.at(sensor.optics.wavelength_nm)
         farthest = sensor.max_range_m
         found = self._caster.scan(
             beams, poses, window=window, t_min=sensor.min_range_m, t_max=farthest
@@ -238,8 +266,12 @@ class EchoCaster:
             normals = surfaces.normals(triangle, times, poses.ways)
             along = products(normals.T, directions.T)
             distance = before + step
-            energy = share * self._energy(sensor, triangle, np.abs(along), distance)
-            parts.append(Hits(ray, distance, triangle, energy))
+            colour = None
+            if self._coloured:
+                points = origins + step[:, None] * directions
+                colour = surfaces.colours(triangle, points, times, poses.ways)
+            energy = share * self._energy(sensor, triangle, np.abs(along), distance, colour)
+            parts.append(Hits(ray, distance, triangle, energy, colour))
             seen.append(normals if turns is None else np.einsum("nji,nj->ni", turns, normals))
             rows = surfaces.objects(triangle)
             on = np.flatnonzero(materials.passes[rows] | materials.mirrors[rows])
@@ -308,6 +340,7 @@ class EchoCaster:
             number=np.minimum(number[kept] + 1, 255).astype(np.uint8),
             returns=np.minimum(each[kept], 255).astype(np.uint8),
             reported=thinned.distance,
+            colour=thinned.colour,
         )
 
 
@@ -327,8 +360,8 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
 
     So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
     grazes a road illuminates all of the road between them. A return's energy is the sum over its
-    hits, its distance their mean weighted by energy, its triangle that of the strongest. Hits
-    without energy are dropped.
+    hits, its distance their mean weighted by energy, its triangle and colour those of the
+    strongest. Hits without energy are dropped.
 
     The hits of all sub-rays, `each` of a beam, are in the order of rays; `gap_m` is half of the
     pulse's length. Returns are in the order of beams and distances; their `ray` is the beam.
@@ -366,7 +399,8 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     distance = np.bincount(which, hits.energy * hits.distance) / energy
     strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
     first = strongest[numbers(which[strongest]) == 0]
-    return Hits(beam[begins], distance, hits.triangle[first], energy / each)
+    colour = None if hits.colour is None else hits.colour[first]
+    return Hits(beam[begins], distance, hits.triangle[first], energy / each, colour)
 
 
 def _continued(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cached_property
 from typing import Any
 
@@ -11,12 +12,13 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..columns.table import Column
+from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from .echoes import Echoes
 from .motion import Poses, products, turned
-from .surfaces import Surfaces
+from .surfaces import Surfaces, light_of
 
 
 class BatchReturns:
@@ -40,7 +42,13 @@ class BatchReturns:
         self.scene, self.survey = scene, survey
         self.carried = survey.carried[specs[0].sensor]
         self.sensor = self.carried.sensor
-        self.specs, self.found = specs, found
+        self.specs = specs
+        # Triangles that were hit and their hits, (k,) each: a count for every triangle of the scene
+        # would be kept for each station of a batch.
+        hits = np.zeros(0, np.int64) if found.tally is None else found.tally
+        triangles = np.flatnonzero(hits)
+        self.tally = triangles, hits[triangles]
+        self.found = replace(found, tally=None)
         self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
@@ -52,11 +60,6 @@ class BatchReturns:
     def hits(self) -> NDArray[np.int64]:
         """Returns of each scan, kept or not: (scans,)."""
         return self.found.hits
-
-    @property
-    def tally(self) -> NDArray[np.int64]:
-        """Returns of each counter of the scene, kept or not."""
-        return np.asarray(self.found.tally)
 
     def column(self, column: Column) -> NDArray[Any]:
         """Values of a column."""
@@ -245,10 +248,38 @@ class BatchReturns:
         """Received energy, see `Surfaces.energy`."""
         if self.found.energy is not None:
             return self.found.energy
-        extinction = self.survey.extinction(self.sensor)
+        light = light_of(self.survey, self.sensor)
+        colours = self._colours if self._surfaces.materials.textured else None
         return self._surfaces.energy(
-            self.found.triangle, self.cosine, self.found.distance, extinction
+            self.found.triangle, self.cosine, self.found.distance, light, colours
         )
+
+    @cached_property
+    def _colours(self) -> NDArray[np.uint32]:
+        """Packed colours."""
+        if self.found.colour is not None:
+            return self.found.colour
+        ways = self._poses.ways
+        times = self.time if ways else np.zeros(len(self), np.int64)
+        points = self.positions
+        if self.found.reported is not self.found.distance:
+            points = self.directions * self.found.distance[:, None] + self._rays[0]
+        return self._surfaces.colours(self.found.triangle, points, times, ways)
+
+    @property
+    def red(self) -> NDArray[np.uint8]:
+        """Red of the surface, sRGB."""
+        return unpacked(self._colours)[:, 0]
+
+    @property
+    def green(self) -> NDArray[np.uint8]:
+        """Green of the surface, sRGB."""
+        return unpacked(self._colours)[:, 1]
+
+    @property
+    def blue(self) -> NDArray[np.uint8]:
+        """Blue of the surface, sRGB."""
+        return unpacked(self._colours)[:, 2]
 
     @property
     def reflectivity(self) -> NDArray[np.float64]:

@@ -14,7 +14,7 @@ from raybeam import Pattern
 
 from ..scene.actors import Actor
 from ..scene.scene import Scene
-from ..sensor import Pose, ScanSpec, Survey, Trajectory
+from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
 from .device import DeviceColumns, DeviceReturns
 from .echoes import PATTERN_RAYS, EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
@@ -36,6 +36,16 @@ class _Rays(NamedTuple):
     by_head: bool = False
 
 
+def rays_repeat(sensor: Sensor, moves: bool) -> tuple[bool, bool]:
+    """Whether a sensor's rays are made once and cast again and again, and whether by its head.
+
+    By the head they are one firing, and each firing has a pose of its own.
+    """
+    fits = 0 < (sensor.period or 0) * sensor.channels <= PATTERN_RAYS
+    by_head = sensor.spins(np.zeros(1, np.int64)) is not None and (moves or not fits)
+    return fits or by_head, by_head
+
+
 class Rig:
     """Scene, survey and a ray caster that is ready; `backend` and the like as of `RayCaster`."""
 
@@ -48,9 +58,11 @@ class Rig:
         device: int | None = None,
     ) -> None:
         self.scene, self.survey = scene, survey
-        self._surfaces = Surfaces(scene, tuple(survey.materials))
+        wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
+        self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         options = {"backend": backend, "threads": threads, "device": device}
         self._world = World(scene, self._surfaces, **options)
+        self._device: DeviceColumns | None = None
         self._see()
         check_trajectory(survey.path)
         self._made: dict[tuple[int, bool], _Rays] = {}  # {(sensor, whether it moves): rays}
@@ -63,16 +75,14 @@ class Rig:
         made = self._made.get((number, moves))
         if made is None:
             sensor = self.survey.carried[number].sensor
-            period = sensor.period or 0
-            fits = 0 < period * sensor.channels <= PATTERN_RAYS
-            heads = sensor.spins(np.zeros(1, np.int64)) is not None
+            repeats, by_head = rays_repeat(sensor, moves)
             made = _Rays(None, None)
-            if heads and (moves or not fits):
+            if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
                 made = _Rays(pattern, self._echoes.divided(sensor, pattern), by_head=True)
-            elif fits:
-                made = self._rays_of(number, 0, period)
+            elif repeats:
+                made = self._rays_of(number, 0, sensor.period or 0)
             self._made[number, moves] = made
         return made
 
@@ -101,8 +111,10 @@ class Rig:
         """Make what depends on where the surfaces are."""
         given = self._world, self.scene, self.survey, self._surfaces
         self._echoes = EchoCaster(*given)
-        able = self._echoes.plain and DeviceColumns.can_make(self._world, self.survey)
-        self._device = DeviceColumns(*given) if able else None
+        if self._device is not None:
+            self._device = self._device.moved(self.scene, self._surfaces)
+        elif self._echoes.plain and self._world.caster.on_device:
+            self._device = DeviceColumns(*given)
 
     @property
     def backend(self) -> str:

@@ -37,6 +37,7 @@ from ..sensor.trajectory import CENTRE, pose_of
 from .batch import columns_of
 from .motion import check_trajectory
 from .rig import Rig
+from .surfaces import warn_of_grey
 from .world import check_backend_here
 
 SCANS_MOST = 1 << 31  # the type of the column `scan`
@@ -111,6 +112,7 @@ class Scanner:
             visibility_km=visibility_km,
         )
         check_backend_here(backend)
+        warn_of_grey(scene, survey)
         try:
             self._rig = Rig(scene, survey, backend, threads, device)
         except ValueError as error:  # of threads or device

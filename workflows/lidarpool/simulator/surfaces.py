@@ -2,28 +2,59 @@
 
 from __future__ import annotations
 
+import logging
+from collections.abc import Iterable
 from copy import copy
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
-from ..sensor import Trajectory
-from ..sensor.materials import Material, MaterialTable, at_right_angles
-from .motion import products
+from ..sensor import Sensor, Survey, Trajectory
+from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
+from .motion import into_axes, products
+
+_log = logging.getLogger(__name__)
 
 BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
+BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
 
 Triangles = NDArray[np.integer[Any]]
 Real = NDArray[np.float64]
+
+
+_NONE = np.zeros(0, np.intp)
+
+
+class Light(NamedTuple):
+    """Light of a sensor in the air."""
+
+    wavelength_nm: float
+    extinction: float  # 1/m
+
+
+def light_of(survey: Survey, sensor: Sensor) -> Light:
+    """Light of a sensor in the air of a survey."""
+    return Light(sensor.optics.wavelength_nm, survey.extinction(sensor))
+
+
+def warn_of_grey(scene: Scene, survey: Survey) -> None:
+    """Warn if a survey is to take colours for reflectance, and nothing has colours."""
+    if not scene.coloured and any(m.reflectance == "texture" for m in survey.materials):
+        _log.warning(
+            "a material has reflectance: texture, but nothing in the scene has colours, so that "
+            "all is grey; in Python, Scene.load(path, colours=True) reads them"
+        )
 
 
 class Surfaces:
     """Optical properties of triangles.
 
     Triangles are numbered by the scene's faces, then instance by instance, then by actors.
+    `wavelengths` are those of all sensors, nanometres.
 
     Raises
     ------
@@ -31,11 +62,17 @@ class Surfaces:
         If there are materials, and an object has none, or a name fits no object.
     """
 
-    def __init__(self, scene: Scene, materials: tuple[Material, ...]) -> None:
+    def __init__(
+        self,
+        scene: Scene,
+        materials: tuple[Material, ...],
+        wavelengths: Iterable[float] = (NEAR_NM,),
+    ) -> None:
         self._scene = scene
         self._standing = len(scene.names)  # objects
         self.counters = scene.counters
-        self.materials = MaterialTable.of(materials, scene.all_names)
+        names = scene.all_names
+        self._tables = {nm: MaterialTable.of(materials, names, nm) for nm in wavelengths}
         shared = scene.instances
         plain = len(scene.faces)
         sizes = np.zeros(0, np.int64) if shared is None else shared.sizes
@@ -48,6 +85,15 @@ class Surfaces:
         self.owners = np.concatenate(owned)
         if shared is not None:
             self._turns = _turns(shared.transforms)
+
+    @property
+    def materials(self) -> MaterialTable:
+        """Materials of objects, the same at all wavelengths but for their reflectance."""
+        return next(iter(self._tables.values()))
+
+    def at(self, wavelength_nm: float) -> MaterialTable:
+        """Materials of objects at the wavelength of a sensor."""
+        return self._tables[wavelength_nm]
 
     def moved(self, scene: Scene, rows: NDArray[np.intp]) -> Surfaces:
         """Return the same with some of the scene's instances in other places."""
@@ -73,14 +119,10 @@ class Surfaces:
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
         """
         normals = np.empty((3, len(triangle)))
-        rows, shared = triangle, self._scene.instances
-        if shared is not None:
-            rows, on, which = self._found(triangle)
-            local = rows[on] - self._begins[which]
-            rows[on] = self._first_normal[shared.part[which]] + local
+        rows, on, which = self._rows(triangle)
         for axis, out in zip(self.unit_normals, normals, strict=True):
             out[:] = axis.take(rows)
-        if shared is not None and len(on):
+        if len(on):
             # In one order of rounding, that of columns.cu.
             turns = self._turns[which].transpose(1, 2, 0)
             x, y, z = (products(row, normals[:, on]) for row in turns)
@@ -93,6 +135,64 @@ class Surfaces:
                 turned = (rotations * normals.T[rows, None, :]).sum(axis=2)
                 normals[:, rows] = turned.T
         return normals.T
+
+    def _rows(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
+        """Rows among the triangles that are kept once, and the others as `_found`."""
+        if self._scene.instances is None:
+            return triangle, _NONE, _NONE
+        rows, on, which = self._found(triangle)
+        local = rows[on] - self._begins[which]
+        rows[on] = self._first_of_part[self._scene.instances.part[which]] + local
+        return rows, on, which
+
+    def colours(
+        self,
+        triangle: Triangles,
+        points: Real,
+        times: Real | NDArray[np.int64],
+        ways: tuple[Trajectory, ...],
+    ) -> NDArray[np.uint32]:
+        """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
+        if self._lookup is None:
+            return np.full(len(triangle), packed(GREY[0])[0])
+        out = np.empty(len(triangle), np.uint32)
+        for begin in range(0, len(triangle), BLOCK_HITS):
+            block = slice(begin, begin + BLOCK_HITS)
+            out[block] = self._colours(triangle[block], points[block], times[block], ways)
+        return out
+
+    def _colours(
+        self, triangle: Triangles, points: Real, times: Any, ways: tuple[Trajectory, ...]
+    ) -> NDArray[np.uint32]:
+        assert self._lookup is not None
+        rows, on, which = self._rows(triangle)
+        if len(on) or ways:
+            points = points.copy()
+        if len(on):
+            assert self._scene.instances is not None
+            back = points[on] - self._scene.instances.transforms[which, :, 3]
+            points[on] = np.einsum("ni,nij->nj", back, self._turns[which])
+        objects = self.objects(triangle) if ways else None
+        for number, way in enumerate(ways, self._standing):
+            moving = np.flatnonzero(objects == number)
+            if len(moving):
+                places, rotations = way.poses(0, times[moving].astype(np.float64))
+                points[moving] = into_axes(points[moving] - places, rotations)
+        return self._lookup.at(rows, points)
+
+    @cached_property
+    def _lookup(self) -> Lookup | None:
+        """Colours of the triangles that are kept once; None if there are none."""
+        bodies = self._kept
+        colours = joined([colours for _, _, colours in bodies], [len(f) for _, f, _ in bodies])
+        if colours is None:
+            return None
+        corners = (
+            vertices[faces[begin : begin + BLOCK_FACES]]
+            for vertices, faces, _ in bodies
+            for begin in range(0, len(faces), BLOCK_FACES)
+        )
+        return Lookup(colours, corners)
 
     def bodies(self) -> tuple[NDArray[np.int64], Real]:
         """Return what bodies the triangles belong to, in the order of a world's ray caster.
@@ -112,7 +212,7 @@ class Surfaces:
         bodies: list[Any] = [[[actors - plain, -1, 0]]]
         turns = [one]
         if (shared := self._scene.instances) is not None:
-            firsts = self._first_normal[shared.part]
+            firsts = self._first_of_part[shared.part]
             bodies.insert(0, np.stack([self._begins[:-1], shared.owner, firsts], axis=1))
             turns.insert(0, self._turns)
         if plain:
@@ -141,29 +241,49 @@ class Surfaces:
         rows[on] = plain + which
         return rows
 
-    def energy(self, triangle: Triangles, cosine: Real, distance: Real, extinction: float) -> Real:
+    def energy(
+        self,
+        triangle: Triangles,
+        cosine: Real,
+        distance: Real,
+        light: Light,
+        colours: NDArray[np.uint32] | None = None,
+    ) -> Real:
         """Received energy of rays that end on triangles (n,), at distances in metres.
 
         ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
-        retro-reflector, a gain replaces the cosine.
+        retro-reflector, a gain replaces the cosine. Where materials are `textured`, the colours
+        (n,) are needed.
         """
-        scattered = self.materials.scattered(self.objects(triangle), cosine)
-        return np.asarray(scattered * at_right_angles(distance, extinction))
+        table = self.at(light.wavelength_nm)
+        bright = luminance(colours) if table.textured and colours is not None else None
+        scattered = table.scattered(self.objects(triangle), cosine, bright)
+        return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
-    @cached_property
-    def unit_normals(self) -> NDArray[np.float32]:
-        """Unit normals of all triangles, one row for each axis, the fastest layout: (3, f).
+    @property
+    def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
+        """Vertices, faces and colours of the triangles that are kept once.
 
         Those of actors follow the scene's, and those of the parts of instances follow them.
         """
         scene = self._scene
-        bodies: list[tuple[Real, Triangles]] = [(scene.vertices, scene.faces)]
-        bodies += [(actor.mesh.vertices, actor.mesh.faces) for actor in scene.actors]
+        bodies: list[tuple[Real, Triangles, Colours | None]] = [
+            (scene.vertices, scene.faces, scene.colours)
+        ]
+        meshes = [actor.mesh for actor in scene.actors]
+        bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in meshes]
         if scene.instances is not None:
-            bodies += [(part.vertices, part.faces) for part in scene.instances.parts]
-        out = np.empty((3, sum(len(faces) for _, faces in bodies)), np.float32)
+            parts = scene.instances.parts
+            bodies += [(part.vertices, part.faces, part.colours) for part in parts]
+        return bodies
+
+    @cached_property
+    def unit_normals(self) -> NDArray[np.float32]:
+        """Unit normals of `_kept`, one row for each axis, the fastest layout: (3, f)."""
+        bodies = self._kept
+        out = np.empty((3, sum(len(faces) for _, faces, _ in bodies)), np.float32)
         at = 0
-        for vertices, faces in bodies:
+        for vertices, faces, _ in bodies:
             for begin in range(0, len(faces), BLOCK_FACES):
                 block = faces[begin : begin + BLOCK_FACES]
                 a, b, c = vertices[block].transpose(1, 0, 2)
@@ -174,8 +294,8 @@ class Surfaces:
         return out
 
     @cached_property
-    def _first_normal(self) -> NDArray[np.intp]:
-        """Where the normals of each part of instances begin."""
+    def _first_of_part(self) -> NDArray[np.intp]:
+        """Rows at which the parts of instances begin."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
         return len(self.owners) - 1 + np.cumsum([0, *sizes[:-1]])

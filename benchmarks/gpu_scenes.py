@@ -43,7 +43,8 @@ def city(triangles: int, seed: int = 0) -> Mesh:
     """Streets of box-shaped buildings with panelled faces on flat ground, about `triangles`."""
     rng = np.random.default_rng(seed)
     panels, pitch = 4, 20.0
-    side = max(1, round(np.sqrt(triangles / (5 * 2 * panels**2 + 2))))
+    # Odd: there is a crossing at (pitch / 2, pitch / 2), where sensors stand.
+    side = 2 * round((np.sqrt(triangles / (5 * 2 * panels**2 + 2)) - 1) / 2) + 1
     line = np.linspace(-1, 1, panels + 1)
     a, b = (x.ravel() for x in np.meshgrid(line, line, indexing="ij"))
     one = np.ones_like(a)

@@ -1,0 +1,187 @@
+"""Times and rates on a CUDA device, and what it and its surroundings are."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import statistics
+import subprocess
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+_LEAST, _MOST = 3, 50  # times that something is measured
+_CLOCKS = ("clocks.sm", "clocks.mem", "temperature.gpu", "power.draw", "pcie.link.gen.current")
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """How much is measured; the defaults are for a device, `QUICK` is for a look."""
+
+    cities: tuple[int, ...] = (100_000, 1_000_000)  # triangles
+    large: int = 10_000_000
+    rays: int = 128 * 2048  # of a revolution
+    poses: int = 16  # revolutions of one launch
+    many: int = 1 << 31
+    forest: tuple[int, int] = (1000, 50_000)  # trees, and leaves of each
+    sample: int = 2000  # rays compared with NumPy
+    leaks: int = 10_000_000
+    batch: int = 1_000_000  # rays, as in a run
+    step_deg: float = 360  # of a scan
+    survey: int = 100_000_000  # rays
+    seconds: float = 0.7  # for one figure
+    copied: int = 1 << 26  # bytes
+
+
+QUICK = Sizes(
+    cities=(1000,), large=2000, rays=128 * 16, poses=2, many=5000, forest=(20, 100), sample=300,
+    leaks=5000, batch=14_000, step_deg=18, survey=50_000, seconds=0.05, copied=1 << 16,
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Here:
+    """What sections need."""
+
+    cupy: Any
+    sizes: Sizes
+    folder: str  # on the disk that parts are written to
+
+
+def milliseconds(here: Here, launch: Callable[[], object]) -> dict[str, float]:
+    """Median, least and greatest time of a launch on the device, by events."""
+    events = here.cupy.cuda.Event
+    launch()
+
+    def once() -> float:
+        start, stop = events(), events()
+        start.record()
+        launch()
+        stop.record()
+        stop.synchronize()
+        return float(here.cupy.cuda.get_elapsed_time(start, stop))
+
+    return _repeated(here, once)
+
+
+def wall_milliseconds(here: Here, call: Callable[[], object]) -> dict[str, float]:
+    """Median, least and greatest time of a call by the clock, until the device is done."""
+    device = here.cupy.cuda.Device()
+    call()
+
+    def once() -> float:
+        device.synchronize()
+        start = time.perf_counter()
+        call()
+        device.synchronize()
+        return 1e3 * (time.perf_counter() - start)
+
+    return _repeated(here, once)
+
+
+def _repeated(here: Here, once: Callable[[], float]) -> dict[str, float]:
+    end, times = time.monotonic() + here.sizes.seconds, [once()]
+    while len(times) < _LEAST or (len(times) < _MOST and time.monotonic() < end):
+        times.append(once())
+    return {"ms": statistics.median(times), "least_ms": min(times), "greatest_ms": max(times)}
+
+
+class Split:
+    """Adds up times of parts of the work on the device, by events."""
+
+    def __init__(self, cupy: Any) -> None:
+        self._cupy = cupy
+        self._pairs: list[tuple[str, Any, Any]] = []
+
+    @contextmanager
+    def timed(self, name: str, stream: Any = None) -> Iterator[None]:
+        """Add what is begun inside in a stream, the current one by default."""
+        stream = stream or self._cupy.cuda.get_current_stream()
+        start = stream.record()
+        yield
+        self._pairs.append((name, start, stream.record()))
+
+    def milliseconds(self) -> dict[str, float]:
+        """Return sums by name, when the device is done."""
+        self._cupy.cuda.Device().synchronize()
+        out: Counter[str] = Counter()
+        for name, start, stop in self._pairs:
+            out[name] += self._cupy.cuda.get_elapsed_time(start, stop)
+        return dict(out)
+
+
+def pinned(cupy: Any, count: int) -> Any:
+    """Make bytes in page-locked memory."""
+    return np.frombuffer(cupy.cuda.alloc_pinned_memory(count), np.uint8, count)
+
+
+def to_pinned(here: Here) -> float:
+    """GB/s of a plain copy from the device to page-locked memory: all that the bus gives."""
+    cupy, count = here.cupy, here.sizes.copied
+    array, out = cupy.zeros(count, np.uint8), pinned(cupy, count)
+    stream = cupy.cuda.get_current_stream()
+    copy = milliseconds(here, lambda: array.get(stream=stream, out=out, blocking=False))
+    return count / copy["ms"] / 1e6
+
+
+def device(here: Here) -> Iterator[tuple[str, dict[str, Any]]]:
+    """Tell what the device is, and how fast it copies."""
+    cupy, count = here.cupy, here.sizes.copied
+    runtime = cupy.cuda.runtime
+    about = runtime.getDeviceProperties(cupy.cuda.Device().id)
+    major, minor = divmod(runtime.driverGetVersion(), 1000)
+    yield (
+        "device",
+        {
+            "name": about["name"].decode(),
+            "memory_gb": round(about["totalGlobalMem"] / 1e9, 1),
+            "multiprocessors": about["multiProcessorCount"],
+            "driver_cuda": f"{major}.{minor // 10}",
+            "runtime": runtime.runtimeGetVersion(),
+            "cupy": cupy.__version__,
+            "numpy": np.__version__,
+            "python": platform.python_version(),
+            "date": time.strftime("%Y-%m-%d"),
+        },
+    )
+    array, plain, source = (
+        cupy.zeros(count, np.uint8),
+        np.zeros(count, np.uint8),
+        pinned(cupy, count),
+    )
+    other, stream = cupy.empty_like(array), cupy.cuda.get_current_stream()
+    calls = {
+        "from pinned": (milliseconds, lambda: array.set(source, stream=stream)),
+        "to touched": (wall_milliseconds, lambda: array.get(out=plain)),
+        "to fresh": (wall_milliseconds, array.get),
+        "from plain": (wall_milliseconds, lambda: array.set(plain)),
+    }
+    rates = {name: count / clock(here, call)["ms"] / 1e6 for name, (clock, call) in calls.items()}
+    copied = milliseconds(here, lambda: cupy.copyto(other, array))["ms"]
+    yield (
+        "copies, GB/s",
+        {
+            "to pinned": to_pinned(here),
+            **rates,
+            "device, read and write": 2 * count / copied / 1e6,
+        },
+    )
+
+
+def clocks() -> dict[str, str]:
+    """Clocks, temperature and power now, in the words of nvidia-smi; nothing without it."""
+    program = shutil.which("nvidia-smi")
+    if program is None:
+        return {}
+    asked = [program, f"--query-gpu={','.join(('driver_version', *_CLOCKS))}", "--format=csv"]
+    try:
+        said = subprocess.run(asked, capture_output=True, text=True, timeout=20).stdout.splitlines()
+    except (OSError, subprocess.TimeoutExpired) as error:
+        return {"error": str(error)}
+    rows = [[word.strip() for word in line.split(",")] for line in said[:2]]
+    return dict(zip(*rows, strict=True)) if len(rows) == 2 else {}

@@ -1,0 +1,60 @@
+"""Makes road.glb: a road whose lane markings are in the image of its base colour."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from PIL import Image
+from trimesh.visual import TextureVisuals
+from trimesh.visual.material import PBRMaterial
+
+LENGTH_M, WIDTH_M, PIXEL_M = 48.0, 9.6, 0.05
+ASPHALT, WHITE, YELLOW = (88, 88, 90), (236, 236, 230), (222, 176, 40)
+TURN = trimesh.transformations.rotation_matrix(-np.pi / 2, [1, 0, 0])  # from Z-up to Y-up
+
+
+def markings() -> Image.Image:
+    """Paint the road from above: edge lines, a dashed middle line, and a crossing."""
+    image = np.full((round(WIDTH_M / PIXEL_M), round(LENGTH_M / PIXEL_M), 3), ASPHALT, np.uint8)
+    for edge in (8, -12):
+        image[edge : edge + 4] = WHITE
+    middle = len(image) // 2
+    for begin in range(0, image.shape[1], 180):  # 3 m of every 9 m
+        image[middle - 2 : middle + 2, begin : begin + 60] = YELLOW
+    for begin in range(16, len(image) - 20, 20):  # 50 cm of every metre
+        image[begin : begin + 10, 560:620] = WHITE
+    return Image.fromarray(image)
+
+
+def slab(low: tuple[float, ...], high: tuple[float, ...], colour: list[float]) -> trimesh.Trimesh:
+    """Make a box of one colour, linear light."""
+    box = trimesh.creation.box(bounds=[low, high])
+    box.visual = TextureVisuals(material=PBRMaterial(baseColorFactor=[*colour, 1.0]))
+    return box
+
+
+def road() -> trimesh.Scene:
+    """Make the road, with a pavement on each side and a parked van."""
+    x, y = LENGTH_M / 2, WIDTH_M / 2
+    corners = [[-x, -y, 0], [x, -y, 0], [x, y, 0], [-x, y, 0]]
+    visual = TextureVisuals(
+        [[0, 0], [1, 0], [1, 1], [0, 1]], PBRMaterial(baseColorTexture=markings())
+    )
+    scene = trimesh.Scene()
+    parts = {
+        "Road": trimesh.Trimesh(corners, [[0, 1, 2], [0, 2, 3]], visual=visual, process=False),
+        "Pavement left": slab((-x, y, 0), (x, y + 2, 0.12), [0.4, 0.38, 0.35]),
+        "Pavement right": slab((-x, -y - 2, 0), (x, -y, 0.12), [0.4, 0.38, 0.35]),
+        "Van": slab((9, 2.2, 0.0), (14, 4.2, 2.2), [0.05, 0.12, 0.45]),
+    }
+    for name, part in parts.items():
+        scene.add_geometry(part.apply_transform(TURN), name, name)
+    return scene
+
+
+if __name__ == "__main__":
+    target = sys.argv[1] if len(sys.argv) > 1 else Path(__file__).with_name("road.glb")
+    Path(target).write_bytes(road().export(file_type="glb"))

@@ -1,0 +1,511 @@
+"""Colours of meshes: what a ray hits is what other programs read from the same file."""
+
+from __future__ import annotations
+
+import importlib.util
+import io
+import logging
+import pickle
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from tests.lidarpool.meshes import write
+from tests.lidarpool.test_gltf import glb
+from tests.lidarpool.test_masks import card
+from trimesh.visual import TextureVisuals
+from trimesh.visual.color import uv_to_color
+from trimesh.visual.material import PBRMaterial
+
+from lidarpool import (
+    Actor,
+    Column,
+    Instance,
+    LidarpoolError,
+    Material,
+    Mesh,
+    Noise,
+    Pose,
+    Returns,
+    Scanner,
+    Scene,
+    Sensor,
+    Track,
+)
+from lidarpool.columns.table import COLOURS
+from lidarpool.live.surface import Surface, colours_for
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene import masks
+from lidarpool.scene.colours import (
+    GREY,
+    LINEAR,
+    WEIGHTS,
+    Colours,
+    as_srgb,
+    luminance,
+    packed,
+    told,
+    unpacked,
+)
+from lidarpool.scene.drawn import Drawn, cut
+from lidarpool.scene.scene_file import write_scene
+from lidarpool.sensor.materials import DARKEST, reflectances
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+RNG = np.random.default_rng(7)
+BLOCKS = RNG.integers(0, 256, (6, 9, 3), dtype=np.uint8)  # 32 pixels wide and high each
+PICTURE = BLOCKS.repeat(32, axis=0).repeat(32, axis=1)
+SENSOR = Sensor.grid(rays_per_revolution=240, layers=24, vertical_fov_deg=140)
+HERE = Pose((0.3, -0.2, 1.5), yaw_deg=20)
+
+
+def hills():
+    """Vertices, faces and texture coordinates of a bumpy ground around the sensor."""
+    at = np.linspace(-5, 5, 9)
+    x, y = (a.ravel() for a in np.meshgrid(at, at))
+    first = (np.arange(8)[:, None] * 9 + np.arange(8)).ravel()
+    faces = np.concatenate(
+        [np.stack([first, first + 1, first + 10], 1), np.stack([first, first + 10, first + 9], 1)]
+    )
+    vertices = np.stack([x, y, 0.3 * np.sin(x) * np.cos(y)], axis=1)
+    return vertices, faces, RNG.uniform(0, 1, (81, 2))
+
+
+def png(colours=PICTURE):
+    out = io.BytesIO()
+    Image.fromarray(colours).save(out, "png")
+    return out.getvalue()
+
+
+def sweep(scene, *columns, sensor=SENSOR, pose=HERE, **options):
+    """A sweep, and the colours (n, 3) of its points."""
+    names: list[str | Column] = [*COLOURS, "triangle", *columns]
+    scanner = Scanner(scene, sensor, columns=names, precision_m=1e-6, backend="numpy", **options)
+    cloud = scanner.sweep(pose)
+    assert len(cloud) > 500
+    return cloud, np.stack([cloud[name] for name in COLOURS], axis=1)
+
+
+def weights(cloud, vertices, faces):
+    """Barycentric coordinates (n, 3) of points, by trimesh."""
+    corners = vertices[faces[cloud["triangle"]]]
+    return trimesh.triangles.points_to_barycentric(corners, cloud.positions.astype(float))
+
+
+@pytest.mark.parametrize("suffix", [".glb", ".obj"])
+def test_images_are_looked_up_as_trimesh_does(tmp_path, suffix):
+    vertices, faces, uv = hills()
+    picture = Image.fromarray(PICTURE)
+    looks = PBRMaterial(baseColorTexture=picture) if suffix == ".glb" else None
+    visual = TextureVisuals(uv, material=looks, image=None if looks else picture)
+    path = tmp_path / f"hills{suffix}"
+    trimesh.Trimesh(vertices, faces, visual=visual, process=False).export(path)
+    scene = Scene.load(path, up_axis="z", colours=True)
+    assert told([scene.colours]) == "1 texture"
+    cloud, found = sweep(scene)
+    at = (weights(cloud, vertices, faces)[:, :, None] * uv[faces[cloud["triangle"]]]).sum(axis=1)
+    # trimesh's elements are half a pixel off, which shows at the edges of blocks alone.
+    assert (found == uv_to_color(at, picture)[:, :3]).all(axis=1).mean() > 0.97
+
+
+@pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.obj", "a.off"])
+def test_colours_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
+    vertices, faces, _ = hills()
+    colours = RNG.integers(0, 256, (81, 3), dtype=np.uint8)
+    path = tmp_path / name
+    mesh = trimesh.Trimesh(vertices, faces, vertex_colors=colours, process=False)
+    if name == "a.off":
+        rows = [
+            f"{' '.join(map(str, [*v, *c]))} 255" for v, c in zip(vertices, colours, strict=True)
+        ]
+        rows += [f"3 {a} {b} {c}" for a, b, c in faces]
+        write(path, "\n".join([f"COFF\n81 {len(faces)} 0", *rows]))
+    else:
+        mesh.export(path, **({"encoding": "ascii"} if name == "text.ply" else {}))
+    scene = Scene.load(path, up_axis="z", colours=True)
+    assert told([scene.colours]) == "colours of vertices"
+    cloud, found = sweep(scene)
+    light = LINEAR[colours[faces[cloud["triangle"]]]]
+    want = as_srgb((weights(cloud, vertices, faces)[:, :, None] * light).sum(axis=1))
+    np.testing.assert_allclose(found.astype(int), want.astype(int), atol=1)
+    assert Scene.load(path, up_axis="z").colours is None  # unless asked for
+
+
+EFFECTS = """
+ <library_images><image id="i"><init_from>file:///C:/pictures/a%20b.png</init_from></image>
+ </library_images>
+ <library_effects>
+  <effect id="e"><profile_COMMON>
+   <newparam sid="f"><surface type="2D"><init_from>i</init_from></surface></newparam>
+   <newparam sid="s"><sampler2D><source>f</source></sampler2D></newparam>
+   <technique sid="c"><lambert><diffuse><texture texture="s" texcoord="UV"/></diffuse></lambert>
+   </technique></profile_COMMON></effect>
+  <effect id="plain"><profile_COMMON><technique sid="c"><phong>
+   <diffuse><color>1 0.5 0 1</color></diffuse></phong></technique></profile_COMMON></effect>
+ </library_effects>
+ <library_materials><material id="m"><instance_effect url="#e"/></material>
+  <material id="n"><instance_effect url="#plain"/></material></library_materials>"""
+
+
+def test_collada_has_images_and_colours(tmp_path):
+    def numbers(kind, values, width):
+        text = " ".join(map(str, values.ravel().tolist()))
+        return (
+            f'<source id="{kind}"><float_array id="{kind}a" count="{values.size}">{text}'
+            f'</float_array><technique_common><accessor source="#{kind}a" count="{len(values)}" '
+            f'stride="{width}"/></technique_common></source>'
+        )
+
+    def triangles(symbol, faces):
+        p = " ".join(f"{n} {n}" for n in faces.ravel())
+        return (
+            f'<triangles material="{symbol}" count="{len(faces)}"><input semantic="VERTEX" '
+            'source="#v" offset="0"/><input semantic="TEXCOORD" source="#t" offset="1" set="0"/>'
+            f"<p>{p}</p></triangles>"
+        )
+
+    vertices, faces, uv = hills()
+    bound = "".join(f'<instance_material symbol="{s}" target="#{s}"/>' for s in "mn")
+    write(tmp_path / "a b.png", png())
+    write(
+        tmp_path / "m.dae",
+        '<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">'
+        f"<asset><up_axis>Z_UP</up_axis></asset>{EFFECTS}"
+        f'<library_geometries><geometry id="g"><mesh>{numbers("p", vertices, 3)}'
+        f'{numbers("t", uv, 2)}<vertices id="v"><input semantic="POSITION" source="#p"/></vertices>'
+        f"{triangles('m', faces[:64])}{triangles('n', faces[64:])}</mesh></geometry>"
+        '</library_geometries><library_visual_scenes><visual_scene id="s"><node>'
+        f'<instance_geometry url="#g"><bind_material><technique_common>{bound}</technique_common>'
+        "</bind_material></instance_geometry></node></visual_scene></library_visual_scenes>"
+        "</COLLADA>",
+    )
+    scene = Scene.load(tmp_path / "m.dae", colours=True)
+    cloud, found = sweep(scene)
+    at = (weights(cloud, vertices, faces)[:, :, None] * uv[faces[cloud["triangle"]]]).sum(axis=1)
+    own = cloud["triangle"] < 64
+    want = uv_to_color(at, Image.fromarray(PICTURE))[:, :3]
+    assert (found == want).all(axis=1)[own].mean() > 0.97
+    assert (found[~own] == [255, 128, 0]).all() and not own.all()
+
+
+def opaque(texture=None, **changes):
+    """Header and buffer of a card with an image of 4 x 4 blocks, without a mask."""
+    header, body = card(png(BLOCKS[:4, :4]) if texture is None else texture, **changes)
+    header["materials"][0].pop("alphaMode")
+    return header, body
+
+
+def on_card(tmp_path, header, body):
+    """Colours of hits of a card, and u and v of each."""
+    write(tmp_path / "m.glb", glb(header, body))
+    scene = Scene.load(tmp_path / "m.glb", up_axis="z", colours=True)
+    cloud, found = sweep(scene, sensor=Sensor.grid(720, 61, 60.0), pose=Pose((0.0, 0.0, 0.0)))
+    return found, (cloud.positions[:, 1] + 2) / 4, (2 - cloud.positions[:, 2]) / 4
+
+
+@pytest.mark.parametrize("wrap", [10497, 33071, 33648])
+def test_images_go_on_as_the_file_says(tmp_path, wrap):
+    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4") * 3 - 1
+    header, body = opaque(uv=uv, sampler={"wrapS": wrap, "wrapT": wrap})
+    found, u, v = on_card(tmp_path, header, body)
+
+    def element(x):
+        at = np.floor(x * 12 - 4).astype(int)
+        if wrap == 33071:
+            return np.clip(at, 0, 3)
+        return at % 4 if wrap == 10497 else np.where(at % 8 < 4, at % 4, 3 - at % 4)
+
+    near = np.abs(np.column_stack([u, v]) * 12 % 1 - 0.5).max(axis=1) > 0.499  # of an edge
+    assert (found == BLOCKS[element(v), element(u)])[~near].all() and near.mean() < 0.1
+
+
+def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
+    header, body = opaque()
+    header["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0.25, 1, 1]
+    header["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 3
+    header["accessors"].append(
+        {
+            "bufferView": len(header["bufferViews"]),
+            "componentType": 5126,
+            "count": 4,
+            "type": "VEC3",
+        }
+    )
+    light = np.full((4, 3), [0.5, 1, 0.1], "<f4").tobytes()
+    header["bufferViews"].append({"buffer": 0, "byteOffset": len(body), "byteLength": len(light)})
+    header["buffers"][0]["byteLength"] += len(light)
+    found, u, v = on_card(tmp_path, header, body + light)
+    texels = BLOCKS[np.floor(v * 4).astype(int).clip(0, 3), np.floor(u * 4).astype(int).clip(0, 3)]
+    near = np.abs(np.column_stack([u, v]) * 4 % 1 - 0.5).max(axis=1) > 0.499
+    want = LINEAR[texels] * [0.25, 0.25, 0.1]
+    np.testing.assert_allclose(LINEAR[found][~near], want[~near], atol=0.012)
+
+
+@pytest.mark.parametrize(
+    ("change", "why"),
+    [
+        ({"texture": b"junk"}, "its image is no PNG"),
+        ({"texture": png()[:300]}, "its image cannot be decoded"),
+        ({"uv": np.full((4, 2), np.nan, "<f4")}, "infinite or too large"),
+        ({"info": {"texCoord": 3}}, "texture coordinates are missing"),
+        ({"info": {"index": 7}}, "it is broken"),
+        ({"pbrMetallicRoughness": {"baseColorFactor": "red"}}, "it is broken"),
+        ({"pbrMetallicRoughness": 3}, "it is broken"),
+    ],
+)
+def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
+    header, body = opaque(**change)
+    with caplog.at_level(logging.WARNING):
+        found, _, _ = on_card(tmp_path, header, body)
+    assert why in caplog.text and "are grey: Leaf" in caplog.text
+    assert (found == GREY[0, 0]).all()
+
+
+def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
+    write(tmp_path / "m.mtl", "newmtl a\nmap_Kd gone.png\nnewmtl b\nKd nan 2 -1\nnewmtl c\nKd x\n")
+    ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
+    write(tmp_path / "m.obj", f"{ground}usemtl a\nf 1 2 3\nusemtl b\nf 1 3 4\nusemtl c\nf 3 4 1\n")
+    scene = Scene.load(tmp_path / "m.obj", colours=True)
+    assert "its image 'gone.png' is not there" in caplog.text
+    _, found = sweep(scene)
+    assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
+
+
+def test_large_images_are_made_smaller(tmp_path, monkeypatch, caplog):
+    monkeypatch.setattr(masks, "SIDE_MOST", 36)
+    header, body = opaque(png())
+    write(tmp_path / "m.glb", glb(header, body))
+    (picture,) = Scene.load(tmp_path / "m.glb", colours=True).colours.images
+    assert picture.shape == (24, 36, 3)
+    assert "has images of 288 x 192 pixels, taken at 36 at most on a side" in caplog.text
+
+
+def textured():
+    """A mesh of the hills with an image and colours of vertices."""
+    vertices, faces, uv = hills()
+    image = (RNG.random(len(faces)) < 0.3).astype(np.int32)
+    corners = RNG.integers(100, 256, (len(faces), 3, 3), dtype=np.uint8)
+    corners[::2] = 255
+    plain = np.array([[[250, 40, 10]]], np.uint8)
+    colours = Colours((PICTURE, plain), image, uv[faces].astype(np.float32), corners)
+    return Mesh("Hills", vertices, faces, colours=colours)
+
+
+def test_instances_and_actors_have_the_colours_of_their_mesh():
+    mesh = textured()
+    turn = trimesh.transformations.rotation_matrix(0.7, [0, 0, 1], [1, 2, 0])
+    turn[:3, :3] @= np.diag([1.1, -0.9, 1.2])  # mirrored
+    flat = Scene.from_meshes([Instance(mesh, turn).flat()])
+    cloud, want = sweep(flat)
+    assert len(np.unique(want, axis=0)) > 30
+    shared = Scene.from_meshes([Instance(mesh, turn), Instance(mesh, Pose((50, 0, 0)))])
+    other, found = sweep(shared)
+    np.testing.assert_array_equal(other.positions, cloud.positions)
+    assert (found == want).all(axis=1).mean() > 0.99
+    pose = Pose((1.0, 0.5, 0.1), 50)
+    half = np.radians(25)
+    way = Track([0, 10], [pose.position] * 2, [[0, 0, np.sin(half), np.cos(half)]] * 2)
+    far = Mesh("Far", mesh.vertices, mesh.faces).moved("Far", np.eye(3), np.array([0, 0, -90]))
+    moving = Scene.from_meshes([far]).with_actors([Actor(mesh, way)])
+    _, want = sweep(Scene.from_meshes([Instance(mesh, pose), far]))
+    _, found = sweep(moving)
+    assert (found == want).all(axis=1).mean() > 0.99
+
+
+def test_an_image_is_sent_once_whatever_shares_it():
+    mesh = textured()
+    many = [Mesh(str(n), mesh.vertices, mesh.faces, colours=mesh.colours) for n in range(20)]
+    alone, all_of = (len(pickle.dumps(Scene.from_meshes(some))) for some in (many[:1], many))
+    assert all_of < 20 * alone - 15 * PICTURE.nbytes
+    assert len(Scene.from_meshes(many).colours.images) == 2
+
+
+def test_textures_are_the_reflectance(caplog):
+    bare = Mesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
+    scene = Scene.from_meshes([textured(), bare])
+    materials = [Material("*", 0.4), Material("Hills", "texture", scale=0.8)]
+    cloud, found = sweep(scene, "reflectivity", "intensity", materials=materials)
+    plain, _ = sweep(scene, "reflectivity", materials=[Material("*", 1.0)])
+    share = np.clip(0.8 * LINEAR[found] @ WEIGHTS, DARKEST, 1)
+    share[cloud["object"] == 1] = 0.4
+    np.testing.assert_allclose(cloud["reflectivity"], share * plain["reflectivity"], rtol=1e-5)
+    # What has no colour has the luminance of the default.
+    grey, found = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity",
+                        materials=[Material("*", "texture")])  # fmt: skip
+    usual, _ = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity")
+    assert (found == 188).all() and "nothing in the scene has colours" in caplog.text
+    np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
+
+
+def test_each_sub_ray_has_the_light_of_its_own_hit():
+    """Of a chequered ground, wide beams return the mean of black and white."""
+    chequers = np.indices((64, 64)).sum(axis=0) % 2
+    image = (chequers[..., None] * np.full(3, 255)).astype(np.uint8)
+    corners = np.array([[-8, -8, 0], [8, -8, 0], [8, 8, 0], [-8, 8, 0]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    uv = (corners[faces][..., :2] / 16).astype(np.float32)
+    colours = Colours((image,), np.zeros(2, np.int32), uv)
+    scene = Scene.from_meshes([Mesh("Ground", corners, faces, colours=colours)])
+    materials = [Material("*", "texture")]
+    options = {"materials": materials, "pose": Pose((0.05, 0.1, 3.0))}
+    one, _ = sweep(scene, "reflectivity", **options)
+    wide = Returns("strongest", 61, divergence_mrad=200.0)
+    many, colour = sweep(scene, "reflectivity", returns=wide, **options)
+    assert np.isin(colour, [0, 255]).all()
+    spread = [np.std(cloud["reflectivity"][cloud["reflectivity"] > 0.0]) for cloud in (one, many)]
+    assert spread[1] < 0.4 * spread[0]
+    # Noise of angles, and of ranges, moves hits and points.
+    noisy, _ = sweep(scene, "reflectivity", noise=Noise(0.05, angle_deg=0.01), **options)
+    assert np.std(noisy["reflectivity"]) == pytest.approx(spread[0], rel=0.1)
+
+
+def test_lane_markings_stand_out_in_intensity():
+    scene = Scene.load(EXAMPLES / "road.glb", up_axis="y", colours=True)
+    assert told([scene.colours]) == "1 texture, 2 plain colours"
+    materials = [Material("*", "texture"), Material("Pavement*", material="concrete, road")]
+    pose = Pose((-6.0, -2.4, 1.9))
+    sensor = Sensor.grid(rays_per_revolution=1800, layers=64, vertical_fov_deg=80)
+    cloud, found = sweep(scene, "intensity", sensor=sensor, pose=pose, materials=materials)
+    x, y, _ = cloud.positions.T
+    road, (asphalt, white) = cloud["object"] == 0, ((88, 88, 90), (236, 236, 230))
+    marking = road & (found == white).all(axis=1)
+    bare = road & (found == asphalt).all(axis=1)
+    edge = np.abs(np.abs(y) - 4.3) < 0.1
+    assert marking[road & edge].mean() > 0.95 and marking.sum() > 100
+    # Side by side, at one distance.
+    near = (np.abs(x + 6) < 2) & (y < -3.8)
+    bright, dark = (np.median(cloud["intensity"][some & near]) for some in (marking, bare))
+    assert bright > 5 * dark
+    flat = sweep(scene, "intensity", sensor=sensor, pose=pose)[0]["intensity"]
+    assert np.median(flat[marking & near]) < 1.3 * np.median(flat[bare & near])
+
+
+def test_the_script_of_the_example_makes_its_file(tmp_path):
+    spec = importlib.util.spec_from_file_location("road", EXAMPLES / "road.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    (tmp_path / "road.glb").write_bytes(module.road().export(file_type="glb"))
+    made, stored = (
+        Scene.load(folder / "road.glb", up_axis="y", colours=True)
+        for folder in (tmp_path, EXAMPLES)
+    )
+    np.testing.assert_array_equal(made.colours.means(), stored.colours.means())
+    np.testing.assert_array_equal(made.vertices, stored.vertices)
+
+
+def test_pictures_and_the_page_have_the_mean_of_each_face():
+    mesh = textured()
+    scene = Scene.from_meshes([mesh, Instance(mesh, Pose((20, 0, 0)), "Copy")])
+    means = mesh.colours.means()
+    drawn = Drawn.of(scene).scene
+    np.testing.assert_array_equal(drawn.colours.means(), np.tile(means, (2, 1)))
+    alone = Scene.from_meshes([mesh])
+    assert colours_for(alone, None) == ("grey", "hits", "object", "colour")
+    none = np.zeros(len(means)), np.zeros((0, 3), np.float32)
+    arrays, _ = Surface(alone).coloured("colour", *none)
+    np.testing.assert_allclose(arrays["colours"][:, 0], means, atol=1)
+    plain = mesh.colours.image == 1
+    assert (means[plain & (np.arange(len(means)) % 2 == 0)] == [250, 40, 10]).all()
+
+
+def test_leaves_are_drawn_in_the_colours_of_their_images(tmp_path):
+    image = np.dstack([BLOCKS[:4, :4].repeat(8, 0).repeat(8, 1), np.full((32, 32), 255, np.uint8)])
+    image[:16, :, 3] = 0  # its upper half is not there
+    header, body = card(png(image))
+    write(tmp_path / "m.glb", glb(header, body))
+    scene = Scene.load(tmp_path / "m.glb", up_axis="z", colours=True)
+    assert scene.masked
+    drawn = Drawn.of(cut(scene)).scene
+    middles, means = drawn.vertices[drawn.faces].mean(axis=1), drawn.colours.means()
+    u, v = (middles[:, 1] + 2) / 4, (2 - middles[:, 2]) / 4
+    want = BLOCKS[np.floor(v * 4).astype(int).clip(0, 3), np.floor(u * 4).astype(int).clip(0, 3)]
+    assert (means == want).all(axis=1).mean() > 0.8 and v.min() > 0.45
+
+
+def test_colours_that_do_not_fit_are_refused():
+    vertices, faces, _ = hills()
+    for colours in (
+        Colours.plain(GREY, 3),
+        Colours((GREY,), np.ones(128, np.int32)),
+        Colours((PICTURE,), np.zeros(128, np.int32)),
+        Colours((PICTURE,), np.zeros(128, np.int32), np.full((128, 3, 2), np.nan, np.float32)),
+        Colours((GREY.astype(float),), np.zeros(128, np.int32)),
+    ):
+        with pytest.raises(LidarpoolError, match="do not fit its 128 faces"):
+            Mesh("Hills", vertices, faces, colours=colours)
+
+
+@given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=1, max_size=20))
+def test_light_and_bytes_are_one_another(rows):
+    colours = np.array(rows, np.uint8)
+    np.testing.assert_array_equal(as_srgb(LINEAR[colours]), colours)
+    np.testing.assert_array_equal(unpacked(packed(colours)), colours)
+    np.testing.assert_allclose(luminance(packed(colours)), LINEAR[colours] @ WEIGHTS)
+
+
+def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
+    scene = Scene.from_meshes([Mesh("Ground", *hills()[:2])])
+    snow, white = Material("*", material="snow, melting"), Material("*", 1.0)
+    for nm, share in ((850.0, 0.70), (1064.0, 0.70), (1550.0, 0.01), (1600.0, 0.01)):
+        sensor = replace(SENSOR, optics=replace(SENSOR.optics, wavelength_nm=nm))
+        found, full = (
+            sweep(scene, "intensity", sensor=sensor, materials=[one])[0]["intensity"]
+            for one in (snow, white)
+        )
+        np.testing.assert_allclose(found, share * full, rtol=1e-5)
+
+
+def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
+    scene = Scene.from_meshes([Mesh("Ground", *hills()[:2])])
+    columns = "reflectivity", Column("cosine", "float64", "", "of incidence", "cosine")
+
+    def returned(**arguments):
+        cloud, _ = sweep(scene, *columns, materials=[Material("*", **arguments)])
+        return cloud["cosine"], cloud["reflectivity"]
+
+    cosine, matt = returned(reflectance=0.3)
+    np.testing.assert_allclose(matt, 0.3 * cosine, rtol=1e-5)
+    for roughness, metalness in ((0.2, 0.0), (0.5, 0.5), (1.0, 1.0)):
+        _, found = returned(reflectance=0.3, roughness=roughness, metalness=metalness)
+        # Cook and Torrance's D F G / (4 cos² θ), for light and receiver in one direction.
+        a, front = roughness**2, 0.04 * (1 - metalness) + 0.3 * metalness
+        d = a**2 / (np.pi * (cosine**2 * (a**2 - 1) + 1) ** 2)
+        tangent = np.sqrt(1 - cosine**2) / cosine
+        g = 1 / (1 + 2 * (np.sqrt(1 + (a * tangent) ** 2) - 1) / 2)
+        want = np.pi * cosine * d * front * g / (4 * cosine**2) + (1 - metalness) * matt
+        np.testing.assert_allclose(found, want, rtol=1e-4)
+    for wrong in ({"metalness": 0.5}, {"roughness": 0.5, "retro": True}, {"roughness": 0.0}):
+        with pytest.raises(LidarpoolError):
+            Material("*", **wrong)
+
+
+def test_names_of_materials_are_looked_up_and_contradictions_refused():
+    for arguments, why in (
+        ({"material": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
+        ({"material": "asphalt, dry", "reflectance": 0.2}, "either material or reflectance"),
+        ({"reflectance": "texture", "transparent": "pass"}, "give a number"),
+        ({"scale": 2.0}, "give reflectance texture"),
+        ({"reflectance": "textures"}, "it must be a number or one of texture"),
+    ):
+        with pytest.raises(LidarpoolError, match=why):
+            Material("*", **arguments)
+    with pytest.raises(LidarpoolError, match=r"\[0\].reflectance: given is 'white'; it must"):
+        Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
+    table = reflectances()
+    assert len(table) >= 30
+    assert all(0 < share < 1 for one in table.values() for share in one.shares)
+    assert all(one.library and one.sample for one in table.values())
+    page = (EXAMPLES.parent / "docs" / "how-to" / "materials.md").read_text("utf-8")
+    for name, (shares, library, sample) in table.items():
+        row = f"| `{name}` | {shares[0]:.2f} | {shares[1]:.2f} | {library}: {sample} |"
+        assert row in page
+
+
+def test_a_written_scene_keeps_masks_and_loses_colours(tmp_path):
+    path = write_scene(tmp_path / "m.glb", Scene.from_meshes([textured()]))
+    assert Scene.load(path, colours=True).triangles == 128

@@ -1,0 +1,92 @@
+"""The estimate of the memory that casting takes, against what it takes."""
+
+from __future__ import annotations
+
+import tracemalloc
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarpool import (
+    Beams,
+    Material,
+    Mesh,
+    Mounted,
+    Noise,
+    Returns,
+    Scene,
+    Sensor,
+    Spin,
+    Survey,
+    Track,
+    load_sensor,
+)
+from lidarpool.scene.colours import Colours
+from lidarpool.sensor.survey import OPTIONAL_NAMES
+from lidarpool.simulator.batch import columns_of
+from lidarpool.simulator.memory import TRIANGLE, cast_bytes, scans_that_fit
+from lidarpool.simulator.rig import Rig
+
+RAYS = 600_000
+
+BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
+COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
+SCENE = Scene.from_meshes(
+    [Mesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS)]
+)
+
+DELAYS = 300.0 * np.arange(128)
+MANY = Sensor(Beams(np.radians(np.linspace(-22, 22, 128)), time_ns=DELAYS), Spin(2048))
+ONE = Sensor(Beams(np.zeros(1)), Spin(20_000))
+STILL = {"poses": [(0, 0, 1)], "steps": 10_000}
+WAY = {"trajectory": Track([0, 60], [(0, 0, 1), (2, 0, 1)], [[0, 0, 0, 1], [0, 0, 1, 0]])}
+ALL = {"columns": OPTIONAL_NAMES}
+HALF = [Material("*", 0.5)]
+PAINT = {"columns": ["intensity", "red", "green", "blue"], "materials": [Material("*", "texture")]}
+
+SURVEYS = {
+    "positions": Survey(MANY, **STILL),
+    "every 5th": Survey(MANY, **STILL, keep_every=5),
+    "all columns, on the move": Survey(MANY, **WAY, **ALL),
+    "one beam, on the move": Survey(ONE, **WAY),
+    "rays that never repeat": Survey(load_sensor("livox/mid40", step_deg=30), **STILL),
+    "noise of angles": Survey(MANY, **STILL, noise=Noise(angle_deg=0.01)),
+    "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
+    "colours": Survey(MANY, **STILL, **PAINT),
+    "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
+    "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
+}
+
+
+@pytest.mark.parametrize("name", SURVEYS)
+def test_the_estimate_is_safe_and_near(name):
+    survey = SURVEYS[name]
+    rig = Rig(SCENE, survey, "embree", threads=1)
+    scans = RAYS // survey.scan(0).ray_count
+    columns_of(list(rig.cast(0, 1)))  # what is made once
+    tracemalloc.start()
+    try:
+        columns_of(list(rig.cast(0, scans)))
+        taken = tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+    assert taken < cast_bytes(SCENE, survey, scans) < 1.5 * taken
+
+
+@given(st.floats(0, 1e10), st.sampled_from(sorted(SURVEYS)))
+def test_as_many_scans_as_fit(limit, name):
+    survey = SURVEYS[name]
+    fit = scans_that_fit(SCENE, survey, limit)
+    assert 1 <= fit <= survey.scan_count
+    limit += TRIANGLE * SCENE.counters
+    assert fit == 1 or cast_bytes(SCENE, survey, fit) <= limit
+    assert fit == survey.scan_count or cast_bytes(SCENE, survey, fit + 1) > limit
+
+
+def test_the_sensor_with_the_largest_scans_counts():
+    both = Survey(sensors=[Mounted(ONE, name="one"), Mounted(MANY, name="many")], **STILL)
+    alone = Survey(MANY, **STILL, columns=["sensor"])
+    assert cast_bytes(SCENE, both) == cast_bytes(SCENE, alone)

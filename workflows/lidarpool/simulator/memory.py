@@ -1,0 +1,96 @@
+"""The memory that casting scans takes on a worker, beside that of its rig: an estimate."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from functools import partial
+
+import numpy as np
+
+from ..scene.scene import Scene
+from ..sensor import Survey
+from .device import needs_hits
+from .echoes import CHUNK_RAYS
+from .rig import rays_repeat
+
+MB = 1_000_000
+
+# Bytes, measured in `Rig.cast` and `columns_of` as the peak of tracemalloc, at a million rays that
+# all hit a sphere of 20,480 triangles: 128 beams and one, a prism, standing and moving, with all
+# columns and none, 1 to 19 sub-rays, a glass sphere around the sensor, with Embree and NumPy, which
+# differ by 30 MB at most (2026-11-22, Linux, NumPy 2.4). The estimate was 1.02 to 1.5 times that;
+# 1.64 if two returns of a pulse may be reported and there is one, 0.8 if there are always two. The
+# peak of the process (VmHWM) was 16 % above tracemalloc's at most, and mostly below.
+# tests/lidarpool/test_memory.py measures some of it again.
+RAY = 28  # its hit
+RAY_MADE, RAY_MADE_KEPT = 92, 32  # if it is not repeated: while it is made, and after that
+RAY_TURNED = 20  # by noise of angles, likewise
+RAY_AMONG_BODIES = 70  # in a scene with instances or actors
+POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
+SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
+RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
+POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
+COLOUR = 16  # of a ray, where its colour is its reflectance
+SCAN, STATION = 500, 6000  # their descriptions, poses and small arrays
+TRIANGLE = 16  # a count of hits, twice
+
+
+def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool = False) -> int:
+    """Most memory that casting so many scans and making their columns takes, if all rays hit.
+
+    They are scans of the sensor for which it is most; columns of a user's functions count as if
+    they needed as much as others. `on_device` says that a CUDA device casts the rays; its own
+    memory, some 300 MB, does not count.
+    """
+    passing = any(material.transparent != "none" for material in survey.materials)
+    dark = any(material.reflectance == 0 for material in survey.materials)
+    textured = any(material.reflectance == "texture" for material in survey.materials)
+    subrays, noise = survey.returns.subrays, survey.noise
+    echoes = subrays > 1 or noise.loses or passing or dark
+    several = survey.returns.mode in ("all", "dual") and (subrays > 1 or passing)
+    bodies = bool(scene.actors or scene.instances)
+    columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
+    noisy = noise.angle_deg or noise.range_m or noise.range_per_m
+    made_there = on_device and not (echoes or noisy)
+    # NumPy makes nothing, or all columns: then hits leave the device as well.
+    point = POINT + POINT_BYTE * columns
+    if made_there:
+        point = columns + (point if needs_hits(survey) else 0)
+    most = 0.0
+    for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
+        sensor = carried.sensor
+        first, stop = sensor.firings(0)
+        firings = (stop - first) * scans
+        rays = firings * sensor.channels
+        returns = rays * (RETURNS if several else 1)
+        points = returns / survey.keep_every
+        repeats, by_head = rays_repeat(sensor, survey.path.moves)
+        poses = firings if survey.path.moves or by_head else 0
+        here = 0 if made_there else rays  # rays whose hits are on the host
+        made = 0 if repeats else rays
+        turned = rays if noise.angle_deg and not echoes else 0
+        kept = (
+            (RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * max(made, turned)
+        )
+        casting = POSE * poses + RAY_MADE * made + RAY_TURNED * turned
+        casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
+        if echoes:
+            chunk = min(rays * subrays, CHUNK_RAYS)
+            found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
+        made_columns = point * points
+        small = SCAN * scans + STATION * (1 + scans // steps)
+        most = max(most, kept + max(casting, made_columns) + small)
+    return int(most) + TRIANGLE * scene.counters
+
+
+def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: bool = False) -> int:
+    """Find how many scans can be cast at a time in so many bytes, at least 1; see `cast_bytes`.
+
+    The counts of hits do not count: each cast takes them, and smaller ones would take no less.
+    """
+    limit += TRIANGLE * scene.counters
+    counts = range(1, survey.scan_count + 1)
+    takes = partial(cast_bytes, scene, survey, on_device=on_device)
+    return max(1, bisect_right(counts, limit, key=takes))
