@@ -54,6 +54,8 @@ def read_usd(data: bytes, path: Path) -> Content:
     """
     if find_spec("pxr") is None:
         raise MeshFileError('is OpenUSD, which usd-core reads: pip install "lidarpool[usd]"')
+    if sys.platform == "win32":  # which has no limits of memory for a process
+        raise MeshFileError("is OpenUSD, which is not read on Windows: export it as .glb")
     allowance = Allowance(0, SMALLER)  # grows by all files of the scene
     meshes: dict[int, list[Mesh]] = {}
     stage: dict[str, Any] = {}
