@@ -18,7 +18,7 @@ from tests.lidarpool.test_memory import MANY
 from tests.lidarpool.test_memory import SCENE as SPHERE
 from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
 
-from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scene, Survey, Track
+from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scanner, Scene, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarpool.pipeline import cast
 from lidarpool.scene.actors import box
@@ -206,6 +206,17 @@ def test_the_hosts_memory_is_what_was_estimated(more, scenes, backend, monkeypat
     assert cast_bytes(scenes["plain"], survey, 14, on_device=True) < cast_bytes(
         scenes["plain"], survey, 14
     )
+
+
+def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
+    sensor = MADE["few columns"].sensor
+    clouds = [
+        Scanner(scenes["both"], sensor, columns=COLUMNS, backend=name).sweep(Pose((0, 0, 1)))
+        for name in (backend, "numpy")
+    ]
+    for name, values in clouds[0].columns.items():
+        assert values.flags.owndata, name
+        assert np.array_equal(values, clouds[1].columns[name]), name
 
 
 @pytest.mark.parametrize("stations", [1, 20])
