@@ -79,10 +79,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
             chunk = min(rays * subrays, CHUNK_RAYS)
             found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
-        one_run = scans <= steps and len(survey.carried) == 1
-        point = (PAGE_LOCKED + (0 if one_run else JOINED)) * columns
         if by_numpy:  # as if it made all columns, and once more those of the device
             point = POINT + POINT_BYTE * columns + columns * made_there
+        else:
+            one_run = scans <= steps and len(survey.carried) == 1
+            point = (PAGE_LOCKED + (0 if one_run else JOINED)) * columns
         made_columns = point * points
         small = SCAN * scans + STATION * (1 + scans // steps)
         most = max(most, kept + max(casting, made_columns) + small)
