@@ -145,11 +145,16 @@ def count_bytes(scans: int) -> None:
     )
 
 
+def single_scans() -> Any:
+    """Make the batches of runs so small that each has one scan."""
+    return patch.object(lidarpool.run.run, "scans_that_fit", lambda *_, **__: 1)
+
+
 def count_batches(batches: int) -> None:
     """Print bytes a batch: what more batches of one scan add at the scheduler and at the driver."""
     ends = {}
     for count in (batches, 3 * batches):
-        with counting() as counted, patch.object(lidarpool.run.run, "scans_that_fit", lambda *_: 1):
+        with counting() as counted, single_scans():
             simulate(Scene.seed(), small_survey(count, 5))
         ends[count] = counted.work(), counted.work(driver=True)
     scheduler, driver = (np.array(ends[3 * batches]) - ends[batches]) / (2 * batches)
@@ -167,7 +172,7 @@ def sustain(parts: int) -> None:
     with (
         tempfile.TemporaryDirectory() as folder,
         cluster_in_processes({"GPU": 4, "LIDAR": 8}) as (client, processes),
-        patch.object(lidarpool.run.run, "scans_that_fit", lambda *_: 1),
+        single_scans(),
     ):
         simulate(room, first, client=client, backend="numpy")
         before = processor_seconds(processes)

@@ -31,7 +31,7 @@ class Sizes:
     forest: tuple[int, int] = (1000, 50_000)  # trees, and leaves of each
     sample: int = 2000  # rays compared with NumPy
     leaks: int = 10_000_000
-    batch: int = 1_000_000  # rays, as in a run
+    batch: int = 1_000_000  # rays
     step_deg: float = 360  # of a scan
     survey: int = 100_000_000  # rays
     seconds: float = 0.7  # for one figure

@@ -67,7 +67,7 @@ def rates(here: Here, caster: RayCaster, scan: Scan) -> dict[str, Any]:
     def pack() -> None:
         groups = Groups(scan.groups, 1)
         for (start, _, _), hit in zip(parts, found, strict=True):
-            engine._packed(hit, start, groups, 1.0, engine._uncounted)
+            engine._packed(hit, start, groups, 1.0, engine._uncounted, engine._none)
 
     times = {
         "cast": milliseconds(here, cast),

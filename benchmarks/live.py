@@ -26,6 +26,7 @@ from lidarpool.run.job import Job
 from lidarpool.run.local import local_cluster
 from lidarpool.run.run import Run
 from lidarpool.run.store import RunStore
+from lidarpool.run.watch import Waiting
 
 NEWS_S = 0.5  # as the page asks
 SCENE, POINTS = "surface?colour=grey", "points?colour=z&most=200000"
@@ -40,7 +41,8 @@ def job(poses: int) -> Job:
 
 def plain(client: Client, work: Job) -> float:
     """Seconds of a survey without a page."""
-    return Run(client, RunStore(work)).drive(None, None).survey_seconds
+    run = Run(client, RunStore(work), print, Waiting())
+    return run.drive(lambda frame: None, lambda progress: None).survey_seconds
 
 
 def watched(client: Client, work: Job) -> tuple[float, int]:
@@ -48,7 +50,7 @@ def watched(client: Client, work: Job) -> tuple[float, int]:
     with live_run(work, port=0, browser=False) as live, looking(live.page.url) as taken:
         store = RunStore(work)
         live.follow(store)
-        run = Run(client, store)
+        run = Run(client, store, print, Waiting())
         show = live.with_progress(lambda progress: None, run.partitions)
         result = run.drive(live.on_frame, show)
         live.finish(result)

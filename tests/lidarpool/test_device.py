@@ -6,6 +6,7 @@ import importlib.resources
 import pickle
 import shutil
 import subprocess
+import tracemalloc
 from dataclasses import replace
 from types import SimpleNamespace
 
@@ -13,9 +14,11 @@ import numpy as np
 import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
 from tests.lidarpool.casting import cast_between
+from tests.lidarpool.test_memory import MANY
+from tests.lidarpool.test_memory import SCENE as SPHERE
 from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
 
-from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scene, Survey, Track
+from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scanner, Scene, Survey, Track
 from lidarpool.columns.parts import pack
 from lidarpool.pipeline import cast
 from lidarpool.scene.actors import box
@@ -203,6 +206,43 @@ def test_the_hosts_memory_is_what_was_estimated(more, scenes, backend, monkeypat
     assert cast_bytes(scenes["plain"], survey, 14, on_device=True) < cast_bytes(
         scenes["plain"], survey, 14
     )
+
+
+def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):
+    sensor = MADE["few columns"].sensor
+    clouds = [
+        Scanner(scenes["both"], sensor, columns=COLUMNS, backend=name).sweep(Pose((0, 0, 1)))
+        for name in (backend, "numpy")
+    ]
+    for name, values in clouds[0].columns.items():
+        owner = values if values.base is None else values.base
+        assert isinstance(owner, np.ndarray) and owner.flags.owndata, name
+        assert np.array_equal(values, clouds[1].columns[name]), name
+
+
+@pytest.mark.parametrize("stations", [1, 20])
+@pytest.mark.parametrize("more", [(), ("azimuth",)], ids=["", "hits"])
+def test_rounded_and_joined_columns_are_in_the_estimate(more, stations, backend, monkeypatch):
+    taken = []
+
+    def rounded(size):  # as CuPy's pool does
+        taken.append(1 << (size - 1).bit_length())
+        return bytearray(size)
+
+    monkeypatch.setattr(HOST.cuda, "alloc_pinned_memory", rounded)
+    poses = [(0, 0, 1)] * stations
+    survey = Survey(MANY, poses, steps=20 // stations, columns=(*COLUMNS, *more))
+    rig = Rig(SPHERE, survey, backend)
+    tracemalloc.start()
+    try:
+        found = list(rig.cast(0, 20))
+        before = tracemalloc.get_traced_memory()[0]
+        tracemalloc.reset_peak()
+        columns_of(found)
+        joined = tracemalloc.get_traced_memory()[1] - before
+    finally:
+        tracemalloc.stop()
+    assert joined + sum(taken) < cast_bytes(SPHERE, survey, 20, on_device=True)
 
 
 @pytest.mark.parametrize("card", ["75", "120"])

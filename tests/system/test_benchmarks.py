@@ -6,7 +6,7 @@ import json
 from contextlib import contextmanager
 
 import pytest
-from benchmarks import formats, gpu, live, pipeline, scale
+from benchmarks import control, formats, gpu, live, pipeline, scale
 from distributed import Client
 from tests.clusters import thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
@@ -53,6 +53,11 @@ def test_live(tmp_path, capsys):
     assert figures["ratio"] > 0
     assert figures["megabytes_sent"] > 0  # or nobody looked
     assert "times as long" in capsys.readouterr().out
+
+
+def test_bytes_of_batches(capsys):
+    control.count_batches(5)
+    assert "a further batch of one scan adds" in capsys.readouterr().out
 
 
 def test_formats(capsys):

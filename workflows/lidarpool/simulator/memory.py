@@ -32,6 +32,9 @@ RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are co
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
+# Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns
+# of several runs of scans, by station and sensor, are joined.
+PAGE_LOCKED, JOINED = 2, 1
 SCAN, STATION = 500, 6000  # their descriptions, poses and small arrays
 TRIANGLE = 16  # a count of hits, twice
 
@@ -53,10 +56,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     noisy = noise.angle_deg or noise.range_m or noise.range_per_m
     made_there = on_device and not (echoes or noisy)
-    # NumPy makes nothing, or all columns: then hits leave the device as well.
-    point = POINT + POINT_BYTE * columns
-    if made_there:
-        point = columns + (point if needs_hits(survey) else 0)
+    by_numpy = not made_there or needs_hits(survey)
     most = 0.0
     for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
         sensor = carried.sensor
@@ -79,6 +79,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
             chunk = min(rays * subrays, CHUNK_RAYS)
             found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
+        if by_numpy:  # as if it made all columns, and once more those of the device
+            point = POINT + POINT_BYTE * columns + columns * made_there
+        else:
+            one_run = scans <= steps and len(survey.carried) == 1
+            point = (PAGE_LOCKED + (0 if one_run else JOINED)) * columns
         made_columns = point * points
         small = SCAN * scans + STATION * (1 + scans // steps)
         most = max(most, kept + max(casting, made_columns) + small)

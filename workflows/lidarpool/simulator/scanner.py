@@ -183,7 +183,12 @@ class Scanner:
         survey = rig.survey
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
         table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))
-        return columns_of([returns]).cloud(table, survey.precision_m, origin)
+        part = columns_of([returns])
+        # A device writes to page-locked memory with room for all rays: the next sweep needs it.
+        made = {column.name: part.columns[column.name] for column in table[1:]}
+        own = {name: v if v.flags.owndata else v.copy() for name, v in made.items()}
+        part = replace(part, columns={**part.columns, **own})
+        return part.cloud(table, survey.precision_m, origin)
 
     @checked
     def ranges(
