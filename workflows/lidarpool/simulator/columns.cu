@@ -2,7 +2,7 @@
 //
 // One thread a hit. CuPy compiles it without fused multiply-adds; the tests compile it for the CPU.
 // `wanted` has a bit for each column, in the order in which device.py lists them; what is not wanted
-// is neither read nor written.
+// is neither read nor written, but for channel and object, which every part has.
 
 typedef long long Count;
 

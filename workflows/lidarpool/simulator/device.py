@@ -218,9 +218,15 @@ class _Making:
         if self._begun is None:
             return {c.name: np.zeros(0, c.dtype) for c in self._maker.made}, _NO_HITS[1:]
         self._begun.outbox.wait()
-        columns = {column.name: out[: self._count] for column, out in self._begun.out.items()}
+        # Page-locked memory has room for hits of all rays: where few hit, it is given back.
+        few = 2 * self._count < self._most
+
+        def kept(out: NDArray[Any]) -> NDArray[Any]:
+            return out[: self._count].copy() if few else out[: self._count]
+
+        columns = {column.name: kept(out) for column, out in self._begun.out.items()}
         if self._begun.hits:
-            return columns, tuple(out[: self._count] for out in self._begun.hits)
+            return columns, tuple(map(kept, self._begun.hits))
         _, *hits = map(np.concatenate, zip(*self._on_actors, strict=True))
         return columns, tuple(hits)
 
