@@ -115,7 +115,7 @@ def read_obj(data: bytes, path: Path, masks: bool = True, colours: bool = False)
     textures: dict[bytes, ObjTexture] = {}  # {material: its mask}
     paint = _Paint(notes)
     used = _obj_names(b"usemtl", text) if masks or colours else []
-    kinds = {name: kind for kind, name in enumerate([b"", *used])}
+    kinds = {name: kind for kind, name in enumerate(dict.fromkeys([b"", *used]))}
     if (masks or colours) and (libraries := _obj_names(b"mtllib", text)):
         materials = Materials(path, len(data), notes, libraries)
         textures = materials.masks(used) if masks else {}
