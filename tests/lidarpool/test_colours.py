@@ -255,6 +255,7 @@ def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
         ({"info": {"texCoord": 3}}, "texture coordinates are missing"),
         ({"info": {"index": 7}}, "it is broken"),
         ({"pbrMetallicRoughness": {"baseColorFactor": "red"}}, "it is broken"),
+        ({"pbrMetallicRoughness": {"baseColorFactor": [1, 0]}}, "its factor is not red"),
         ({"pbrMetallicRoughness": 3}, "it is broken"),
     ],
 )
@@ -264,6 +265,14 @@ def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
         found, _, _ = on_card(tmp_path, header, body)
     assert why in caplog.text and "are grey: Leaf" in caplog.text
     assert (found == GREY[0, 0]).all()
+
+
+def test_colours_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
+    header, body = opaque()
+    attributes = header["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = attributes["TEXCOORD_0"]
+    found, _, _ = on_card(tmp_path, header, body)
+    assert "its COLOR_0 is not red" in caplog.text and (found == GREY[0, 0]).all()
 
 
 def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
