@@ -504,6 +504,10 @@ def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
 def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for arguments, why in (
         ({"material": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
+        ({"material": "Asphalt"}, "There are: asphalt shingle, red; asphalt, dry; asphaltic"),
+        ({"material": "limestone rock"}, "Did you mean 'limestone'"),
+        ({"material": "muddy"}, "There are: water, muddy.$"),
+        ({"material": "tar"}, "There are: aluminium, weathered; asphalt"),
         ({"material": "asphalt, dry", "reflectance": 0.2}, "either material or reflectance"),
         ({"reflectance": "texture", "transparent": "pass"}, "give a number"),
         ({"scale": 2.0}, "give reflectance texture"),
