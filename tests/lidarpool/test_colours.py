@@ -359,6 +359,20 @@ def test_textures_are_the_reflectance(caplog):
     np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
 
 
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"cloud": {"columns": ["red"]}},
+        {"materials": [{"objects": "*", "reflectance": "texture"}]},
+        {"cloud": {}},
+    ],
+)
+def test_a_scenario_notes_that_nothing_has_colours(asked):
+    scenario = Scenario.from_data(asked)
+    noted = any("needs colours" in note for note in scenario.advice(scenario.build_scene()))
+    assert noted == (asked != {"cloud": {}})
+
+
 def test_each_sub_ray_has_the_light_of_its_own_hit():
     """Of a chequered ground, wide beams return the mean of black and white."""
     chequers = np.indices((64, 64)).sum(axis=0) % 2
