@@ -136,6 +136,41 @@ def test_colours_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
     assert Scene.load(path, up_axis="z").colours is None  # unless asked for
 
 
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+{0}element face 1
+property list uchar int vertex_indices
+end_header
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "rgb"),
+    [
+        ("obj", "255 128 0"),
+        ("obj", "1 0.502 0"),
+        ("uchar", "255 128 0"),
+        ("ushort", "65535 32896 0"),
+        ("int", "255 128 0"),
+        ("float", "255 128 0"),
+        ("float", "1 0.502 0"),
+    ],
+)
+def test_colours_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
+    rows = [f"{place} {rgb}\n" for place in ("0 0 0", "1 0 0", "0 1 0")]
+    if kind == "obj":
+        path, text = tmp_path / "m.obj", "".join(f"v {row}" for row in rows) + "f 1 2 3\n"
+    else:
+        names = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+        path, text = tmp_path / "m.ply", PLY.format(names) + "".join(rows) + "3 0 1 2\n"
+    write(path, text)
+    assert Scene.load(path, colours=True).colours.means().tolist() == [[255, 128, 0]]
+
+
 EFFECTS = """
  <library_images><image id="i"><init_from>file:///C:/pictures/a%20b.png</init_from></image>
  </library_images>
