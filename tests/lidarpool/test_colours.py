@@ -136,6 +136,41 @@ def test_colours_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
     assert Scene.load(path, up_axis="z").colours is None  # unless asked for
 
 
+PLY = """ply
+format ascii 1.0
+element vertex 3
+property float x
+property float y
+property float z
+{0}element face 1
+property list uchar int vertex_indices
+end_header
+"""
+
+
+@pytest.mark.parametrize(
+    ("kind", "rgb"),
+    [
+        ("obj", "255 128 0"),
+        ("obj", "1 0.502 0"),
+        ("uchar", "255 128 0"),
+        ("ushort", "65535 32896 0"),
+        ("int", "255 128 0"),
+        ("float", "255 128 0"),
+        ("float", "1 0.502 0"),
+    ],
+)
+def test_colours_of_vertices_are_bytes_or_shares(tmp_path, kind, rgb):
+    rows = [f"{place} {rgb}\n" for place in ("0 0 0", "1 0 0", "0 1 0")]
+    if kind == "obj":
+        path, text = tmp_path / "m.obj", "".join(f"v {row}" for row in rows) + "f 1 2 3\n"
+    else:
+        names = "".join(f"property {kind} {name}\n" for name in ("red", "green", "blue"))
+        path, text = tmp_path / "m.ply", PLY.format(names) + "".join(rows) + "3 0 1 2\n"
+    write(path, text)
+    assert Scene.load(path, colours=True).colours.means().tolist() == [[255, 128, 0]]
+
+
 EFFECTS = """
  <library_images><image id="i"><init_from>file:///C:/pictures/a%20b.png</init_from></image>
  </library_images>
@@ -255,6 +290,7 @@ def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
         ({"info": {"texCoord": 3}}, "texture coordinates are missing"),
         ({"info": {"index": 7}}, "it is broken"),
         ({"pbrMetallicRoughness": {"baseColorFactor": "red"}}, "it is broken"),
+        ({"pbrMetallicRoughness": {"baseColorFactor": [1, 0]}}, "its factor is not red"),
         ({"pbrMetallicRoughness": 3}, "it is broken"),
     ],
 )
@@ -266,6 +302,14 @@ def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
     assert (found == GREY[0, 0]).all()
 
 
+def test_colours_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
+    header, body = opaque()
+    attributes = header["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = attributes["TEXCOORD_0"]
+    found, _, _ = on_card(tmp_path, header, body)
+    assert "its COLOR_0 is not red" in caplog.text and (found == GREY[0, 0]).all()
+
+
 def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
     write(tmp_path / "m.mtl", "newmtl a\nmap_Kd gone.png\nnewmtl b\nKd nan 2 -1\nnewmtl c\nKd x\n")
     ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
@@ -273,6 +317,14 @@ def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
     scene = Scene.load(tmp_path / "m.obj", colours=True)
     assert "its image 'gone.png' is not there" in caplog.text
     _, found = sweep(scene)
+    assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
+
+
+def test_faces_without_a_material_may_precede_those_with_one(tmp_path):
+    write(tmp_path / "m.mtl", "newmtl b\nKd 0 1 0\n")
+    ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
+    write(tmp_path / "m.obj", f"{ground}usemtl \nf 1 2 3\nusemtl b\nf 1 3 4\n")
+    _, found = sweep(Scene.load(tmp_path / "m.obj", colours=True))
     assert {*map(tuple, found.tolist())} == {(188, 188, 188), (0, 255, 0)}
 
 
@@ -340,6 +392,20 @@ def test_textures_are_the_reflectance(caplog):
     usual, _ = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity")
     assert (found == 188).all() and "nothing in the scene has colours" in caplog.text
     np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    "asked",
+    [
+        {"cloud": {"columns": ["red"]}},
+        {"materials": [{"objects": "*", "reflectance": "texture"}]},
+        {"cloud": {}},
+    ],
+)
+def test_a_scenario_notes_that_nothing_has_colours(asked):
+    scenario = Scenario.from_data(asked)
+    noted = any("needs colours" in note for note in scenario.advice(scenario.build_scene()))
+    assert noted == (asked != {"cloud": {}})
 
 
 def test_each_sub_ray_has_the_light_of_its_own_hit():
@@ -487,6 +553,10 @@ def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
 def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for arguments, why in (
         ({"material": "asfalt, dry"}, "Did you mean 'asphalt, dry'"),
+        ({"material": "Asphalt"}, "There are: asphalt shingle, red; asphalt, dry; asphaltic"),
+        ({"material": "limestone rock"}, "Did you mean 'limestone'"),
+        ({"material": "muddy"}, "There are: water, muddy.$"),
+        ({"material": "tar"}, "There are: aluminium, weathered; asphalt"),
         ({"material": "asphalt, dry", "reflectance": 0.2}, "either material or reflectance"),
         ({"reflectance": "texture", "transparent": "pass"}, "give a number"),
         ({"scale": 2.0}, "give reflectance texture"),

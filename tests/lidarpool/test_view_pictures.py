@@ -72,6 +72,15 @@ def test_intensity_colours_what_was_hit_and_only_that(pixels, scene):
     assert colourful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay grey"
 
 
+def test_shares_of_hits_are_counted_whole(scene):
+    """Counts of instances are shared among their triangles, so their sum may be just below."""
+    shot = take_shot(scene, [], size=SIZE, backend="numpy")
+    hits = np.zeros(len(scene.faces))
+    hits[:3] = 1 / 3 - 1e-12
+    texts = [text.get_text() for text in draw_intensity(shot, hits, NOWHERE, NONE).figure.texts]
+    assert any(text.startswith("1 hit ") for text in texts)
+
+
 def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
     """A floor of 8 by 4 metres, with hits on its left half alone: no diagonal between colours."""
     corners = np.array([[0, 0, 0], [8, 0, 0], [8, 4, 0], [0, 4, 0]], float)

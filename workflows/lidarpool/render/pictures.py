@@ -91,7 +91,7 @@ def draw_intensity(
     page.lines(axes, shot, sample_rays[rays].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(*limits), "hits per square metre; grey: none")
     page.title(
-        "Ray intensity", f"{counted(int(hit_counts.sum()), 'hit')} · {shot.when}", shot.models
+        "Ray intensity", f"{counted(round(hit_counts.sum()), 'hit')} · {shot.when}", shot.models
     )
     return page
 

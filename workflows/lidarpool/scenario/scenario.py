@@ -276,12 +276,20 @@ class Scenario(Section):
         if self._remarks[1:]:
             notes[-1] += f"; {counted(len(self._remarks) - 1, 'more file')}, too"
         poses = self._of_poses(scene)  # first, because that finds out whether it is an object
-        return [*notes, *filter(None, (self._of_size(scene), poses))]
+        return [*notes, *filter(None, (self._of_size(scene), poses, self._of_colours(scene)))]
 
     @property
     def colours(self) -> dict[str, str]:
         """Colours that `build_scene` found: {mesh file: what it has}; empty if it read none."""
         return dict(self._colours)
+
+    def _of_colours(self, scene: Scene) -> str:
+        if scene.coloured or not self.coloured:
+            return ""
+        return (
+            "a column or reflectance: texture needs colours, but nothing in the scene has any, so "
+            "that all is grey"
+        )
 
     def _of_size(self, scene: Scene) -> str:
         files = [entry.file for entry in self.scene.files if entry.unit is None]

@@ -246,6 +246,8 @@ class _Reader:
         if "COLOR_0" in primitive["attributes"]:
             light = self._normalised(self._attribute("COLOR_0", primitive, mesh))
             check_corners(faces, len(light))
+            if light.shape[1] < 3:
+                raise MaskError("its COLOR_0 is not red, green and blue")
             corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
             colours = Colours.plain(WHITE, len(faces))
         if number is not None:
@@ -261,6 +263,8 @@ class _Reader:
         material = self._part("materials", number)
         info, factor = _base_of(material)
         light = tuple(float(np.clip(one, 0, 1)) for one in factor[:3])
+        if len(light) < 3:
+            raise MaskError("its factor is not red, green and blue")
         if info is None:
             return as_srgb(light).reshape(1, 1, 3), {}
         texture = self._part("textures", info["index"])

@@ -115,7 +115,7 @@ def read_obj(data: bytes, path: Path, masks: bool = True, colours: bool = False)
     textures: dict[bytes, ObjTexture] = {}  # {material: its mask}
     paint = _Paint(notes)
     used = _obj_names(b"usemtl", text) if masks or colours else []
-    kinds = {name: kind for kind, name in enumerate([b"", *used])}
+    kinds = {name: kind for kind, name in enumerate(dict.fromkeys([b"", *used]))}
     if (masks or colours) and (libraries := _obj_names(b"mtllib", text)):
         materials = Materials(path, len(data), notes, libraries)
         textures = materials.masks(used) if masks else {}
@@ -150,7 +150,7 @@ def read_obj(data: bytes, path: Path, masks: bool = True, colours: bool = False)
     vertices = np.frombuffer(numbers).reshape(-1, 3)
     uv = np.frombuffer(coordinates).reshape(-1, 2)
     if len(tints) == len(numbers):
-        paint.tints = as_bytes(np.frombuffer(tints).reshape(-1, 3))
+        paint.tints = as_bytes(_shares(np.frombuffer(tints).reshape(-1, 3)))
     paint.names, paint.uv = list(kinds), uv
     meshes = []
     for name, part in parts.items():
@@ -284,9 +284,13 @@ def read_off(data: bytes, path: Path, colours: bool = False) -> Content:
     vertices = np.frombuffer(numbers).reshape(-1, 3)
     faces, shown = polygon.faces(vertices), None
     if coloured and len(tints) == len(numbers):
-        given = np.frombuffer(tints).reshape(-1, 3)
-        shown = _tinted(given / (255 if given.max(initial=0) > 1 else 1), faces)
+        shown = _tinted(_shares(np.frombuffer(tints).reshape(-1, 3)), faces)
     return Content(_mesh(path.stem, vertices, faces, colours=shown))
+
+
+def _shares(colours: Float) -> Float:
+    """Shares of colours that are written as 0 to 1 or, if one is above 1.5, as 0 to 255."""
+    return colours / (255 if (colours > 1.5).any() else 1)
 
 
 def _tinted(shares: Float, faces: Int) -> Colours:
@@ -355,7 +359,7 @@ class _Element:
 def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
     """Read a Stanford polygon file: text or binary, faces of any mixture.
 
-    `colours` are red, green and blue of its vertices: bytes, or real numbers from 0 to 1.
+    `colours` are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
     """
     elements, order, body = _ply_header(data)
     counts = {element.name: element.count for element in elements}
@@ -384,9 +388,10 @@ def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
     faces, shown = triangulated(vertices, corners, sizes), None
     if colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
         given = np.stack([rows["vertex"][name][0] for name in _PLY_COLOURS], axis=1)
-        whole = kinds.get("red", "f4")[0] in "iu"
-        most = np.iinfo(kinds["red"]).max if whole else 1
-        shown = _tinted(given.astype(np.float64) / most, faces)
+        given, kind = given.astype(np.float64), np.dtype(kinds["red"])
+        # Integers of four bytes hold 0 to 255, too.
+        small = kind.kind in "iu" and kind.itemsize < 4
+        shown = _tinted(given / np.iinfo(kind).max if small else _shares(given), faces)
     return Content(_mesh(path.stem, vertices, faces, colours=shown))
 
 

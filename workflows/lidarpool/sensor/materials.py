@@ -125,10 +125,8 @@ class Material:
         object.__setattr__(self, "objects", names)
         if self.material is not None:
             if self.material not in (known := reflectances()):
-                raise LidarpoolError(
-                    f"There is no material {self.material!r}."
-                    + (did_you_mean(self.material, known) or f" There are: {'; '.join(known)}.")
-                )
+                there = _materials_like(self.material, [*known])
+                raise LidarpoolError(f"There is no material {self.material!r}.{there}")
             if self.reflectance is not None:
                 raise LidarpoolError("give either material or reflectance, not both.")
         if self.reflectance == "texture":
@@ -160,6 +158,14 @@ class Material:
     def named(self, name: str) -> bool:
         """Whether this material applies to an object."""
         return any(name == pattern or fnmatchcase(name, pattern) for pattern in self.objects)
+
+
+def _materials_like(name: str, known: Sequence[str]) -> str:
+    """Name the materials that contain a word, such as «asphalt», or else the nearest, or all."""
+    some = [one for one in known if name.lower() in one.lower()]
+    if len(some) > 1:
+        return f" There are: {'; '.join(some)}."
+    return did_you_mean(name, some or known) or f" There are: {'; '.join(some or known)}."
 
 
 def rows_named(pattern: str, names: Sequence[str]) -> NDArray[np.intp]:
