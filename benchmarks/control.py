@@ -32,7 +32,7 @@ import numpy as np
 import psutil
 from distributed import Client
 
-import lidarpool.run.run
+import lidarpool.pipeline.policies
 from lidarpool import Scene, Sensor, Survey, simulate
 from lidarpool.scene.actors import box
 
@@ -146,8 +146,8 @@ def count_bytes(scans: int) -> None:
 
 
 def single_scans() -> Any:
-    """Make the batches of runs so small that each has one scan."""
-    return patch.object(lidarpool.run.run, "scans_that_fit", lambda *_, **__: 1)
+    """Make the batches of runs so small that each has one scan; tasks still have several."""
+    return patch.object(lidarpool.pipeline.policies, "most_scans", lambda *_: 1)
 
 
 def count_batches(batches: int) -> None:
