@@ -467,10 +467,11 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
     Returns the requests under way. A worker that does not answer is in the log.
     """
 
-    # Nested, so that it is sent by value. A worker that is closing has taken it off already, for
-    # which Dask's own `plugin-remove` would write a traceback into its log.
+    # Nested, so that it is sent by value. A worker that is closing takes its plugins off itself;
+    # of two that take one off, Dask's writes a traceback into the log.
     def remove(dask_worker: Any = None) -> None:
-        if found := dask_worker.plugins.pop(name, None):
+        closing = dask_worker.status.name in ("closing", "closed")
+        if not closing and (found := dask_worker.plugins.pop(name, None)):
             found.teardown(dask_worker)
 
     if plugin is None:
