@@ -321,7 +321,7 @@ def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
 
 
 def test_faces_without_a_material_may_precede_those_with_one(tmp_path):
-    write(tmp_path / "m.mtl", "newmtl b\nKd 0 1 0\n")
+    write(tmp_path / "m.mtl", "\ufeffnewmtl b\nKd 0 1 0\n")  # as some editors begin files
     ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
     write(tmp_path / "m.obj", f"{ground}usemtl \nf 1 2 3\nusemtl b\nf 1 3 4\n")
     _, found = sweep(Scene.load(tmp_path / "m.obj", colours=True))

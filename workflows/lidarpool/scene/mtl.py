@@ -229,7 +229,8 @@ def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
     """Find what a file says of materials."""
     entries: dict[bytes, _Entry] = {}
     entry = _Entry()
-    for line in data.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
+    text = data.removeprefix(b"\xef\xbb\xbf")  # the mark of some editors on Windows
+    for line in text.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
         key, _, rest = line.strip().partition(b" ")
         if key == b"newmtl":
             entry = entries.setdefault(rest.strip(), _Entry())
