@@ -76,6 +76,11 @@ class Noise:
         """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None
 
+    @property
+    def displaces(self) -> bool:
+        """Whether directions or ranges deviate."""
+        return self.angle_deg > 0 or self.range_m > 0 or self.range_per_m > 0
+
     def ranges(self, distance: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
         """Return the reported ranges of returns (n,), metres, at least 0."""
         sigma = self.range_m + self.range_per_m * distance

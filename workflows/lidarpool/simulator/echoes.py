@@ -100,8 +100,8 @@ class EchoCaster:
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._textured = surfaces.materials.textured
         self._coloured = shown or self._textured
-        noisy = survey.noise.angle_deg or survey.noise.range_m or survey.noise.range_per_m
-        self.plain = self._one_each and not noisy  # whether its returns are the caster's hits
+        # Whether its returns are the caster's hits.
+        self.plain = self._one_each and not survey.noise.displaces
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.bounds).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
