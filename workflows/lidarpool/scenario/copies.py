@@ -59,9 +59,7 @@ class Standing:
                 hint = (
                     did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
                 )
-                raise LidarpoolError(
-                    f"scatter.surfaces names {name!r}, but no object has that name.{hint}"
-                )
+                raise LidarpoolError(f"surfaces names {name!r}, but no object has that name.{hint}")
         found = np.unique(np.concatenate(rows))
         made = self if len(found) == len(scene.names) else Standing(scene, found)
         if not len(made._tops[0]):

@@ -15,6 +15,7 @@ from ..base.errors import prefixed
 from ..sensor import Mounted, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
+from ..sensor.trajectory import Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import Lengths, MeshEntry, PoseSection, Section, SensorSection, told
 
@@ -86,6 +87,13 @@ class TrajectorySection(Section):
     duration_s: Annotated[
         Duration | None, told("duration of the survey; by default to the end")
     ] = None
+    beyond: Annotated[
+        Beyond,
+        told(
+            "of actors, before the first and after the last time: an error (refuse), the same "
+            "pose (hold), or not in the scene (absent)"
+        ),
+    ] = "refuse"
 
     @model_validator(mode="after")
     def _one_source(self) -> TrajectorySection:
@@ -113,6 +121,7 @@ class TrajectorySection(Section):
                 smooth=smooth,
                 start_s=start_s,
                 duration_s=self.duration_s,
+                beyond=self.beyond,
             )
             return replace(track, positions=track.positions - origin)
         angles = [[p.yaw_deg, p.pitch_deg, p.roll_deg] for p in self.points]
@@ -124,6 +133,7 @@ class TrajectorySection(Section):
             smooth,
             start_s,
             self.duration_s,
+            self.beyond,
         )
 
 
