@@ -194,26 +194,50 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
     assert len(packed.build_scene().actors) == 3
 
 
+RAMP = "o Ramp\nv 0 0 0\nv 18.5 0 1.85\nv 18.5 9 1.85\nv 0 9 0\nf 1 2 3\nf 1 3 4\n"
+UPHILL = np.array([10, 0, 1]) / 101**0.5
+
+
 def test_traffic_stands_on_surfaces_and_is_absent_beside_them(tmp_path):
-    """On a ramp of 10 % to x 18.5, which the car leaves when its front does."""
-    (tmp_path / "ramp.obj").write_text(
-        "o Ramp\nv 0 0 0\nv 18.5 0 1.85\nv 18.5 9 1.85\nv 0 9 0\nf 1 2 3\nf 1 3 4\n"
-    )
+    (tmp_path / "ramp.obj").write_text(RAMP)
     steps = "".join(
-        f'<timestep time="{k}"><vehicle id="c" x="{6 + 2 * k}" y="5" angle="90" type="car"/>'
+        f'<timestep time="{k}"><vehicle id="c" x="{2 * k}" y="5" z="9" angle="90" type="car"/>'
         "</timestep>"
-        for k in range(9)
+        for k in range(15)
     )
     read = scenario(
         tmp_path, f"<fcd-export>{steps}</fcd-export>", {"surfaces": "Ramp"},
-        scene={"files": "ramp.obj"}, steps=36 * 70,
+        scene={"files": "ramp.obj"}, steps=36 * 140,
     )  # fmt: skip
     (car,) = read.build_scene().actors
-    assert car.trajectory.presence_ns[1] == 6e9
-    places, turns = car.trajectory.poses(0, np.array([2e9]))
-    slope = np.array([10, 0, 1]) / 101**0.5
-    np.testing.assert_allclose(turns[0, :, 0], slope, atol=1e-9)
-    np.testing.assert_allclose(places[0], np.array([10, 5, 1]) - 2 * slope, atol=1e-9)
+    # Its middle is 2 m behind the front, and on the ramp until x is 18.5.
+    np.testing.assert_allclose(car.trajectory.presence_ns, (1e9, 10.25e9), atol=0.26e9)
+    places, turns = car.trajectory.poses(0, np.array([3.1e9]))
+    np.testing.assert_allclose(places, [[4.2, 5, 0.42]], atol=1e-9)
+    np.testing.assert_allclose(turns[0, :, 0], UPHILL, atol=1e-9)
+
+
+def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path):
+    (tmp_path / "ramp.obj").write_text(RAMP)
+    points = [{"time_s": t, "position": [18 - 2 * t, 5, 0.3]} for t in (0, 8)]
+
+    def read(points):
+        return Scenario.from_data(
+            {"scene": "ramp.obj", "trajectory": {"points": points, "surfaces": "Ramp"}},
+            folder=tmp_path,
+        )
+
+    downhill = read(points)
+    scene = downhill.build_scene()
+    path = downhill.survey(scene).path
+    assert path.duration_ns == 8e9
+    places, turns = path.poses(0, np.array([0, 1.3e9, 8e9]))
+    np.testing.assert_allclose(places[:, 2], [2.1, 1.84, 0.5], atol=1e-9)
+    np.testing.assert_allclose(turns[:, :, 0], np.tile(-UPHILL, (3, 1)), atol=1e-9)
+    np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-9)
+    points[1]["position"] = [30, 5, 0]
+    with pytest.raises(LidarpoolError, match=r"leaves its surfaces \(Ramp\)"):
+        read(points).survey(scene)
 
 
 def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_path):

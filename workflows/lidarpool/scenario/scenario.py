@@ -28,10 +28,10 @@ from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
-from .copies import Standing, copies_of
+from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .placing import Placing, inside_note, place
 from .sections import (
@@ -53,6 +53,7 @@ from .sections import (
     scene_in_short,
     told,
 )
+from .standing import Standing
 from .traffic import TrafficSection, VehicleSection, actors_of, read_fcd
 from .validation_errors import validation_errors
 
@@ -180,6 +181,8 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
     _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
+    # Triangles of a scene, and the trajectory there.
+    _way: tuple[Any, Track] | None = PrivateAttr(default=None)
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -327,7 +330,7 @@ class Scenario(Section):
         if self.scene.has_seed:
             return ""
         if self.trajectory is not None:
-            track = self.trajectory.track(self._folder, scene.origin)
+            track = self._track(scene)
             at, _ = track.poses(0, np.linspace(0, track.duration_ns, _LOOKED_FROM))
         else:
             positions = [pose.position for pose in self._world_poses(scene)]
@@ -357,7 +360,22 @@ class Scenario(Section):
         scene = Scene.from_meshes(meshes)
         if self.scene.ground is not None:
             scene = Scene.from_meshes([*meshes, self._ground(scene)])
-        return replace(scene, actors=(*self._actors(scene.origin), *self._traffic(scene)))
+        if not (self.actors or self.traffic):
+            return scene
+        standing = Standing(scene)
+        with prefixed(self._source):
+            start = 0.0 if self.trajectory is None else self._track(scene, standing).start_s
+        assert start is not None  # of every track
+        actors = (*self._actors(standing, start), *self._traffic(scene, standing, start))
+        return replace(scene, actors=actors)
+
+    def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
+        """Return the trajectory in the coordinates of a scene; it is made once."""
+        assert self.trajectory is not None
+        if self._way is None or self._way[0] is not scene.faces:
+            way = self.trajectory.track(self._folder, standing or Standing(scene))
+            self._way = (scene.faces, way)
+        return self._way[1]
 
     def _copies(self, base: list[Mesh | Instance]) -> list[Instance]:
         """Place the copies; they stand on other objects and on the ground, not on one another."""
@@ -398,13 +416,12 @@ class Scenario(Section):
         corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
         return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
-    def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
+    def _actors(self, standing: Standing, start_s: float) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
         shapes: dict[Any, Mesh] = {}
         meshes = [replace(self._shape(entry, shapes), name=entry.name) for entry in self.actors]
         with prefixed(self._source):
-            start = self._start_s(origin)
-            ways = [entry.way(self._folder, origin, start) for entry in self.actors]
+            ways = [entry.way(self._folder, standing, start_s) for entry in self.actors]
         return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
 
     def _shape(
@@ -420,34 +437,25 @@ class Scenario(Section):
                 made[shape] = box(name, shape)
         return made[shape]
 
-    def _traffic(self, scene: Scene) -> list[Actor]:
+    def _traffic(self, scene: Scene, standing: Standing, start_s: float) -> list[Actor]:
         """Vehicles and persons that are there during the survey."""
-        section, standing = self.traffic, None
+        section = self.traffic
         if section is None:
             return []
-        start, duration = self._start_s(scene.origin), self.survey(scene).duration_ns / 1e9
+        duration = self.survey(scene).duration_ns / 1e9
         with prefixed(self._source):
             path = self._path(section.file)
-            begin = start - section.offset_s
+            begin = start_s - section.offset_s
             passages, count = read_fcd(path, begin, begin + duration)
-            if section.surfaces is not None:
-                standing = Standing(scene).only(section.surfaces)
             shapes: dict[Any, Mesh] = {}
             actors = actors_of(
-                section, passages, lambda entry: self._shape(entry, shapes), standing, start,
-                scene.origin,
-            )  # fmt: skip
+                section, passages, lambda entry: self._shape(entry, shapes), standing, start_s
+            )
         self._notes.append(
             f"{section.file}: {counted(len(actors), 'actor')} during the survey, of "
             f"{counted(count, 'vehicle')} and persons until its end"
         )
         return actors
-
-    def _start_s(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-        """Start of the survey by the clock of its trajectory."""
-        if self.trajectory is None:
-            return 0.0
-        return self.trajectory.track(self._folder, origin).start_s or 0.0
 
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, and those of actors and copies that have a class of their own."""
@@ -484,7 +492,7 @@ class Scenario(Section):
         with prefixed(self._source):
             track, poses, carried = None, [], self._carried()
             if self.trajectory is not None:
-                track = self.trajectory.track(self._folder, scene.origin)
+                track = self._track(scene)
             else:
                 poses = [
                     replace(pose, position=tuple(np.subtract(pose.position, scene.origin)))

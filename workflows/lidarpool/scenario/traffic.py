@@ -28,8 +28,8 @@ from ..sensor.calibrations import said
 from ..sensor.materials import SemanticClass
 from ..sensor.trajectory import quaternions_of, rotations_of
 from ..sensor.trajectory_files import Seconds
-from .copies import Standing
 from .sections import Lengths, MeshEntry, Section, told
+from .standing import Standing, following
 
 ACTORS_MOST = 10_000
 _PIECE = 1 << 20  # bytes of a file that are read at a time
@@ -188,9 +188,8 @@ def actors_of(
     section: TrafficSection,
     passages: list[Passage],
     shape_of: Callable[[VehicleSection], Mesh],
-    standing: Standing | None,
+    standing: Standing,
     start_s: float,
-    origin: Float,
 ) -> list[Actor]:
     """Make actors of passages, in a scene's local coordinates.
 
@@ -199,8 +198,8 @@ def actors_of(
     shape_of
         Returns the mesh of an entry of `section.vehicles`.
     standing
-        What they stand on, if `section.surfaces` are given; where there is nothing to stand on,
-        they are not in the scene.
+        What they stand on, if `section.surfaces` are given; where there is nothing, they are not
+        in the scene.
     start_s
         Start of the survey.
 
@@ -209,40 +208,25 @@ def actors_of(
     LidarpoolError
         If a type has no shape, or there are too many.
     """
-    actors = []
+    actors: list[Actor] = []
+    follows = section.surfaces and standing.only(section.surfaces)
     for one in passages:
         entry = section.shape_of(one.kind)
         mesh = shape_of(entry)
         times = np.array(one.times_s) + section.offset_s
         x, y, z, angle, slope = np.array(one.rows).reshape(-1, len(_ROW)).T
         fronts = np.column_stack([x, y, z]) + section.translation
+        if follows:
+            fronts[:, 2], slope = section.translation[2], 0 * slope
         # Angles are clockwise from north, and slopes positive uphill.
-        angles = np.column_stack([90.0 - angle, -slope, np.zeros(len(x))])
-        runs = [slice(None)]
-        if standing is not None:
-            rear, foremost = mesh.vertices[:, 0].min(), mesh.vertices[:, 0].max()
-            ahead = rotations_of(angles * [1, 0, 0])[:, :2, 0]
-            heights, _ = standing.under(fronts[:, :2])
-            behind, _ = standing.under(fronts[:, :2] - ahead * (foremost - rear))
-            fronts[:, 2] = heights
-            angles[:, 1] = -np.degrees(np.arctan2(heights - behind, foremost - rear))
-            there = np.isfinite(heights + behind)
-            edges = np.flatnonzero(np.diff(there, prepend=False, append=False)).reshape(-1, 2)
-            runs = [slice(begin, end) for begin, end in edges.tolist() if end - begin > 1]
-        for run in runs:
-            turns = rotations_of(angles[run])
-            # SUMO places the middle of the front bumper.
-            places = fronts[run] - turns[:, :, 0] * mesh.vertices[:, 0].max() - origin
-            track = Track(
-                times[run],
-                places,
-                quaternions_of(turns),
-                section.interpolation == "smooth",
-                start_s,
-                beyond="absent",
-            )
-            name = f"{entry.name or one.kind} ({one.name})"
-            actors.append(Actor(replace(mesh, name=name), track))
+        turns = rotations_of(np.column_stack([90.0 - angle, -slope, np.zeros(len(x))]))
+        # SUMO places the middle of the front bumper.
+        places = fronts - turns[:, :, 0] * mesh.vertices[:, 0].max() - standing.origin
+        smooth = section.interpolation == "smooth"
+        way = Track(times, places, quaternions_of(turns), smooth, start_s, beyond="absent")
+        ways = following(way, follows) if follows else [way]
+        named = replace(mesh, name=f"{entry.name or one.kind} ({one.name})")
+        actors += [Actor(named, way) for way in ways]
         if len(actors) > ACTORS_MOST:
             raise LidarpoolError(
                 f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "
