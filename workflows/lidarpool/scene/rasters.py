@@ -11,6 +11,8 @@ import math
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import cached_property
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -35,9 +37,9 @@ SUFFIXES = (*_DRIVERS,)
 _BESIDE = {".tif": ".tfw", ".tiff": ".tfw", ".asc": ".prj"}
 _BESIDE_MOST = 65536  # bytes
 
-# GDAL's own overviews may be made by any resampling, and may be other files.
-_OPTIONS = {"GTiff": {"OVERVIEW_LEVEL": "NONE"}, "AAIGrid": {"DATATYPE": "Float64"}}
+_OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with integers has no others
 
+_AT_ONCE = 100_000  # vertices that are reprojected, through lists
 _PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
 _MOST_READ = 4 * 10**9  # pixels of which a coarser grid is made; GDAL reads some 10⁸ a second
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
@@ -85,29 +87,27 @@ def read_raster(
     with ExitStack() as stack:
         source = stack.enter_context(_opened(data, path))
         own, up_m = _systems(source)
-        target = _target(source, own, epsg)
-        grid, place, window = _grid(stack, source, own, target, step_m, window)
-        columns, rows = _part(grid, place, window)
-        _check_size(place, columns, rows)
-        band = grid.read(1, window=(rows, columns), masked=True)
+        grid = _Grid(source, _place(source), own, _target(source, own, epsg))
+        if step_m is not None:
+            grid, window = stack.enter_context(_coarser(grid, step_m, window)), None
+        columns, rows = grid.part(window)
+        _check_size(grid, columns, rows)
+        band = grid.file.read(1, window=(rows, columns), masked=True)
         heights = np.ma.getdata(band).astype(np.float64)
         valid = ~np.ma.getmaskarray(band) & np.isfinite(heights)
         del band
-        notes = _notes(source, own)
+        notes = _notes(source, own, path)
         metre = UNITS_M[unit] if unit else _unit_m(source.units[0], own, up_m, notes)
         heights = (heights * source.scales[0] + source.offsets[0]) * metre
-        code = None if target is None else _code(target)
-        crs = "" if target is None else f"EPSG:{code}" if code else target.to_wkt()
-        taken = Raster(crs, code, _told(source, own, target, place, step_m, valid))
-    x, y = _positions(place, columns, rows)
-    mesh = _mesh(path.stem, x, y, heights, valid)
+        mesh = _mesh(path.stem, grid, columns, rows, heights, valid)
+        told = _told(source, own, grid, step_m, valid)
     low, high = mesh.bounds[:, 2]
     if not _LOWEST_M <= low <= high <= _HIGHEST_M:
         notes.append(
             f"has heights from {low:,.6g} to {high:,.6g} m: if one of them stands for no data, say "
             "so in the file (rio edit-info --nodata VALUE FILE)"
         )
-    return Content([mesh], 1.0, "z", notes=notes, raster=taken)
+    return Content([mesh], 1.0, "z", notes=notes, raster=Raster(*_key(grid.target), told))
 
 
 @contextmanager
@@ -125,12 +125,24 @@ def _opened(data: bytes, path: Path) -> Iterator[Any]:
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
         stack.enter_context(rasterio.Env(GDAL_CACHEMAX=LEAST, GDAL_PAM_ENABLED=False))
         folder = uuid4().hex
+        stack.enter_context(_named(f"/vsimem/{folder}/"))
         if (beside := _BESIDE.get(suffix)) and (content := _beside(path, beside)):
             stack.enter_context(MemoryFile(content, dirname=folder, filename=f"{stem}{beside}"))
         file = stack.enter_context(MemoryFile(data, dirname=folder, filename=f"{stem}{suffix}"))
         source = stack.enter_context(file.open(driver=driver, **_OPTIONS.get(driver, {})))
         _check_kind(source)
         yield source
+
+
+@contextmanager
+def _named(folder: str) -> Iterator[None]:
+    """Leave GDAL's reason of an error, without a folder that users do not know."""
+    from rasterio.errors import RasterioError
+
+    try:
+        yield
+    except RasterioError as error:
+        raise ValueError(str(error.__cause__ or error).replace(folder, "")) from error
 
 
 def _beside(path: Path, suffix: str) -> bytes:
@@ -144,9 +156,8 @@ def _beside(path: Path, suffix: str) -> bytes:
 
 def _check_kind(source: Any) -> None:
     """Refuse what are no heights, or takes too much to unpack."""
-    kind = np.dtype(source.dtypes[0])
-    if kind.kind not in "iuf":
-        raise MeshFileError(f"has pixels of the type {kind}, which are no heights")
+    if not source.dtypes[0].startswith(("int", "uint", "float")):
+        raise MeshFileError(f"has pixels of the type {source.dtypes[0]}, which are no heights")
     if source.width < 2 or source.height < 2:
         raise MeshFileError(f"has {source.width} x {source.height} pixels: no cell of four")
     if source.gcps[0] and source.transform.is_identity:
@@ -156,7 +167,7 @@ def _check_kind(source: Any) -> None:
         raise MeshFileError(f"places its pixels by {[*place][:6]}, which gives them no area")
     rows, columns = source.block_shapes[0]
     together = source.count if source.interleaving and source.interleaving.name == "pixel" else 1
-    size = rows * columns * kind.itemsize * together
+    size = rows * columns * np.dtype(source.dtypes[0]).itemsize * together
     if size > memory_share():
         raise MeshFileError(
             f"has blocks of {columns:,} x {rows:,} pixels, each {bytes_of(size)}, of at most "
@@ -170,8 +181,7 @@ def _systems(source: Any) -> tuple[Any, float | None]:
 
     if source.crs is None or not (source.crs.is_projected or source.crs.is_geographic):
         return None, None
-    described = source.crs.to_dict(projjson=True)
-    described = described.get("source_crs", described)  # of one that is bound to another
+    described = _described(source.crs)
     parts = described.get("components", [described])
     axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
     units = [axis["unit"] for axis in axes if axis["direction"] == "up"]
@@ -179,6 +189,12 @@ def _systems(source: Any) -> tuple[Any, float | None]:
     if not units:
         return own, None
     return own, 1.0 if units[0] == "metre" else float(units[0]["conversion_factor"])
+
+
+def _described(crs: Any) -> dict[str, Any]:
+    """PROJJSON of a coordinate system, without the datum that it may be bound to."""
+    found: dict[str, Any] = crs.to_dict(projjson=True)
+    return found.get("source_crs", found)
 
 
 def _target(source: Any, own: Any, epsg: int | None) -> Any:
@@ -190,20 +206,20 @@ def _target(source: Any, own: Any, epsg: int | None) -> Any:
         given = CRS.from_epsg(epsg)
         if not given.is_projected or given.linear_units_factor[1] != 1:
             raise MeshFileError(
-                f"cannot be brought to EPSG:{epsg} ({given.to_dict(projjson=True)['name']}), which "
+                f"cannot be brought to EPSG:{epsg} ({_described(given)['name']}), which "
                 "is not in metres: give cloud.epsg another code"
             )
         return given
     if own is None or (own.is_projected and own.linear_units_factor[1] == 1):
         return own
-    middle = _place(source) * (source.width / 2, source.height / 2)
-    (longitude,), (latitude,) = transform(own, CRS.from_epsg(4326), *([one] for one in middle))
-    wide = np.ptp(_corners(source, _place(source))[:, 0])
-    if own.is_geographic and wide > _WIDEST_DEG:
+    corners = _corners(source, _place(source))
+    if own.is_geographic and (wide := np.ptp(corners[:, 0])) > _WIDEST_DEG:
         raise MeshFileError(
             f"spans {wide:.4g} degrees, too wide for a UTM zone: give cloud.epsg, the code of a "
             "projection in metres"
         )
+    x, y = corners.mean(axis=0)
+    (longitude,), (latitude,) = transform(own, CRS.from_epsg(4326), [x], [y])
     zone = math.floor((longitude + 180) / 6) % 60 + 1
     return CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
 
@@ -216,133 +232,184 @@ def _place(source: Any) -> Any:
     return from_origin(0, source.height, 1, 1) if place.is_identity else place
 
 
-def _corners(grid: Any, place: Any) -> NDArray[np.float64]:
-    """Corners (4, 2) of a dataset, in the order of a window's."""
-    return np.array([place * (x, y) for x in (0, grid.width) for y in (0, grid.height)])
+def _at(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
+    """Apply an affine; its own operators differ from version to version."""
+    a, b, c, d, e, f = [*affine][:6]
+    return a * x + b * y + c, d * x + e * y + f
 
 
-def _grid(
-    stack: ExitStack,
-    source: Any,
-    own: Any,
-    target: Any,
-    step_m: float | None,
-    window: Window | None,
-) -> tuple[Any, Any, Window | None]:
-    """Dataset in the mesh's coordinates, its affine, and the window to be cut out of it."""
+def _corners(file: Any, place: Any) -> NDArray[np.float64]:
+    """Corners (4, 2) of a file, in its own coordinates."""
+    return np.array([_at(place, x, y) for x in (0, file.width) for y in (0, file.height)])
+
+
+@dataclass(frozen=True)
+class _Grid:
+    """Pixels, and where they are."""
+
+    file: Any
+    place: Any  # affine from columns and rows to x and y
+    own: Any  # coordinate system of these
+    target: Any  # and that of the mesh
+
+    @property
+    def same(self) -> bool:
+        """Whether the mesh has the coordinates of the file."""
+        return self.own is None or bool(self.own == self.target)
+
+    def at(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+        """X and y in the mesh's coordinates."""
+        from rasterio.warp import transform
+
+        x, y = _at(self.place, column, row)
+        for first in range(0, 0 if self.same else len(x), _AT_ONCE):
+            some = slice(first, first + _AT_ONCE)
+            x[some], y[some] = transform(self.own, self.target, x[some], y[some])
+        return x, y
+
+    @cached_property
+    def reach(self) -> NDArray[np.float64]:
+        """Lowest and highest x and y in the mesh's coordinates, (2, 2)."""
+        from rasterio.warp import transform_bounds
+
+        corners = _corners(self.file, self.place)
+        ends = np.array([corners.min(axis=0), corners.max(axis=0)])
+        if not self.same:
+            ends = np.reshape(transform_bounds(self.own, self.target, *ends.ravel()), (2, 2))
+        return ends
+
+    @cached_property
+    def pixel_m(self) -> float:
+        """Side of a square as large as the pixel in the middle, metres."""
+        column, row = np.array([0.0, 1.0, 0.0]), np.array([0.0, 0.0, 1.0])
+        x, y = self.at(column + self.file.width // 2, row + self.file.height // 2)
+        return math.sqrt(abs((x[1] - x[0]) * (y[2] - y[0]) - (x[2] - x[0]) * (y[1] - y[0])))
+
+    def part(self, window: Window | None) -> tuple[Span, Span]:
+        """Columns and rows whose middles are in a window, or in a box around it, half-open."""
+        from rasterio.warp import transform_bounds
+
+        sides = np.array([self.file.width, self.file.height])
+        if window is None:
+            return (0, int(sides[0])), (0, int(sides[1]))
+        self.check_overlap(window)
+        if not self.same:
+            window = transform_bounds(self.target, self.own, *window)
+        x, y = np.meshgrid(window[::2], window[1::2])
+        corners = np.stack(_at(~self.place, x.ravel(), y.ravel()))
+        first = np.maximum(np.ceil(corners.min(axis=1) - 0.5 - 1e-6), 0)
+        end = np.minimum(np.floor(corners.max(axis=1) + 0.5 + 1e-6), sides)
+        if (end - first < 2).any():
+            raise MeshFileError("has fewer than 2 x 2 pixels in the window: give a larger one")
+        (c0, r0), (c1, r1) = first.astype(int).tolist(), end.astype(int).tolist()
+        return (c0, c1), (r0, r1)
+
+    def check_overlap(self, window: Window) -> None:
+        """Refuse a window beside all pixels."""
+        low, high = self.reach
+        if (np.maximum(low, window[:2]) >= np.minimum(high, window[2:])).any():
+            (left, right), (bottom, top) = self.reach.T.tolist()
+            raise MeshFileError(
+                f"has nothing in the window {[*window]}: it reaches from x {left:,.10g} to "
+                f"{right:,.10g} and from y {bottom:,.10g} to {top:,.10g}"
+            )
+
+
+@contextmanager
+def _coarser(grid: _Grid, step_m: float, window: Window | None) -> Iterator[_Grid]:
+    """Make a grid of mean heights, along the axes of the mesh's coordinates."""
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
     from rasterio.transform import from_origin
     from rasterio.vrt import WarpedVRT
 
-    grid, place = source, _place(source)
-    plane = target or CRS.from_epsg(32631)  # any: GDAL wants one, the same on both sides
-    options: dict[str, Any] = {"src_crs": own or plane, "crs": plane, "src_transform": place}
-    options |= {"dtype": "float64", "nodata": np.nan}
-    if source.nodata is None and np.dtype(source.dtypes[0]).kind == "f":
-        options["src_nodata"] = np.nan
-    if own is not None and own != target:
-        grid = WarpedVRT(source, resampling=Resampling.bilinear, **options)
-        stack.enter_context(grid)
-        place = grid.transform
-    if step_m is None:
-        return grid, place, window
-    finest = math.sqrt(abs(place.determinant))
-    if step_m < finest * (1 - 1e-6):
-        raise MeshFileError(f"has pixels of {finest:.6g} m: step_m must not be less")
-    corners = _corners(grid, place)
-    low, high = corners.min(axis=0), corners.max(axis=0)
+    if step_m < grid.pixel_m * (1 - 1e-6):
+        raise MeshFileError(f"has pixels of {grid.pixel_m:.6g} m: step_m must not be less")
+    low, high = grid.reach
     if window is not None:
-        _part(grid, place, window)  # that there is something in it
+        grid.check_overlap(window)
         low, high = np.maximum(low, window[:2]), np.minimum(high, window[2:])
-    if (count := float(np.prod((high - low) / finest))) > _MOST_READ:
+    if (count := float(np.prod((high - low) / grid.pixel_m))) > _MOST_READ:
         raise MeshFileError(
             f"would be made coarser from {count:,.0f} pixels, of at most {_MOST_READ:,}: give a "
             "window too, or make it coarser first (gdal_translate -tr)"
         )
-    columns, rows = np.maximum(np.ceil((high - low) / step_m - 1e-6), 1).astype(int).tolist()
+    columns, rows = np.ceil((high - low) / step_m - 1e-6).astype(int).tolist()
+    if min(columns, rows) < 2:
+        raise MeshFileError("has fewer than 2 x 2 steps of step_m: give a smaller one")
     place = from_origin(low[0], high[1], step_m, step_m)
-    grid = WarpedVRT(
-        source,
-        resampling=Resampling.average,
+    plane = grid.target or CRS.from_epsg(32631)  # any: GDAL wants one, the same on both sides
+    options: dict[str, Any] = {"src_crs": grid.own or plane, "crs": plane}
+    if grid.file.nodata is None and grid.file.dtypes[0].startswith("float"):
+        options["src_nodata"] = np.nan
+    with WarpedVRT(
+        grid.file,
+        src_transform=grid.place,
         transform=place,
         width=columns,
         height=rows,
+        resampling=Resampling.average,
+        dtype="float64",
+        nodata=np.nan,
+        tolerance=0.01,  # pixels
         **options,
-    )
-    return stack.enter_context(grid), place, None
+    ) as made:
+        yield _Grid(made, place, grid.target, grid.target)
 
 
-def _part(grid: Any, place: Any, window: Window | None) -> tuple[Span, Span]:
-    """Columns and rows of the pixels whose middles are in a window, as half-open ranges."""
-    if window is None:
-        return (0, grid.width), (0, grid.height)
-    x0, y0, x1, y1 = window
-    corners = np.array([~place * (x, y) for x in (x0, x1) for y in (y0, y1)])
-    first = np.maximum(np.ceil(corners.min(axis=0) - 0.5 - 1e-6), 0)
-    end = np.minimum(np.floor(corners.max(axis=0) + 0.5 + 1e-6), (grid.width, grid.height))
-    if (end - first < 2).any():
-        (left, bottom), (right, top) = _bounds(grid, place)
-        raise MeshFileError(
-            f"has fewer than 2 x 2 pixels in the window {[*window]}; it reaches from x "
-            f"{left:,.10g} to {right:,.10g} and from y {bottom:,.10g} to {top:,.10g}"
-        )
-    (c0, r0), (c1, r1) = first.astype(int).tolist(), end.astype(int).tolist()
-    return (c0, c1), (r0, r1)
-
-
-def _bounds(grid: Any, place: Any) -> tuple[list[float], list[float]]:
-    corners = _corners(grid, place)
-    return corners.min(axis=0).tolist(), corners.max(axis=0).tolist()
-
-
-def _check_size(place: Any, columns: Span, rows: Span) -> None:
-    """Refuse more pixels than the memory has room for, with a step and a window that fit."""
+def _check_size(grid: _Grid, columns: Span, rows: Span) -> None:
+    """Refuse more pixels than the memory has room for, with a window and a step that fit."""
     sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
-    count, most = int(np.prod(sides.astype(object))), memory_share() // _PIXEL_BYTES
-    most = min(most, MOST_TRIANGLES // 2)
+    count = int(np.prod(sides.astype(object)))
+    most = min(memory_share() // _PIXEL_BYTES, MOST_TRIANGLES // 2)
     if count <= most:
         return
-    pixel = math.sqrt(abs(place.determinant))
-    step = pixel * math.sqrt(count / most)
-    while np.prod(np.ceil(sides * pixel / step) + 1) > most:
-        step *= 1.05
+    low, high = grid.reach
+    x, y = grid.at(np.array([sum(columns) / 2]), np.array([sum(rows) / 2]))
+    # Less by a tenth, for what is askew.
+    half = np.minimum(0.9 * math.sqrt(most), sides) * grid.pixel_m / 2
+    window = [round(float(side), 1) for side in (x[0] - half[0], y[0] - half[1])]
+    window += [round(float(side), 1) for side in (x[0] + half[0], y[0] + half[1])]
+    step = grid.pixel_m
+    while np.prod(np.ceil((high - low) / step) + 1) > 0.9 * most:
+        step *= 1.1
     digits = 2 - math.floor(math.log10(step))
     step = math.ceil(step * 10**digits) / 10**digits
-    middle = np.array(place * (sum(columns) / 2, sum(rows) / 2))
-    half = np.minimum(math.floor(math.sqrt(most)) - 1, sides) * pixel / 2
-    window = [round(float(side), 1) for side in (*(middle - half), *(middle + half))]
+    coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "
-        f"at most {bytes_of(memory_share())}, a quarter of the memory: take a part or less detail "
-        f"in scene.files, such as window: {window} or step_m: {step:g}"
+        f"at most {bytes_of(memory_share())}, a quarter of the memory: give window: {window}"
+        f"{coarser} in scene.files"
     )
 
 
-def _positions(place: Any, columns: Span, rows: Span) -> tuple[Any, Any]:
-    """X and y of the pixels' middles, arrays that together have a raster's shape."""
-    a, b, c, d, e, f = [*place][:6]
-    column, row = np.arange(*columns) + 0.5, np.arange(*rows)[:, None] + 0.5
-    return a * column + b * row + c, d * column + e * row + f
-
-
-def _mesh(name: str, x: Any, y: Any, heights: NDArray[Any], valid: NDArray[np.bool_]) -> Mesh:
-    """Two triangles for each cell of four valid pixels, seen from above."""
+def _mesh(
+    name: str,
+    grid: _Grid,
+    columns: Span,
+    rows: Span,
+    heights: NDArray[np.float64],
+    valid: NDArray[np.bool_],
+) -> Mesh:
+    """Vertices at the middles of pixels, and two triangles, seen from above, for each full cell."""
     cells = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
     if not cells.any():
         raise MeshFileError("has no cell of four pixels with heights, only of those without")
     used = np.zeros_like(valid)
     for part in (used[:-1, :-1], used[:-1, 1:], used[1:, :-1], used[1:, 1:]):
         part |= cells
-    vertices = np.stack([one[used] for one in (*np.broadcast_arrays(x, y), heights)], axis=1)
+    row, column = np.nonzero(used)
+    vertices = np.empty((len(row), 3))
+    vertices[:, 0], vertices[:, 1] = grid.at(column + (columns[0] + 0.5), row + (rows[0] + 0.5))
+    vertices[:, 2] = heights[used]
     number = np.cumsum(used).reshape(used.shape) - 1
-    first, right = number[:-1, :-1][cells], number[:-1, 1:][cells]
-    below, across = number[1:, :-1][cells], number[1:, 1:][cells]
-    faces = np.stack([first, below, across, first, across, right], axis=1).reshape(-1, 3)
-    (x0, y0), (x1, y1), (x2, y2) = vertices[faces[0], :2]
-    if (x1 - x0) * (y2 - y0) < (x2 - x0) * (y1 - y0):
-        faces = faces[:, ::-1]
-    return Mesh(name, vertices, faces)
+    faces = np.empty((np.count_nonzero(cells), 2, 3), np.int64)
+    below, right = (1, 2) if grid.place.determinant < 0 else (2, 1)  # rows go down, or up
+    faces[:, :, 0] = number[:-1, :-1][cells][:, None]
+    faces[:, 0, below] = number[1:, :-1][cells]
+    faces[:, 1, right] = number[:-1, 1:][cells]
+    faces[:, 0, right] = faces[:, 1, below] = number[1:, 1:][cells]
+    return Mesh(name, vertices, faces.reshape(-1, 3))
 
 
 def _unit_m(stated: str | None, own: Any, up_m: float | None, notes: list[str]) -> float:
@@ -364,40 +431,49 @@ def _unit_m(stated: str | None, own: Any, up_m: float | None, notes: list[str]) 
     return 1.0
 
 
-def _notes(source: Any, own: Any) -> list[str]:
+def _notes(source: Any, own: Any, path: Path) -> list[str]:
     """Clauses on what is missing or left."""
     notes = []
     if source.transform.is_identity:
         notes.append("states no place: its pixels are taken as 1 m, from x and y 0")
     if own is None:
-        notes.append("states no coordinate system: its coordinates are taken in metres")
+        notes.append(
+            "states no coordinate system: its coordinates are taken in metres (gdal_translate "
+            "-a_srs EPSG:CODE gives it one)"
+        )
     if source.count > 1:
         notes.append(f"has {source.count} bands: the first is taken for heights")
+    endings = (".msk", ".aux.xml") if own is None else (".msk",)
+    beside = [path.name + ending for ending in endings if Path(f"{path}{ending}").is_file()]
+    if beside:
+        notes.append(f"is read without {' and '.join(beside)}: gdal_translate makes one file of it")
     return notes
 
 
-def _code(crs: Any) -> int | None:
-    """EPSG code of a coordinate system; None if it has none for certain."""
-    code: int | None = crs.to_epsg(confidence_threshold=90)  # with 70 it guesses unknown datums
-    return code
+def _key(crs: Any) -> tuple[str, int | None]:
+    """Text that tells a coordinate system from others, and its EPSG code if that is certain."""
+    if crs is None:
+        return "", None
+    code = crs.to_epsg(confidence_threshold=90)  # with 70 it guesses the datum of an unknown one
+    return f"EPSG:{code}" if code else crs.to_wkt(), code
 
 
 def _name(crs: Any) -> str:
-    code = _code(crs)
-    return f"EPSG:{code}" if code else f"{crs.to_dict(projjson=True)['name'][:80]} (no EPSG code)"
+    key, code = _key(crs)
+    return key if code else f"{_described(crs)['name'][:80]} (no EPSG code)"
 
 
 def _told(
-    source: Any, own: Any, target: Any, place: Any, step_m: float | None, valid: NDArray[np.bool_]
+    source: Any, own: Any, grid: _Grid, step_m: float | None, valid: NDArray[np.bool_]
 ) -> str:
     """Say what was taken."""
     rows, columns = valid.shape
-    words = f"{columns:,} x {rows:,} pixels of {math.sqrt(abs(place.determinant)):.6g} m"
-    if step_m is not None:
-        words += f", means of {source.width:,} x {source.height:,}"
-    if target is not None:
-        words += f", {_name(target)}"
-    if own is not None and own != target:
-        words += f" (reprojected from {_name(own)})"
+    words = f"{columns:,} x {rows:,} {'means' if step_m else 'pixels'} of {grid.pixel_m:.6g} m"
+    if (rows, columns) != source.shape:
+        words += f" out of {source.width:,} x {source.height:,} pixels"
+    if grid.target is not None:
+        words += f", {_name(grid.target)}"
+    if own is not None and own != grid.target:
+        words += f" from {_name(own)}"
     holes = valid.size - int(np.count_nonzero(valid))
     return words + (f", {counted(holes, 'pixel')} without height" if holes else "")
