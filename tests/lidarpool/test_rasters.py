@@ -332,7 +332,8 @@ def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
         [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
     assert scenario.survey(scene).epsg == 2056
-    cloud = Scanner(scene, Sensor.grid(), precision_m=0.001).sweep((X0 + 60, Y0 - 60, 110))
+    at = np.array([X0 + 60, Y0 - 60, 110]) - scene.origin
+    cloud = Scanner(scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
     assert len(cloud) > 1000
     np.testing.assert_allclose(z, 100 + ((x - X0) / 2 - 0.5) / 10, atol=0.002)
