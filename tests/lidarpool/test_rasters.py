@@ -319,7 +319,8 @@ def test_the_scene_has_one_coordinate_system(tmp_path):
 def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     _, columns = np.mgrid[:60, :60]
-    write(tmp_path / "hill.tif", 100 + columns / 10.0, count=2, crs="EPSG:2056")
+    heights = 100 + columns / 10.0
+    write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056")
     checked = CliRunner().invoke(cli, ["check", "hill.tif"])
     assert checked.exit_code == 0, checked.output
     assert "raster      hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
@@ -331,9 +332,16 @@ def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
         [pose.position for pose in scenario.placing(scene).poses],
         [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
-    assert scenario.survey(scene).epsg == 2056
+    assert scenario.survey(scene).epsg == 2056 and scenario.advice(scene)[1:] == []
     at = np.array([X0 + 60, Y0 - 60, 110]) - scene.origin
     cloud = Scanner(scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
     assert len(cloud) > 1000
     np.testing.assert_allclose(z, 100 + ((x - X0) / 2 - 0.5) / 10, atol=0.002)
+    heights[20:40, 20:40] = np.nan
+    write(tmp_path / "hole.tif", heights)
+    scenario = Scenario.load(tmp_path / "hole.tif")
+    scene = scenario.build_scene()
+    at = np.array(scenario.placing(scene).poses[0].position)
+    assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
+    assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)

@@ -559,7 +559,7 @@ class Scenario(Section):
     def placing(self, scene: Scene) -> Placing:
         """Where the sensor is put in a scene from mesh files, if no poses are given."""
         if self._placing is None:
-            self._placing = place(scene, self._carried()[0])
+            self._placing = place(scene, self._carried()[0], landscape=bool(self._rasters))
         return self._placing
 
     def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:
