@@ -255,7 +255,7 @@ def test_nothing_that_a_file_names_is_opened(tmp_path):
         "</VRTRasterBand></VRTDataset>"
     )
     (tmp_path / "m.tif").write_text(vrt)
-    with pytest.raises(LidarpoolError, match=r"'raster\.tif' not recognized"):
+    with pytest.raises(LidarpoolError, match=r"'m\.tif' not recognized"):
         read(tmp_path / "m.tif")
     path = write(tmp_path / "plain.tif")
     (tmp_path / "plain.tif.msk").write_text(vrt)

@@ -32,9 +32,9 @@ from .usd import read_usd
 
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 
-# A reader gets the content of a file and its path. It raises MeshFileError for unsupported content,
-# and any error for a broken file. All but read_usd and read_raster are our own; their modules say
-# why no library is used.
+# A reader gets the content of a file and its path; read_raster gets the path alone. It raises
+# MeshFileError for unsupported content, and any error for a broken file. All but read_usd and
+# read_raster are our own; their modules say why no library is used.
 _MASKED: dict[str, Callable[[bytes, Path, bool, bool], Content]] = {
     # And whether to read masks, and colours.
     ".glb": read_gltf,
@@ -131,9 +131,10 @@ def load_meshes(
         If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
-    data = _bytes_of(path)
+    is_raster = path.suffix.lower() in RASTERS
+    data = _bytes_of(path, _HEAD if is_raster else -1)
     raster = {"step_m": step_m, "window": window}
-    if path.suffix.lower() in RASTERS:
+    if is_raster:
         if up_axis:
             raise LidarpoolError(f"{path} is a raster, whose heights are z: leave out up_axis.")
         raster |= {"unit": unit, "epsg": epsg}
@@ -217,7 +218,7 @@ def _read_whole(
         elif suffix in _COLOURED:
             content = _COLOURED[suffix](data, path, colours)
         elif suffix in RASTERS:
-            content = read_raster(data, path, **raster)
+            content = read_raster(path, **raster)
         else:
             content = _READERS[suffix](data, path)
         if not content.meshes:
@@ -243,17 +244,19 @@ def _read_whole(
         ) from error
 
 
-def _bytes_of(path: Path) -> bytes:
-    """Content of a file of a known format."""
+def _bytes_of(path: Path, most: int) -> bytes:
+    """Content of a file of a known format, or of its beginning; -1 for all."""
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)}."
         )
     try:
-        with prefixed(path):
-            check_fits(path)
-        data = path.read_bytes()
+        if most < 0:
+            with prefixed(path):
+                check_fits(path)
+        with path.open("rb") as file:
+            data = file.read(most)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise LidarpoolError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"

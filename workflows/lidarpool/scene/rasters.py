@@ -1,7 +1,7 @@
 """Rasters of heights, such as GeoTIFF, through rasterio and its GDAL.
 
-Files are read from memory with the driver of their ending. So nothing that a file names is opened:
-no other files, no addresses.
+Files are opened with the driver of their ending, which sees no files beside them; those that could
+name others themselves are read from memory. So nothing that a file names is opened, nor fetched.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from uuid import uuid4
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.allowance import LEAST, bytes_of, memory_share
+from ..base.allowance import LEAST, bytes_of, check_fits, memory_share
 from ..base.vocabulary import UNITS_M
 from ..base.words import counted
 from .mesh import Mesh
@@ -33,9 +33,7 @@ _DRIVERS = {
 }  # fmt: skip
 SUFFIXES = (*_DRIVERS,)
 
-# Files beside a raster that GDAL takes the place and the coordinate system from.
-_BESIDE = {".tif": ".tfw", ".tiff": ".tfw", ".asc": ".prj"}
-_BESIDE_MOST = 65536  # bytes
+_BESIDE_MOST = 65536  # bytes of a file beside a raster
 
 _OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with integers has no others
 
@@ -58,7 +56,6 @@ _UNIT_NAMES = {  # of heights, as files have them
 
 
 def read_raster(
-    data: bytes,
     path: Path,
     *,
     unit: str | None = None,
@@ -85,9 +82,10 @@ def read_raster(
     if find_spec("rasterio") is None:
         raise MeshFileError('is a raster, which rasterio reads: pip install "lidarpool[geo]"')
     with ExitStack() as stack:
-        source = stack.enter_context(_opened(data, path))
+        source = stack.enter_context(_opened(path))
         own, up_m = _systems(source)
-        grid = _Grid(source, _place(source), own, _target(source, own, epsg))
+        place = _place(source, path)
+        grid = _Grid(source, place, own, _target(source, place, own, epsg))
         if step_m is not None:
             grid, window = stack.enter_context(_coarser(grid, step_m, window)), None
         columns, rows = grid.part(window)
@@ -96,7 +94,7 @@ def read_raster(
         heights = np.ma.getdata(band).astype(np.float64)
         valid = ~np.ma.getmaskarray(band) & np.isfinite(heights)
         del band
-        notes = _notes(source, own, path)
+        notes = _notes(source, place, own, path)
         metre = UNITS_M[unit] if unit else _unit_m(source.units[0], own, up_m, notes)
         heights = (heights * source.scales[0] + source.offsets[0]) * metre
         mesh = _mesh(path.stem, grid, columns, rows, heights, valid)
@@ -111,38 +109,39 @@ def read_raster(
 
 
 @contextmanager
-def _opened(data: bytes, path: Path) -> Iterator[Any]:
-    """Open a file in memory with the driver of its ending."""
+def _opened(path: Path) -> Iterator[Any]:
+    """Open a file with the driver of its ending."""
     import rasterio
-    from rasterio.errors import NotGeoreferencedWarning
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
     from rasterio.io import MemoryFile
 
-    suffix = path.suffix.lower()
-    driver = _DRIVERS[suffix]
-    stem = path.stem if driver == "SRTMHGT" else "raster"  # whose place is in the name
+    driver = _DRIVERS[path.suffix.lower()]
+    folder = f"{path.parent.absolute()}/"
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
         warnings.simplefilter("ignore", NotGeoreferencedWarning)
-        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=LEAST, GDAL_PAM_ENABLED=False))
-        folder = uuid4().hex
-        stack.enter_context(_named(f"/vsimem/{folder}/"))
-        if (beside := _BESIDE.get(suffix)) and (content := _beside(path, beside)):
-            stack.enter_context(MemoryFile(content, dirname=folder, filename=f"{stem}{beside}"))
-        file = stack.enter_context(MemoryFile(data, dirname=folder, filename=f"{stem}{suffix}"))
-        source = stack.enter_context(file.open(driver=driver, **_OPTIONS.get(driver, {})))
-        _check_kind(source)
-        yield source
-
-
-@contextmanager
-def _named(folder: str) -> Iterator[None]:
-    """Leave GDAL's reason of an error, without a folder that users do not know."""
-    from rasterio.errors import RasterioError
-
-    try:
-        yield
-    except RasterioError as error:
-        raise ValueError(str(error.__cause__ or error).replace(folder, "")) from error
+        alone = {"GDAL_PAM_ENABLED": False, "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+        stack.enter_context(rasterio.Env(GDAL_CACHEMAX=LEAST, **alone))
+        try:
+            if driver == "GTiff":  # which may be larger than the memory, and reads a window
+                source = rasterio.open(path.absolute(), driver=driver)
+            else:
+                check_fits(path)
+                name = uuid4().hex
+                folder = f"/vsimem/{name}/"
+                stem = path.stem if driver == "SRTMHGT" else "raster"  # whose place is in the name
+                for one, content in (
+                    (".prj", _beside(path, ".prj")),
+                    (path.suffix.lower(), path.read_bytes()),
+                ):
+                    memory = MemoryFile(content, dirname=name, filename=f"{stem}{one}")
+                    stack.enter_context(memory)
+                source = memory.open(driver=driver, **_OPTIONS.get(driver, {}))
+            stack.enter_context(source)
+            _check_kind(source)
+            yield source
+        except RasterioError as error:
+            raise ValueError(str(error.__cause__ or error).replace(folder, "")) from error
 
 
 def _beside(path: Path, suffix: str) -> bytes:
@@ -162,9 +161,6 @@ def _check_kind(source: Any) -> None:
         raise MeshFileError(f"has {source.width} x {source.height} pixels: no cell of four")
     if source.gcps[0] and source.transform.is_identity:
         raise MeshFileError("is placed by control points: rectify it first (gdalwarp -tps)")
-    place = _place(source)
-    if not np.isfinite(place).all() or place.determinant == 0:
-        raise MeshFileError(f"places its pixels by {[*place][:6]}, which gives them no area")
     rows, columns = source.block_shapes[0]
     together = source.count if source.interleaving and source.interleaving.name == "pixel" else 1
     size = rows * columns * np.dtype(source.dtypes[0]).itemsize * together
@@ -197,7 +193,7 @@ def _described(crs: Any) -> dict[str, Any]:
     return found.get("source_crs", found)
 
 
-def _target(source: Any, own: Any, epsg: int | None) -> Any:
+def _target(source: Any, place: Any, own: Any, epsg: int | None) -> Any:
     """Coordinate system of the mesh."""
     from rasterio.crs import CRS
     from rasterio.warp import transform
@@ -212,7 +208,7 @@ def _target(source: Any, own: Any, epsg: int | None) -> Any:
         return given
     if own is None or (own.is_projected and own.linear_units_factor[1] == 1):
         return own
-    corners = _corners(source, _place(source))
+    corners = _corners(source, place)
     if own.is_geographic and (wide := np.ptp(corners[:, 0])) > _WIDEST_DEG:
         raise MeshFileError(
             f"spans {wide:.4g} degrees, too wide for a UTM zone: give cloud.epsg, the code of a "
@@ -224,12 +220,19 @@ def _target(source: Any, own: Any, epsg: int | None) -> Any:
     return CRS.from_epsg((32600 if latitude >= 0 else 32700) + zone)
 
 
-def _place(source: Any) -> Any:
+def _place(source: Any, path: Path) -> Any:
     """Affine from columns and rows to x and y; pixels of 1 m, the first on top, if it has none."""
-    from rasterio.transform import from_origin
+    from rasterio.transform import Affine
 
     place = source.transform
-    return from_origin(0, source.height, 1, 1) if place.is_identity else place
+    if place.is_identity:
+        place = Affine(1, 0, 0, 0, -1, source.height)
+        if numbers := _beside(path, ".tfw").split():  # of the middle of the first pixel
+            a, d, b, e, c, f = map(float, numbers)
+            place = Affine(a, b, c - (a + b) / 2, d, e, f - (d + e) / 2)
+    if not np.isfinite(place).all() or place.determinant == 0:
+        raise MeshFileError(f"places its pixels by {[*place][:6]}, which gives them no area")
+    return place
 
 
 def _at(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
@@ -431,10 +434,10 @@ def _unit_m(stated: str | None, own: Any, up_m: float | None, notes: list[str]) 
     return 1.0
 
 
-def _notes(source: Any, own: Any, path: Path) -> list[str]:
+def _notes(source: Any, place: Any, own: Any, path: Path) -> list[str]:
     """Clauses on what is missing or left."""
     notes = []
-    if source.transform.is_identity:
+    if source.transform.is_identity and place.f == source.height:
         notes.append("states no place: its pixels are taken as 1 m, from x and y 0")
     if own is None:
         notes.append(
