@@ -171,6 +171,8 @@ def test_degrees_become_metres_of_the_utm_zone(tmp_path):
     with pytest.raises(LidarpoolError, match=r"spans 40 degrees.*give cloud\.epsg"):
         read(wide)
     assert read(wide, epsg=3035)[1].epsg == 3035
+    with pytest.raises(LidarpoolError, match="EPSG:1024, a code that rasterio does not know"):
+        read(wide, epsg=1024)
     with pytest.raises(LidarpoolError, match=r"EPSG:2263 \(.*not in metres"):
         read(wide, epsg=2263)
 

@@ -39,7 +39,7 @@ _OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with in
 
 _AT_ONCE = 100_000  # vertices that are reprojected, through lists
 _PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
-_MOST_READ = 4 * 10**9  # pixels of which a coarser grid is made; GDAL reads some 10⁸ a second
+_MOST_READ = 10**9  # pixels of which a coarser grid is made, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
 Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
@@ -196,10 +196,17 @@ def _described(crs: Any) -> dict[str, Any]:
 def _target(source: Any, place: Any, own: Any, epsg: int | None) -> Any:
     """Coordinate system of the mesh."""
     from rasterio.crs import CRS
+    from rasterio.errors import CRSError
     from rasterio.warp import transform
 
     if epsg is not None:
-        given = CRS.from_epsg(epsg)
+        try:
+            given = CRS.from_epsg(epsg)
+        except CRSError as error:
+            raise MeshFileError(
+                f"cannot be brought to EPSG:{epsg}, a code that rasterio does not know: check "
+                "cloud.epsg"
+            ) from error
         if not given.is_projected or given.linear_units_factor[1] != 1:
             raise MeshFileError(
                 f"cannot be brought to EPSG:{epsg} ({_described(given)['name']}), which "
