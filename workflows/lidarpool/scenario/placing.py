@@ -46,7 +46,7 @@ class Placing:
 
 
 def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
-    """Choose poses in a scene from mesh files, one that certainly is a landscape or any.
+    """Choose poses in a scene from mesh files; a landscape is not taken for an object.
 
     In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
