@@ -330,7 +330,7 @@ def _coarser(grid: _Grid, step_m: float, window: Window | None) -> Iterator[_Gri
     """Make a grid of mean heights, along the axes of the mesh's coordinates."""
     from rasterio.crs import CRS
     from rasterio.enums import Resampling
-    from rasterio.transform import from_origin
+    from rasterio.transform import Affine
     from rasterio.vrt import WarpedVRT
 
     if step_m < grid.pixel_m * (1 - 1e-6):
@@ -347,7 +347,7 @@ def _coarser(grid: _Grid, step_m: float, window: Window | None) -> Iterator[_Gri
     columns, rows = np.ceil((high - low) / step_m - 1e-6).astype(int).tolist()
     if min(columns, rows) < 2:
         raise MeshFileError("has fewer than 2 x 2 steps of step_m: give a smaller one")
-    place = from_origin(low[0], high[1], step_m, step_m)
+    place = Affine(step_m, 0, low[0], 0, -step_m, high[1])
     plane = grid.target or CRS.from_epsg(32631)  # any: GDAL wants one, the same on both sides
     options: dict[str, Any] = {"src_crs": grid.own or plane, "crs": plane}
     if grid.file.nodata is None and grid.file.dtypes[0].startswith("float"):
