@@ -472,9 +472,13 @@ def test_zones_of_utm_need_no_other_package(epsg, middle, north):
     assert text.count("[") == text.count("]")
 
 
-def test_other_coordinate_systems_come_from_pyproj(monkeypatch):
+def test_other_coordinate_systems_come_from_rasterio(monkeypatch):
+    if las_module.find_spec("rasterio"):
+        assert wkt(2056).startswith('PROJCS["CH1903+ / LV95"')
+        with pytest.raises(LidarpoolError, match="rasterio cannot write EPSG:1024 as WKT 1"):
+            wkt(1024)
     monkeypatch.setattr(las_module, "find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r"EPSG:2056 is not a UTM zone .*: pip install pyproj"):
+    with pytest.raises(LidarpoolError, match=r"EPSG:2056 is not a UTM zone .*lidarpool\[geo\]"):
         wkt(2056)
 
 

@@ -266,6 +266,19 @@ def test_a_scene_of_openusd_is_checked_as_shown(tmp_path, lidarpool, monkeypatch
     assert {*shown.code.splitlines()[1:]} <= {*outcome.out.splitlines(), *outcome.err.splitlines()}
 
 
+def test_a_raster_is_checked_as_shown(tmp_path, lidarpool, monkeypatch):
+    pytest.importorskip("rasterio", reason="rasterio is an extra")
+    monkeypatch.chdir(tmp_path)
+    blocks = blocks_of(ROOT / "docs/how-to/terrain.md")
+    [program] = [block for block in blocks if block.language == "python"]
+    exec(program.code, {})
+    [shown] = [block for block in blocks if block.language == "console"]
+    [words] = commands(shown)
+    outcome = lidarpool(*words[1:])
+    assert outcome.code == 0
+    assert {*shown.code.splitlines()[1:]} <= {*outcome.out.splitlines()}
+
+
 def counts(line: str) -> list[int]:
     """Numbers of rays, hits and the like, which are the same on all machines, nearly."""
     nouns = "triangles|objects|scans|rays|hits|points"

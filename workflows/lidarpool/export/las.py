@@ -137,28 +137,28 @@ def _at_most(values: NDArray[Any], most: int) -> NDArray[np.uint8]:
 
 
 def wkt(epsg: int) -> str:
-    """Return the WKT 1 of an EPSG code: of UTM zones of WGS 84 and ETRS89, or through pyproj.
+    """Return the WKT 1 of an EPSG code: of UTM zones of WGS 84 and ETRS89, or through rasterio.
 
     Raises
     ------
     LidarpoolError
-        If pyproj is missing, or knows no such system.
+        If rasterio is missing, or knows no such system.
     """
     zone = epsg % 100
     if epsg // 100 in (326, 327) and 1 <= zone <= 60:
         return _utm(epsg, zone, epsg // 100 == 327, *_WGS84)
     if 25828 <= epsg <= 25838:
         return _utm(epsg, zone, False, *_ETRS89)
-    if find_spec("pyproj") is None:
+    if find_spec("rasterio") is None:
         raise LidarpoolError(
-            f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89, and others need pyproj: "
-            "pip install pyproj."
+            f"EPSG:{epsg} is not a UTM zone of WGS 84 or ETRS89, and others need rasterio: "
+            'pip install "lidarpool[geo]".'
         )
-    pyproj = import_module("pyproj")
+    crs = import_module("rasterio.crs")
     try:
-        return str(pyproj.CRS.from_epsg(epsg).to_wkt("WKT1_GDAL"))
-    except pyproj.exceptions.CRSError as error:
-        raise LidarpoolError(f"pyproj cannot write EPSG:{epsg} as WKT 1: {error}.") from error
+        return str(crs.CRS.from_epsg(epsg).to_wkt(version="WKT1_GDAL"))
+    except crs.CRSError as error:
+        raise LidarpoolError(f"rasterio cannot write EPSG:{epsg} as WKT 1: {error}.") from error
 
 
 def _utm(

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base.words import counted
 from ..scene.drawn import Drawn
-from ..scene.floor import reaching, room_at
+from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
 from ..scene.surroundings import Surroundings, Views, in_the_way, is_open
 from ..sensor import Mounted, Pose
@@ -45,8 +45,8 @@ class Placing:
     around: bool = False  # whether the poses are around an object
 
 
-def place(scene: Scene, carried: Mounted) -> Placing:
-    """Choose poses in a scene from mesh files.
+def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
+    """Choose poses in a scene from mesh files; a landscape is not taken for an object.
 
     In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
@@ -55,8 +55,11 @@ def place(scene: Scene, carried: Mounted) -> Placing:
     drawn = Drawn.of(scene).scene
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
+    if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
+        ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
+        middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
     standing = _standing(drawn, middle)
-    looker = _looker(drawn)
+    looker = None if landscape else _looker(drawn)
     if looker is None or not looker.is_object(looker.views(_local(standing, scene))):
         if in_the_way(drawn, _local(standing, scene)):
             standing = _aside(drawn, middle) or standing

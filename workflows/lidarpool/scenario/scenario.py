@@ -26,6 +26,7 @@ from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.nodes import Raster
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
@@ -183,6 +184,8 @@ class Scenario(Section):
     _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
     # Triangles of a scene, and the trajectory there.
     _way: tuple[Any, Track] | None = PrivateAttr(default=None)
+    _rasters: list[tuple[MeshFile, Raster]] = PrivateAttr(default_factory=list)
+    _epsg: int | None = PrivateAttr(default=None)  # of the rasters, where they are in their place
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -296,6 +299,11 @@ class Scenario(Section):
         """Colours that `build_scene` found: {mesh file: what it has}; empty if it read none."""
         return dict(self._colours)
 
+    @property
+    def rasters(self) -> list[str]:
+        """Rasters that `build_scene` read, and what it took of them."""
+        return [f"{entry.file}: {raster.told}" for entry, raster in self._rasters]
+
     def _of_colours(self, scene: Scene) -> str:
         if scene.coloured or not self.coloured:
             return ""
@@ -348,6 +356,7 @@ class Scenario(Section):
         self._notes.clear()
         self._remarks.clear()
         self._colours.clear()
+        self._rasters.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
@@ -355,6 +364,7 @@ class Scenario(Section):
             with mistakes.noted():
                 meshes += self._read(entry)
         mistakes.tell()
+        self._epsg = self._system()
         if self.scene.copies:
             meshes += self._copies(meshes)
         scene = Scene.from_meshes(meshes)
@@ -376,6 +386,18 @@ class Scenario(Section):
             way = self.trajectory.track(self._folder, standing or Standing(scene))
             self._way = (scene.faces, way)
         return self._way[1]
+
+    def _system(self) -> int | None:
+        """EPSG code of the rasters that stay where they are; they must be of one system."""
+        stay = [(e.file, raster) for e, raster in self._rasters if e.transform().keeps_xy]
+        systems = {raster.crs: file for file, raster in stay if raster.crs}
+        if len(systems) > 1:
+            listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
+            raise LidarpoolError(
+                f"{self._source}: rasters of one scene have several coordinate systems: {listed}. "
+                "Give cloud.epsg, the code of the one that all of them are brought to."
+            )
+        return next((raster.epsg for _, raster in stay if raster.crs), None)
 
     def _copies(self, base: list[Mesh | Instance]) -> list[Instance]:
         """Place the copies; they stand on other objects and on the ground, not on one another."""
@@ -499,6 +521,7 @@ class Scenario(Section):
                     for pose in self._world_poses(scene)
                 ]
             cloud = dict(self.cloud) | {"columns": (*self.cloud.columns, *self.output.needs)}
+            cloud["epsg"] = self.cloud.epsg or self._epsg
             if self.scene.has_seed and cloud["keep_every"] is None:
                 cloud["keep_every"] = SEED_KEPT
             alone = not self.sensors and self.mount is None
@@ -561,8 +584,12 @@ class Scenario(Section):
             transform=transform,
             opacity=entry.opacity,
             colours=self.coloured,
+            step_m=entry.step_m,
+            window=entry.window,
+            epsg=self.cloud.epsg,
             tell=self._notes.append,
             axes=self._remarks.append,
+            tell_raster=lambda raster: self._rasters.append((entry, raster)),
         )
         if self.coloured:
             shown = [one.mesh if isinstance(one, Instance) else one for one in meshes]
@@ -589,7 +616,7 @@ class Scenario(Section):
     def placing(self, scene: Scene) -> Placing:
         """Where the sensor is put in a scene from mesh files, if no poses are given."""
         if self._placing is None:
-            self._placing = place(scene, self._carried()[0])
+            self._placing = place(scene, self._carried()[0], landscape=bool(self._rasters))
         return self._placing
 
     def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:

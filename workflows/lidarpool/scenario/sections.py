@@ -37,6 +37,7 @@ COPIES_MOST = 1_000_000  # of one entry
 
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
+Rectangle = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False)]
 Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
@@ -53,6 +54,11 @@ def told(description: str, *examples: Any, **limits: Any) -> Any:
     return Field(description=description, examples=[*examples] or None, **limits)
 
 
+def _check_rectangle(name: str, sides: tuple[float, float, float, float] | None) -> None:
+    if sides is not None and (sides[0] >= sides[2] or sides[1] >= sides[3]):
+        raise ValueError(f"{name} is [x0, y0, x1, y1]: the lowest x and y come first.")
+
+
 class Section(BaseModel):
     """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
 
@@ -60,7 +66,7 @@ class Section(BaseModel):
 
 
 class MeshFile(Section):
-    """A mesh file and its placement; in YAML also just the file's name.
+    """A mesh file or raster and its placement; in YAML also just the file's name.
 
     The mesh is scaled, rotated about the world's x, y and z axes, and moved; `matrix` replaces
     all three. Relative names start from the scenario's folder.
@@ -69,14 +75,18 @@ class MeshFile(Section):
     file: Annotated[
         str,
         told(
-            ".glb .gltf .obj .stl .ply .off .dae .3mf or .usd, from the scenario's folder",
+            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, or a raster of heights: .tif .asc .hgt "
+            ".img .dem .dt2; from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
     ]
     unit: Annotated[
         Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
-        told("length unit of the file; by default the one it states, else metres"),
+        told(
+            "length unit of the file, or of a raster's heights; by default the one it states, else "
+            "metres"
+        ),
     ] = None
     up_axis: Annotated[
         Literal["x", "y", "z"] | None,
@@ -90,6 +100,14 @@ class MeshFile(Section):
     )
     scale: Annotated[Scale, told("one factor, or one for each axis; applied first")] = (1, 1, 1)
     matrix: Annotated[Matrix | None, told("instead of the three: 4 rows of 4, metres")] = None
+    step_m: Annotated[
+        float | None,
+        told("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
+    ] = None
+    window: Annotated[
+        Rectangle | None,
+        told("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
+    ] = None
     opacity: Annotated[
         Opacity,
         told("mask: light passes where the image of a material is transparent; ignore: nowhere"),
@@ -102,6 +120,7 @@ class MeshFile(Section):
             raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
         if 0 in self.scale:
             raise ValueError("scale must not be 0: it would flatten the mesh.")
+        _check_rectangle("window", self.window)
         return self
 
     def transform(self) -> Transform:
@@ -172,7 +191,7 @@ class Scatter(Section):
         told("names of the objects to stand on, with * and ?; by default all", min_length=1),
     ] = ("*",)
     within: Annotated[
-        Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False)] | None,
+        Rectangle | None,
         told("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]"),
     ] = None
     spacing_m: Annotated[
@@ -188,10 +207,7 @@ class Scatter(Section):
     def _ordered(self) -> Scatter:
         if not 0 < self.scale[0] <= self.scale[1]:
             raise ValueError("scale is the least and the largest factor, both above 0.")
-        if self.within is not None:
-            x0, y0, x1, y1 = self.within
-            if x0 >= x1 or y0 >= y1:
-                raise ValueError("within is [x0, y0, x1, y1]: the lowest x and y come first.")
+        _check_rectangle("within", self.within)
         return self
 
 
@@ -259,7 +275,8 @@ class SceneSection(Section):
         MeshEntries,
         short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
         told(
-            "mesh files, by name or with unit, up_axis, scale, rotation_deg, translation",
+            "mesh files and rasters of heights, by name or with unit, up_axis, scale, "
+            "rotation_deg, translation",
             ["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}],
             max_length=10_000,
         ),

@@ -1,4 +1,4 @@
-"""Mesh files: .glb .gltf .obj .stl .ply .off .dae .3mf .usd, to named meshes in metres, Z-up."""
+"""Mesh files and rasters, such as .glb, .obj, .usd and .tif, to named meshes in metres, Z-up."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,17 +22,19 @@ from .dae import read_dae
 from .gltf import read_gltf
 from .instances import FARTHEST_M, Instance
 from .mesh import Mesh
-from .nodes import Content, MeshFileError
+from .nodes import Content, MeshFileError, Raster
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
+from .rasters import SUFFIXES as RASTERS
+from .rasters import Window, read_raster
 from .threemf import read_3mf
 from .transform import UP_AXES, Transform
 from .usd import read_usd
 
 _USD = (".usd", ".usda", ".usdc", ".usdz")
 
-# A reader gets the content of a file and its path. It raises MeshFileError for unsupported content,
-# and any error for a broken file. All but read_usd are our own; their modules say why no library
-# is used.
+# A reader gets the content of a file and its path; read_raster gets the path alone. It raises
+# MeshFileError for unsupported content, and any error for a broken file. All but read_usd and
+# read_raster are our own; their modules say why no library is used.
 _MASKED: dict[str, Callable[[bytes, Path, bool, bool], Content]] = {
     # And whether to read masks, and colours.
     ".glb": read_gltf,
@@ -49,7 +51,7 @@ _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".3mf": read_3mf,
     **dict.fromkeys(_USD, read_usd),
 }
-SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf", *_USD)
+SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf", *_USD, *RASTERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -71,8 +73,12 @@ def load_meshes(
     transform: Transform | None = None,
     opacity: Opacity = "mask",
     colours: bool = False,
+    step_m: float | None = None,
+    window: Window | None = None,
+    epsg: int | None = None,
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
+    tell_raster: Callable[[Raster], None] | None = None,
 ) -> tuple[Mesh | Instance, ...]:
     """Read all objects of a mesh file.
 
@@ -85,7 +91,8 @@ def load_meshes(
     path
         One of `SUFFIXES`, in any case.
     unit
-        None takes the file's own (.dae, .3mf, .usd, .glb and .gltf), else metres.
+        None takes the file's own (.dae, .3mf, .usd, .glb and .gltf), else metres. Of a raster it is
+        the unit of its heights.
     up_axis
         None takes the file's own (.dae, .usd), the standard's (Y-up for .glb and .gltf, Z-up for
         .3mf), else Z-up.
@@ -96,12 +103,22 @@ def load_meshes(
         With "ignore", triangles are solid, and no image is read for it.
     colours
         Whether to read colours: base colours and their images, and those of vertices.
+    step_m
+        Of a raster: mean heights in a grid of this step, metres; None takes its pixels.
+    window
+        Of a raster: lowest x and y, highest x and y of what is taken, metres in the coordinate
+        system of the result.
+    epsg
+        Code of the coordinate system that a raster is brought to, one in metres. None keeps its
+        own if it is in metres, else takes the UTM zone of its middle.
     tell
         Called with a line on objects left out, on images that cannot be read, or on materials that
         may be glass; by default this module's logger warns.
     axes
         Called with a line on axes that a file did not state, or that were turned; by default this
         module's logger has it, as a warning if the scene seems to lie on its side.
+    tell_raster
+        Called with what was taken of a raster; by default this module's logger has it.
 
     Returns
     -------
@@ -114,11 +131,23 @@ def load_meshes(
         If the file cannot be read completely, or has no triangles.
     """
     path = Path(path)
-    data = _bytes_of(path)
+    is_raster = path.suffix.lower() in RASTERS
+    data = _bytes_of(path, _HEAD if is_raster else -1)
+    raster = {"step_m": step_m, "window": window}
+    if is_raster:
+        if up_axis:
+            raise LidarpoolError(f"{path} is a raster, whose heights are z: leave out up_axis.")
+        raster |= {"unit": unit, "epsg": epsg}
+        unit = None
+    elif given := [name for name, value in raster.items() if value is not None]:
+        raise LidarpoolError(
+            f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
+            f"({' '.join(RASTERS)})."
+        )
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
-            content = _read_whole(path, data, opacity, colours)
+            content = _read_whole(path, data, opacity, colours, raster)
         except LidarpoolError as error:
             raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
@@ -131,6 +160,9 @@ def load_meshes(
         tell(f"{path} scales {names} to zero: left out")
     for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
         tell(f"{path} {note}")
+    if content.raster is not None:
+        told = tell_raster or (lambda raster: _log.info("%s: %s", path, raster.told))
+        told(content.raster)
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, meshes, axes)
     return meshes
@@ -172,8 +204,10 @@ def _lies(content: Content, meshes: Sequence[Mesh | Instance]) -> str:
     return ""
 
 
-def _read_whole(path: Path, data: bytes, opacity: Opacity, colours: bool) -> Content:
-    """Read any file: returns at least one mesh, or raises LidarpoolError."""
+def _read_whole(
+    path: Path, data: bytes, opacity: Opacity, colours: bool, raster: dict[str, Any]
+) -> Content:
+    """Read any file, a raster with these options: at least one mesh, or LidarpoolError."""
     try:
         for beginning, what in _FOREIGN.items():
             if re.match(beginning, data):
@@ -183,6 +217,8 @@ def _read_whole(path: Path, data: bytes, opacity: Opacity, colours: bool) -> Con
             content = _MASKED[suffix](data, path, opacity == "mask", colours)
         elif suffix in _COLOURED:
             content = _COLOURED[suffix](data, path, colours)
+        elif suffix in RASTERS:
+            content = read_raster(path, **raster)
         else:
             content = _READERS[suffix](data, path)
         if not content.meshes:
@@ -208,17 +244,19 @@ def _read_whole(path: Path, data: bytes, opacity: Opacity, colours: bool) -> Con
         ) from error
 
 
-def _bytes_of(path: Path) -> bytes:
-    """Content of a file of a known format."""
+def _bytes_of(path: Path, most: int) -> bytes:
+    """Content of a file of a known format, or of its beginning; -1 for all."""
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)}."
         )
     try:
-        with prefixed(path):
-            check_fits(path)
-        data = path.read_bytes()
+        if most < 0:
+            with prefixed(path):
+                check_fits(path)
+        with path.open("rb") as file:
+            data = file.read(most)
     except (FileNotFoundError, NotADirectoryError) as error:
         raise LidarpoolError(
             f"{path} does not exist: check the name and the folder.{_like(path)}"
@@ -249,6 +287,7 @@ _FOREIGN = {
 # Beginnings by which a file of the wrong ending is recognised, and endings that suit them.
 _BEGINNINGS = {
     b"glTF": (".glb",), b"ply": (".ply",), b"OFF": (".off",), b"solid ": (".stl",),
+    b"II*\0": (".tif", ".tiff"), b"MM\0*": (".tif", ".tiff"),
     b"PK\x03\x04": (".3mf", ".usdz"), b"PXR-USDC": (".usdc", ".usd"), b"#usda ": (".usda", ".usd"),
 }  # fmt: skip
 

@@ -26,6 +26,15 @@ MOST_NODES = 200_000  # most nodes of a scene, counting every instance
 MOST_TRIANGLES = np.iinfo(np.int32).max  # of all places
 
 
+@dataclass(frozen=True)
+class Raster:
+    """What was taken of a raster of heights."""
+
+    crs: str  # coordinate system of the mesh, as "EPSG:25832" or WKT; empty if it states none
+    epsg: int | None
+    told: str  # for users
+
+
 class MeshFileError(Exception):
     """An error of a mesh file, as a clause that follows its name."""
 
@@ -45,6 +54,7 @@ class Content:
     unit_note: str = ""  # clause on a unit that it does not state
     skipped: list[str] = field(default_factory=list)  # names of objects that nodes scale to zero
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
+    raster: Raster | None = None
 
 
 @dataclass

@@ -21,6 +21,7 @@ from .colours import Colours
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
 from .meshfile import Opacity, load_meshes
+from .rasters import Window
 from .shapes import seed_objects
 from .transform import Transform
 
@@ -122,8 +123,11 @@ class Scene:
         transform: Transform | None = None,
         opacity: Opacity = "mask",
         colours: bool = False,
+        step_m: float | None = None,
+        window: Window | None = None,
+        epsg: int | None = None,
     ) -> Scene:
-        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf .usd .usda .usdc .usdz.
+        """Read a mesh file or a raster of heights, such as .glb, .obj, .stl, .usd or .tif.
 
         Parameters
         ----------
@@ -144,6 +148,8 @@ class Scene:
         colours
             Whether to read base colours and their images (.glb, .gltf, .obj, .dae), and colours of
             vertices (.glb, .gltf, .obj, .ply, .off).
+        step_m, window, epsg
+            Of a raster: see `lidarpool.scene.meshfile.load_meshes`.
 
         Raises
         ------
@@ -158,6 +164,9 @@ class Scene:
                 transform=transform,
                 opacity=opacity,
                 colours=colours,
+                step_m=step_m,
+                window=window,
+                epsg=epsg,
             )
         )
 

@@ -62,6 +62,11 @@ class Transform:
         object.__setattr__(self, "linear", linear)
         object.__setattr__(self, "offset", offset)
 
+    @property
+    def keeps_xy(self) -> bool:
+        """Whether x and y stay as they are."""
+        return not self.offset[:2].any() and bool((self.linear[:2] == np.eye(3)[:2]).all())
+
     @classmethod
     def place(
         cls,

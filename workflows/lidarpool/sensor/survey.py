@@ -154,7 +154,8 @@ class CloudOptions:
         Field(
             ge=1024,
             le=32767,
-            description="EPSG code of the world's coordinate system, for LAS and LAZ",
+            description="EPSG code of the world's coordinate system, for LAS and LAZ, that rasters "
+            "are brought to; by default theirs",
             examples=[25832],
         ),
     ] = None

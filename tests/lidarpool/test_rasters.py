@@ -1,0 +1,349 @@
+"""Rasters of heights: a vertex at the middle of each pixel, in metres, and nothing made up."""
+
+import re
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.cli.commands import cli
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene import rasters
+from lidarpool.scene.meshfile import load_meshes
+from lidarpool.sensor import Sensor
+from lidarpool.simulator.scanner import Scanner
+
+pytestmark = pytest.mark.skipif(find_spec("rasterio") is None, reason="needs rasterio, an extra")
+if find_spec("rasterio") is not None:
+    import rasterio
+    from rasterio.transform import Affine, from_origin
+    from rasterio.warp import transform
+
+X0, Y0 = 500_000, 5_500_000  # of the upper left corner
+SLOPE = np.arange(48.0).reshape(6, 8)
+
+
+def write(path, heights=SLOPE, *, crs="EPSG:25832", place=None, mask=None, units=None, **options):
+    """Write a raster, by default of pixels of 2 m; `options` are rasterio's, and tags."""
+    heights = np.asarray(heights)
+    scale, tags = options.pop("scale", None), options.pop("tags", {})
+    place = from_origin(X0, Y0, 2, 2) if place is None else place or None
+    rows, columns = heights.shape
+    with (
+        rasterio.Env(GDAL_TIFF_INTERNAL_MASK=True),
+        rasterio.open(
+            path, "w", width=columns, height=rows, count=options.pop("count", 1),
+            dtype=heights.dtype, crs=crs, transform=place, **options,
+        ) as file,
+    ):  # fmt: skip
+        file.write(heights, 1)
+        file.update_tags(**tags)
+        if mask is not None:
+            file.write_mask(mask)
+        if units:
+            file.units = [units]
+        if scale:
+            file.scales, file.offsets = [scale[0]], [scale[1]]
+    return path
+
+
+def read(path, **options):
+    """Return the mesh, what was taken, and the notes."""
+    taken, notes = [], []
+    (mesh,) = load_meshes(path, tell=notes.append, tell_raster=taken.append, **options)
+    return mesh, taken[0], [note.removeprefix(f"{path} ") for note in notes]
+
+
+def by_place(mesh):
+    return {(x, y): z for x, y, z in mesh.vertices.tolist()}
+
+
+def upward_area(mesh):
+    a, b, c = np.moveaxis(mesh.vertices[mesh.faces], 1, 0)
+    crossed = np.cross(b - a, c - a)[:, 2]
+    assert (crossed > 0).all()
+    return crossed.sum() / 2
+
+
+def test_without_the_library_the_error_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setattr(rasters, "find_spec", lambda name: None)
+    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[geo\]"\.$'):
+        load_meshes(write(tmp_path / "m.tif"))
+
+
+@pytest.mark.parametrize("suffix", [".tif", ".TIFF", ".asc", ".img"])
+@pytest.mark.parametrize("meaning", ["Area", "Point"])
+def test_vertices_are_at_the_middles_of_pixels(tmp_path, suffix, meaning):
+    drivers = {".asc": "AAIGrid", ".img": "HFA"}
+    driver = drivers.get(suffix, "GTiff")
+    path = write(tmp_path / f"hill{suffix}", driver=driver, tags={"AREA_OR_POINT": meaning})
+    mesh, taken, notes = read(path)
+    expected = {
+        (X0 + 2 * column + 1, Y0 - 2 * row - 1): SLOPE[row, column]
+        for row in range(6)
+        for column in range(8)
+    }
+    assert by_place(mesh) == expected and mesh.name == "hill" and notes == []
+    assert len(mesh.faces) == 2 * 5 * 7 and upward_area(mesh) == 10 * 14
+    assert taken.epsg == 25832 and taken.told == "8 x 6 pixels of 2 m, EPSG:25832"
+
+
+@pytest.mark.parametrize("mirrored", [1, -1])
+def test_rotated_and_sheared_rasters(tmp_path, mirrored):
+    turned = np.array([[1.6, -0.9], [0.7, 1.8]]) @ np.diag([2, -2 * mirrored])
+    place = Affine(*turned[0], X0, *turned[1], Y0)
+    mesh, *_ = read(write(tmp_path / "m.tif", place=place))
+    columns, rows = np.meshgrid(np.arange(8) + 0.5, np.arange(6) + 0.5)
+    middles = np.stack([columns.ravel(), rows.ravel()], axis=1) @ turned.T + [X0, Y0]
+    np.testing.assert_allclose(mesh.vertices, np.column_stack([middles, SLOPE.ravel()]), rtol=1e-14)
+    assert upward_area(mesh) == pytest.approx(35 * abs(place.determinant))
+
+
+def test_pixels_without_height_are_holes(tmp_path):
+    heights = SLOPE.astype(np.float32)
+    heights[2, 2], heights[0, 7], heights[5, 0] = -9999, np.nan, np.inf
+    mesh, taken, notes = read(write(tmp_path / "m.tif", heights, nodata=-9999))
+    assert len(mesh.faces) == 2 * (35 - 4 - 1 - 1) and len(mesh.vertices) == 48 - 3
+    assert mesh.bounds[:, 2].tolist() == [0, 47] and notes == []
+    assert taken.told.endswith(", 3 pixels without height")
+    mask = np.full(SLOPE.shape, 255, np.uint8)
+    mask[2, 2] = 0
+    mesh, *_ = read(write(tmp_path / "mask.tif", SLOPE.astype(np.int16), mask=mask))
+    assert len(mesh.faces) == 2 * (35 - 4)
+    with pytest.raises(LidarpoolError, match="no cell of four pixels with heights"):
+        read(write(tmp_path / "none.tif", np.full((4, 4), 7.0), nodata=7))
+    *_, notes = read(write(tmp_path / "untold.tif", np.where(SLOPE == 3, -32768, SLOPE)))
+    assert "heights from -32,768 to 47 m" in notes[0] and "--nodata" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("options", "unit", "metres", "said"),
+    [
+        ({}, None, 1, ""),
+        ({"units": "ft"}, None, 0.3048, ""),
+        ({"units": "US survey foot"}, None, 1200 / 3937, ""),
+        ({"units": "ells"}, None, 1, "'ells', which is no known unit"),
+        ({"units": "ft"}, "cm", 0.01, ""),
+        ({"crs": "EPSG:25832+6360"}, None, 1200 / 3937, ""),
+        ({"crs": "EPSG:2263"}, None, 1200 / 3937, "no unit of heights: taken in US survey foot"),
+        ({"crs": "EPSG:2263"}, "m", 1, ""),
+        ({"scale": (0.5, 100)}, None, 0.5, ""),
+    ],
+)
+def test_units_of_heights(tmp_path, options, unit, metres, said):
+    path = write(tmp_path / "m.tif", np.repeat([[1000.0], [2000.0]], 8, 0).repeat(20, 1), **options)
+    mesh, taken, notes = read(path, unit=unit)
+    above = 100 if "scale" in options else 0
+    z = mesh.vertices[:, 2]
+    np.testing.assert_allclose([z.min(), z.max()], np.array([1000, 2000]) * metres + above)
+    assert said in "".join(notes) and bool(said) == bool(notes)
+    # Feet on the ground become metres, too, in a zone of UTM.
+    feet = options.get("crs") == "EPSG:2263"
+    assert taken.epsg == (32618 if feet else 25832)
+    assert feet == (" from EPSG:2263" in taken.told)
+
+
+def test_degrees_become_metres_of_the_utm_zone(tmp_path):
+    east, south = np.meshgrid(np.arange(40), np.arange(60))
+    place = from_origin(-58.5, -34.5, 1 / 1200, 1 / 1200)
+    heights = 3.0 * east - 2.0 * south
+    mesh, taken, _ = read(write(tmp_path / "m.tif", heights, crs="EPSG:4326", place=place))
+    assert taken.epsg == 32721 and " from EPSG:4326" in taken.told
+    x, y, z = mesh.vertices.T
+    longitude, latitude = map(np.array, transform("EPSG:32721", "EPSG:4326", x, y))
+    column, row = (longitude + 58.5) * 1200, (-34.5 - latitude) * 1200
+    np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=1e-6)
+    assert len(mesh.faces) == 2 * 39 * 59
+    middle = mesh.bounds.mean(axis=0)
+    window = (*(middle[:2] - 500), *(middle[:2] + 500))
+    part, *_ = read(tmp_path / "m.tif", window=window)
+    assert by_place(part).items() <= by_place(mesh).items() and 11 * 11 < len(part.vertices) < 400
+    coarse, *_ = read(tmp_path / "m.tif", step_m=300)
+    x, y, z = coarse.vertices[np.abs(coarse.vertices[:, :2] - middle[:2]).max(axis=1) < 1000].T
+    longitude, latitude = map(np.array, transform("EPSG:32721", "EPSG:4326", x, y))
+    column, row = (longitude + 58.5) * 1200, (-34.5 - latitude) * 1200
+    np.testing.assert_allclose(z, 3 * (column - 0.5) - 2 * (row - 0.5), atol=0.3)
+    wide = write(tmp_path / "wide.tif", crs="EPSG:4326", place=from_origin(-10, 50, 5, 1))
+    with pytest.raises(LidarpoolError, match=r"spans 40 degrees.*give cloud\.epsg"):
+        read(wide)
+    assert read(wide, epsg=3035)[1].epsg == 3035
+    with pytest.raises(LidarpoolError, match="EPSG:1024, a code that rasterio does not know"):
+        read(wide, epsg=1024)
+    with pytest.raises(LidarpoolError, match=r"EPSG:2263 \(.*not in metres"):
+        read(wide, epsg=2263)
+
+
+def test_what_states_no_place(tmp_path):
+    with pytest.warns(rasterio.errors.NotGeoreferencedWarning):
+        path = write(tmp_path / "m.tif", crs=None, place=())
+    mesh, taken, notes = read(path)
+    assert by_place(mesh)[0.5, 5.5] == 0 and by_place(mesh)[7.5, 0.5] == 47 and taken.crs == ""
+    assert ["no place" in notes[0], "no coordinate system" in notes[1]] == [True, True]
+    (tmp_path / "m.tfw").write_text("10\n0\n0\n-10\n1005\n2995\n")
+    mesh, _, notes = read(path)
+    assert by_place(mesh)[1005, 2995] == 0 and len(notes) == 1
+
+
+def test_a_coarser_grid_has_means_without_holes_of_the_finer(tmp_path):
+    heights = np.full((40, 40), 100, np.int16)
+    heights[10:13, 10:13] = -9999
+    heights[20:30, 20:30] = 101
+    heights[:8, :8] = -9999
+    path = write(tmp_path / "m.tif", heights, nodata=-9999)
+    mesh, taken, _ = read(path, step_m=8)
+    found = by_place(mesh)
+    # Of the 16 pixels of this cell 4 are 101.
+    assert found[X0 + 60, Y0 - 60] == 100.25 and found[X0 + 20, Y0 - 20] == 100
+    assert set(mesh.vertices[:, 2]) == {100, 100.25, 100.5, 101}
+    assert len(mesh.faces) == 2 * (81 - 4)  # of the corner without heights
+    assert taken.told.startswith("10 x 10 means of 8 m out of 40 x 40 pixels")
+    window = (X0 + 20, Y0 - 60, X0 + 60, Y0 - 20)
+    part = {place: z for place, z in by_place(read(path)[0]).items() if inside(place, window)}
+    assert by_place(read(path, window=window)[0]) == part and len(part) == 400 - 9
+    cut, *_ = read(path, window=window, step_m=5)
+    assert cut.bounds[:, :2].tolist() == [[X0 + 22.5, Y0 - 57.5], [X0 + 57.5, Y0 - 22.5]]
+    with pytest.raises(LidarpoolError, match="has pixels of 2 m: step_m must not be less"):
+        read(path, step_m=1)
+    with pytest.raises(LidarpoolError, match=r"reaches from x 500,000 to 500,080 and from y 5,"):
+        read(path, window=(0, 0, 10, 10))
+
+
+def inside(place, window):
+    return all(window[i] <= place[i] <= window[i + 2] for i in (0, 1))
+
+
+def test_too_large_ones_are_refused_with_what_fits(tmp_path, monkeypatch):
+    path = write(tmp_path / "m.tif", np.zeros((300, 500)))
+    monkeypatch.setattr(rasters, "memory_share", lambda: 2_000_000)
+    with pytest.raises(LidarpoolError) as refused:
+        read(path)
+    words = str(refused.value)
+    window = [float(side) for side in re.search(r"window: \[(.*?)\]", words)[1].split(",")]
+    step = float(re.search(r"step_m: ([\d.]+)", words)[1])
+    assert "500 x 300 pixels" in words and len(words) < 300
+    for options in ({"window": tuple(window)}, {"step_m": step}):
+        mesh, *_ = read(path, **options)
+        assert 10_000 < len(mesh.vertices) <= 20_000
+
+
+def test_small_files_that_claim_much(tmp_path):
+    options = {"width": 2_000_000, "height": 2_000_000, "count": 1, "dtype": "float32"}
+    options |= {"crs": "EPSG:25832", "transform": from_origin(X0, Y0, 1, 1), "tiled": True}
+    tiles = {"blockxsize": 4096, "blockysize": 4096, "sparse_ok": True, "bigtiff": "yes"}
+    with rasterio.open(tmp_path / "m.tif", "w", **options, **tiles):
+        pass
+    with pytest.raises(LidarpoolError, match=r"memory: give window: \S+ \S+ \S+ \S+ in"):
+        read(tmp_path / "m.tif")
+    with pytest.raises(LidarpoolError, match="made coarser from 4,000,000,000,000 pixels"):
+        read(tmp_path / "m.tif", step_m=1000)
+    mesh, *_ = read(tmp_path / "m.tif", window=(X0, Y0 - 50, X0 + 50, Y0))
+    assert len(mesh.vertices) == 2500
+    tiles |= {"blockxsize": 80_000, "blockysize": 80_000}
+    with rasterio.open(tmp_path / "b.tif", "w", **options, **tiles):
+        pass
+    with pytest.raises(LidarpoolError, match=r"has blocks of 80,000 x 80,000 pixels"):
+        read(tmp_path / "b.tif", window=(X0, Y0 - 50, X0 + 50, Y0))
+
+
+def test_nothing_that_a_file_names_is_opened(tmp_path):
+    secret = write(tmp_path / "secret.tif", SLOPE + 1000)
+    vrt = (
+        '<VRTDataset rasterXSize="8" rasterYSize="6"><VRTRasterBand dataType="Float64" band="1">'
+        f"<SimpleSource><SourceFilename>{secret}</SourceFilename></SimpleSource>"
+        "</VRTRasterBand></VRTDataset>"
+    )
+    (tmp_path / "m.tif").write_text(vrt)
+    with pytest.raises(LidarpoolError, match=r"'m\.tif' not recognized"):
+        read(tmp_path / "m.tif")
+    path = write(tmp_path / "plain.tif")
+    (tmp_path / "plain.tif.msk").write_text(vrt)
+    (tmp_path / "plain.tif.aux.xml").write_text("<PAMDataset><Metadata/></PAMDataset>")
+    mesh, _, notes = read(path)
+    assert mesh.bounds[1, 2] == 47 and notes[0].startswith("is read without plain.tif.msk")
+
+
+@settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(data=st.data(), suffix=st.sampled_from([".tif", ".asc", ".img"]))
+def test_garbled_files_are_read_or_refused_in_a_line(tmp_path, data, suffix):
+    whole = tmp_path / f"whole{suffix}"
+    if not whole.exists():
+        write(whole, driver={".asc": "AAIGrid", ".img": "HFA"}.get(suffix, "GTiff"))
+    content = bytearray(whole.read_bytes())
+    for place in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=6)):
+        content[place] = data.draw(st.integers(0, 255))
+    cut = data.draw(st.integers(1, len(content)))
+    path = tmp_path / f"garbled{suffix}"
+    path.write_bytes(content[:cut])
+    try:
+        read(path)
+    except LidarpoolError as error:
+        assert "\n" not in str(error) and len(str(error)) < 600
+
+
+def test_options_of_others_are_refused(tmp_path):
+    (tmp_path / "m.off").write_text("OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n")
+    with pytest.raises(LidarpoolError, match="is no raster: leave out step_m and window"):
+        load_meshes(tmp_path / "m.off", step_m=2, window=(0, 0, 1, 1))
+    with pytest.raises(LidarpoolError, match="is a raster, whose heights are z"):
+        load_meshes(write(tmp_path / "m.tif"), up_axis="y")
+    with pytest.raises(LidarpoolError, match=r"window is \[x0, y0, x1, y1\]"):
+        Scenario.from_data({"scene": {"files": [{"file": "m.tif", "window": [1, 0, 0, 1]}]}})
+    complex_one = write(tmp_path / "c.tif", SLOPE.astype(np.complex64))
+    with pytest.raises(LidarpoolError, match="type complex64, which are no heights"):
+        read(complex_one)
+
+
+def epsg_of(folder, *files, **cloud):
+    scenario = Scenario.from_data(
+        {"scene": {"files": [*files]}, "cloud": {"precision_m": 0.001, **cloud}}, folder=folder
+    )
+    return scenario.survey(scenario.build_scene()).epsg
+
+
+def test_the_scene_has_one_coordinate_system(tmp_path):
+    write(tmp_path / "west.tif")
+    write(tmp_path / "east.tif", crs="EPSG:25833")
+    moved = {"file": "east.tif", "translation": [-X0, 0, 0]}
+    assert epsg_of(tmp_path, "west.tif") == 25832
+    assert epsg_of(tmp_path, moved) is None and epsg_of(tmp_path, "west.tif", moved) == 25832
+    assert epsg_of(tmp_path, {"file": "west.tif", "scale": [1, 1, 2]}) == 25832
+    with pytest.raises(LidarpoolError, match=r"west.tif in EPSG:25832, east.tif in EPSG:25833"):
+        epsg_of(tmp_path, "west.tif", "east.tif")
+    assert epsg_of(tmp_path, "west.tif", "east.tif", epsg=25832) == 25832
+
+
+def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    _, columns = np.mgrid[:60, :60]
+    heights = 100 + columns / 10.0
+    write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056")
+    checked = CliRunner().invoke(cli, ["check", "hill.tif"])
+    assert checked.exit_code == 0, checked.output
+    assert "raster      hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
+    assert "note: hill.tif has 2 bands: the first is taken for heights\n" in checked.output
+    scenario = Scenario.load(tmp_path / "hill.tif")
+    scene = scenario.build_scene()
+    # In the middle, 1, 2 and 3 m above the ground.
+    np.testing.assert_allclose(
+        [pose.position for pose in scenario.placing(scene).poses],
+        [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
+    )
+    assert scenario.survey(scene).epsg == 2056 and scenario.advice(scene)[1:] == []
+    at = np.array([X0 + 60, Y0 - 60, 110]) - scene.origin
+    cloud = Scanner(scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
+    x, _, z = cloud.positions.T
+    assert len(cloud) > 1000
+    np.testing.assert_allclose(z, 100 + ((x - X0) / 2 - 0.5) / 10, atol=0.002)
+    heights[20:40, 20:40] = np.nan
+    write(tmp_path / "hole.tif", heights)
+    scenario = Scenario.load(tmp_path / "hole.tif")
+    scene = scenario.build_scene()
+    at = np.array(scenario.placing(scene).poses[0].position)
+    assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
+    assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)
