@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
+    from .scene.robot import Robot, load_robot
     from .scene.scene import Scene
     from .sensor import (
         Beams,
@@ -56,6 +57,7 @@ __all__ = [
     "Pose",
     "Result",
     "Returns",
+    "Robot",
     "ScanSpec",
     "Scanner",
     "Scene",
@@ -64,6 +66,7 @@ __all__ = [
     "Survey",
     "Track",
     "__version__",
+    "load_robot",
     "load_sensor",
     "load_trajectory",
     "read_cloud",
@@ -86,6 +89,7 @@ _MODULES = {
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),
+    "scene.robot": ("Robot", "load_robot"),
     "scene.scene": ("Scene",),
     "sensor.models": ("load_sensor",),
     "sensor": (

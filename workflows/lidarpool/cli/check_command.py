@@ -67,7 +67,7 @@ def check(
         with running as client, shown_status("casting some rays", as_json):
             found = forecast(job, read.pool, out, client, formats_of(read), file)
         found["notes"] += read.advice(job.scene)
-        found["colours"] = read.colours
+        found["colours"], found["robots"] = read.colours, read.robots
     except LidarpoolError as error:
         if as_json:
             found = {"can_run": False, "reasons": [str(error)], "notes": []}
@@ -106,6 +106,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
         have = "object has masks" if len(masked) == 1 else "objects have masks"
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
         yield f"masks       {len(masked):,} {have}: {shown}"
+    for name, words in found["robots"].items():
+        yield f"robot       {name}: {words}"
     for file, colours in found["colours"].items():
         yield f"colours     {file}: {colours}"
     drive = found["drive"]

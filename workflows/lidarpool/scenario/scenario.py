@@ -26,6 +26,7 @@ from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.robot import Robot, load_robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
@@ -131,7 +132,7 @@ class Scenario(Section):
         tuple[ActorSection, ...],
         Strict(False),
         told(
-            "moving objects: meshes or boxes, each with a trajectory",
+            "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
             max_length=10_000,
         ),
@@ -172,6 +173,7 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
     _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
+    _robots: dict[int, Robot] = PrivateAttr(default_factory=dict)  # {number of the actor: robot}
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -240,6 +242,17 @@ class Scenario(Section):
             wrong.append("give both planning.start and planning.target, or neither.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
+        carried = [entry for entry in self.actors if entry.trajectory is None]
+        if carried and self.trajectory is None:
+            wrong.append(
+                f"actor {carried[0].name!r} has no trajectory: give it one, or give the survey a "
+                "trajectory in place of poses, to be its carrier."
+            )
+        if self._links and not any(entry.is_robot for entry in carried):
+            wrong.append(
+                "mount names a link, and no robot is the carrier: give an actor with a .urdf as "
+                "its file, and without a trajectory."
+            )
         copies = [entry.name for entry in self.scene.copies]
         named = Counter([*copies, *(entry.name for entry in self.actors)])
         if twice := next((name for name in copies if named[name] > 1), None):
@@ -259,6 +272,7 @@ class Scenario(Section):
         entries = [*self.scene.files, *(entry.file for entry in placed if entry.file)]
         files = [entry.file for entry in entries]
         files += [entry.table.file for entry in self.scene.copies if entry.table]
+        files += [entry.joints for entry in self.actors if entry.joints]
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
         for file in files if mistakes.lines else ():
             with suppress(RuntimeError):  # of a user who is not known
@@ -282,6 +296,11 @@ class Scenario(Section):
     def colours(self) -> dict[str, str]:
         """Colours that `build_scene` found: {mesh file: what it has}; empty if it read none."""
         return dict(self._colours)
+
+    @property
+    def robots(self) -> dict[str, str]:
+        """Robots that `build_scene` read: {name of the actor: what it has}."""
+        return {self.actors[number].name: one.summary for number, one in self._robots.items()}
 
     def _of_colours(self, scene: Scene) -> str:
         if scene.coloured or not self.coloured:
@@ -335,6 +354,7 @@ class Scenario(Section):
         self._notes.clear()
         self._remarks.clear()
         self._colours.clear()
+        self._robots.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
@@ -394,31 +414,95 @@ class Scenario(Section):
 
     def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
-        meshes = [
-            one_mesh(entry.name, self._read(entry.file))
-            if entry.file is not None
-            else box(entry.name, entry.box or (1, 1, 1))
-            for entry in self.actors
-        ]
+        carrier, out = None, []
         with prefixed(self._source):
-            start = 0.0
             if self.trajectory is not None:
-                start = self.trajectory.track(self._folder, origin).start_s or 0.0
-            ways = [entry.way(self._folder, origin, start) for entry in self.actors]
-        return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
+                carrier = self.trajectory.track(self._folder, origin)
+            ways = [entry.way(self._folder, origin, carrier) for entry in self.actors]
+        for number, (entry, way) in enumerate(zip(self.actors, ways, strict=True)):
+            if entry.is_robot:
+                out += self._parts(number, way)
+            elif entry.file is not None:
+                out.append(Actor(one_mesh(entry.name, self._read(entry.file)), way))
+            else:
+                out.append(Actor(box(entry.name, entry.box or (1, 1, 1)), way))
+        return tuple(out)
+
+    def _parts(self, number: int, way: Track) -> tuple[Actor, ...]:
+        """Actors of a robot, without the links that sensors are mounted on."""
+        entry, robot = self.actors[number], self._robot(number)
+        without = self._links.intersection(robot.meshes) if entry.trajectory is None else ()
+        for link in without:
+            self._notes.append(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
+        with prefixed(f"{self._source}: actor {entry.name!r}"):
+            return robot.actors(
+                way,
+                self._joints(entry),
+                name=entry.name,
+                without=without,
+                tell=self._notes.append,
+            )
+
+    def _robot(self, number: int) -> Robot:
+        """Robot of an actor, read once."""
+        if number not in self._robots:
+            file = self.actors[number].file
+            assert file is not None, "it is a robot"
+            with prefixed(self._source):
+                path = self._path(file.file)
+            self._robots[number] = load_robot(
+                path, opacity=file.opacity, colours=self.coloured, tell=self._notes.append
+            )
+        return self._robots[number]
+
+    def _joints(self, entry: ActorSection) -> Path | None:
+        return None if entry.joints is None else self._path(entry.joints)
+
+    @property
+    def _links(self) -> set[str]:
+        """Links of the carrier that sensors are mounted on."""
+        mounts = [self.mount, *(section.mount for section in self.sensors.values())]
+        return {mount.link for mount in mounts if mount is not None and mount.link is not None}
+
+    def _mount(self, mount: MountSection) -> Pose:
+        """Pose of a sensor in the carrier's axes."""
+        if mount.link is None:
+            return mount.pose()
+        carriers = [n for n, one in enumerate(self.actors) if one.trajectory is None and one.is_robot]
+        names = {number: self._robot(number).links for number in carriers}
+        on = [number for number in carriers if mount.link in names[number]]
+        if len(on) != 1:
+            hint = did_you_mean(mount.link, [name for links in names.values() for name in links])
+            raise LidarpoolError(
+                f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier have; "
+                f"one must.{hint}"
+            )
+        entry = self.actors[on[0]]
+        with prefixed(f"actor {entry.name!r}"):
+            path = self._robot(on[0]).path(mount.link, joints=self._joints(entry))
+        if path.moves:
+            raise LidarpoolError(
+                f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "
+                "mount the sensor on a link that does not move, or leave out those joints' columns."
+            )
+        return path.pose(0).then(mount.pose())
 
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, and those of actors and copies that have a class of their own."""
         made = [Material(**dict(entry)) for entry in self.materials]
-        placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
-        own = [(one, one.semantic_class) for one in placed if one.semantic_class is not None]
+        placed: list[tuple[str, CopiesSection | ActorSection]] = []
+        placed += [(entry.name, entry) for entry in self.scene.copies]
+        for actor in self.actors:
+            links = [one.name for one in scene.actors if one.name.startswith(f"{actor.name}/")]
+            placed += [(name, actor) for name in (links if actor.is_robot else [actor.name])]
+        own = [(n, one, c) for n, one in placed if (c := one.semantic_class) is not None]
         if own and not made:
             made = [Material("*")]
-        for entry, semantic_class in own:
+        for name, entry, semantic_class in own:
             # After the last that is for it: a later one, for a single copy, counts there.
-            after = max((k for k, m in enumerate(made) if m.named(entry.name)), default=-1)
+            after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
             of = made[after] if after >= 0 else Material("*")
-            objects, numbered = [escape(entry.name)], f"{escape(entry.name)}.[0-9]*"
+            objects, numbered = [escape(name)], f"{escape(name)}.[0-9]*"
             if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
                 objects.append(numbered)
             made.insert(after + 1, replace(of, objects=objects, semantic_class=semantic_class))
@@ -490,9 +574,12 @@ class Scenario(Section):
     def _carried(self) -> list[Mounted]:
         """Return the sensors on their carrier."""
         if self.sensors:
-            return [section.mounted(self._folder, name) for name, section in self.sensors.items()]
+            return [
+                section.mounted(self._folder, name, self._mount(section.mount))
+                for name, section in self.sensors.items()
+            ]
         mount = MountSection() if self.mount is None else self.mount
-        return [Mounted(self.sensor.sensor(self._folder), mount.pose())]
+        return [Mounted(self.sensor.sensor(self._folder), self._mount(mount))]
 
     def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
         with prefixed(self._source):
