@@ -134,15 +134,20 @@ class Page:
             )  # fmt: skip
 
     def _actors(self, axes: Axes, shot: Shot) -> None:
-        """Name the actors, if they are few, each above its position; paler if hidden."""
+        """Name the actors, if they are few, each above its position; paler if hidden.
+
+        Of a robot, whose links are called ROBOT/LINK, the first has its name.
+        """
         boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
         some = np.arange(len(boxes) - shot.actors, len(boxes))
         some = some[np.isfinite(boxes[some]).all(axis=(1, 2))]
+        names = [shot.scene.names[k].partition("/")[0] for k in some]
+        some = some[np.sort(np.unique(names, return_index=True)[1])]
+        names = list(dict.fromkeys(names))
         if len(some) > MOST_NAMES:
             return
         tops = np.column_stack([boxes[some, :, :2].mean(axis=1), boxes[some, 1, 2]])
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
-        names = [shot.scene.names[k] for k in some]
         places, seen = shot.visible(tops)
         for k in np.argsort(-places[:, 1]).tolist():  # those in front first
             pixel, name, colour = places[k], names[k], theme.INK if seen[k] else theme.LINE

@@ -19,7 +19,6 @@ from ..sensor.survey import Steps
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import Lengths, MeshEntry, PoseSection, Section, SensorSection, told
 
-
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
 
 
@@ -29,8 +28,11 @@ class MountSection(PoseSection):
     position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
     link: Annotated[
         Text | None,
-        told("link of the robot that carries it, whose axes these are; what is seen of it is left "
-             "out of the scene", "top_lidar_link"),
+        told(
+            "link of the robot that carries it, whose axes these are; what is seen of it is left "
+            "out of the scene",
+            "top_lidar_link",
+        ),
     ] = None
 
 
@@ -163,7 +165,9 @@ class ActorSection(Section):
     ] = None
     joints: Annotated[
         Text | None,
-        told("of a robot: a table of time_s and the values of joints, radians or metres", "arm.csv"),
+        told(
+            "of a robot: a table of time_s and the values of joints, radians or metres", "arm.csv"
+        ),
     ] = None
     semantic_class: Annotated[
         SemanticClass | None,

@@ -29,7 +29,7 @@ from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.robot import Robot, load_robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
 from .copies import Standing, copies_of
@@ -414,7 +414,7 @@ class Scenario(Section):
 
     def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
-        carrier, out = None, []
+        carrier, out = None, list[Actor]()
         with prefixed(self._source):
             if self.trajectory is not None:
                 carrier = self.trajectory.track(self._folder, origin)
@@ -468,14 +468,16 @@ class Scenario(Section):
         """Pose of a sensor in the carrier's axes."""
         if mount.link is None:
             return mount.pose()
-        carriers = [n for n, one in enumerate(self.actors) if one.trajectory is None and one.is_robot]
+        carriers = [
+            n for n, one in enumerate(self.actors) if one.trajectory is None and one.is_robot
+        ]
         names = {number: self._robot(number).links for number in carriers}
         on = [number for number in carriers if mount.link in names[number]]
         if len(on) != 1:
             hint = did_you_mean(mount.link, [name for links in names.values() for name in links])
             raise LidarpoolError(
-                f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier have; "
-                f"one must.{hint}"
+                f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
+                f"have; one must.{hint}"
             )
         entry = self.actors[on[0]]
         with prefixed(f"actor {entry.name!r}"):

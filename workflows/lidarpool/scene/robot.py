@@ -144,11 +144,6 @@ class Robot:
         ------
         LidarpoolError
             If there is no such link, or the joints cannot be used.
-
-        Examples
-        --------
-        >>> arm = load_robot("examples/rover.urdf")
-        >>> arm.path("forearm", joints={"shoulder": 0.5, "elbow": -1.0}).pose(0).position
         """
         if link not in self.joints and link != self.links[0]:
             raise LidarpoolError(
@@ -230,9 +225,7 @@ class Robot:
                 elif slides:
                     place[:3, 3] += place[:3, :3] @ (joint.axis * value[0])
                 elif value[0]:
-                    place[:3, :3] = place[:3, :3] @ rotation_about(
-                        joint.axis, np.degrees(value[0])
-                    )
+                    place[:3, :3] = place[:3, :3] @ rotation_about(joint.axis, np.degrees(value[0]))
         if not hinges and (place == np.eye(4)).all():
             return base
         if not hinges and isinstance(base, Stations):
@@ -243,7 +236,7 @@ class Robot:
     def _values(
         self, given: Joints | None, tell: Callable[[str], None] = lambda line: None
     ) -> tuple[Float, dict[str, Float]]:
-        """Times (k,), and values (k,) of all joints that move."""
+        """Return times (k,), and values (k,) of all joints that move."""
         table: dict[str, Any] = {}
         if isinstance(given, (str, Path)):
             table = self._read_values(Path(given), tell)
@@ -453,7 +446,7 @@ def load_robot(
     if path.suffix.lower() == ".xacro":
         raise LidarpoolError(expand)
     try:
-        root = xml_root(data)
+        root = xml_root(data.lstrip())  # some begin with an empty line
     except (ParseError, ValueError, LookupError) as error:  # an unknown encoding
         if b"<xacro:" in data:
             raise LidarpoolError(expand) from error
@@ -516,7 +509,8 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
     if len(values) != count or not (np.abs(values) <= _FARTHEST).all():  # nor NaN
         tag = "" if element is None else element.tag
         what = "a finite number" if count == 1 else f"{count} finite numbers"
-        raise LidarpoolError(f"{name} of <{tag}> is {shown(text)}; it must be {what}.")
+        hint = " Expand the file by xacro first." * ("$" in text)
+        raise LidarpoolError(f"{name} of <{tag}> is {shown(text)}; it must be {what}.{hint}")
     return values
 
 
@@ -567,6 +561,8 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
 def _in_order(links: list[str], held: Mapping[str, Joint]) -> list[str]:
     """Links, each after its parent; LidarpoolError if they are not one tree."""
     roots = [link for link in links if link not in held]
+    if not links:
+        raise LidarpoolError("it has no link.")
     if not roots:
         raise LidarpoolError("its joints go round in a circle: no link is the root.")
     if len(roots) > 1:
