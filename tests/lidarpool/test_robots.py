@@ -260,8 +260,11 @@ def test_broken_robots_are_refused_in_a_line(tmp_path, words):
 def test_xacro_other_files_and_garbled_copies(tmp_path):
     path = tmp_path / "arm.urdf"
     for text, words in (
-        ("<robot xmlns:xacro='http://ros.org/wiki/xacro'><xacro:arm/></robot>", "xacro arm.urdf >"),
-        ("<robot><xacro:arm/></robot>", "xacro arm.urdf > arm.urdf"),
+        (
+            "<robot xmlns:xacro='http://ros.org/wiki/xacro'><xacro:arm/></robot>",
+            "xacro arm.urdf > arm.exp",
+        ),
+        ("<robot><xacro:arm/></robot>", "xacro arm.urdf > arm.expanded.urdf"),
         ("<sdf version='1.7'/>", "convert an SDF"),
         ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "XML entity"),
     ):

@@ -173,7 +173,7 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
     _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
-    _robots: dict[int, Robot] = PrivateAttr(default_factory=dict)  # {number of the actor: robot}
+    _robots: dict[MeshFile, Robot] = PrivateAttr(default_factory=dict)  # {their file: robot}
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -300,7 +300,11 @@ class Scenario(Section):
     @property
     def robots(self) -> dict[str, str]:
         """Robots that `build_scene` read: {name of the actor: what it has}."""
-        return {self.actors[number].name: one.summary for number, one in self._robots.items()}
+        return {
+            entry.name: self._robots[entry.file].summary
+            for entry in self.actors
+            if entry.file in self._robots
+        }
 
     def _of_colours(self, scene: Scene) -> str:
         if scene.coloured or not self.coloured:
@@ -419,20 +423,20 @@ class Scenario(Section):
             if self.trajectory is not None:
                 carrier = self.trajectory.track(self._folder, origin)
             ways = [entry.way(self._folder, origin, carrier) for entry in self.actors]
-        for number, (entry, way) in enumerate(zip(self.actors, ways, strict=True)):
+        for entry, way in zip(self.actors, ways, strict=True):
             if entry.is_robot:
-                out += self._parts(number, way)
+                out += self._links_of(entry, way)
             elif entry.file is not None:
                 out.append(Actor(one_mesh(entry.name, self._read(entry.file)), way))
             else:
                 out.append(Actor(box(entry.name, entry.box or (1, 1, 1)), way))
         return tuple(out)
 
-    def _parts(self, number: int, way: Track) -> tuple[Actor, ...]:
+    def _links_of(self, entry: ActorSection, way: Track) -> tuple[Actor, ...]:
         """Actors of a robot, without the links that sensors are mounted on."""
-        entry, robot = self.actors[number], self._robot(number)
+        robot = self._robot(entry)
         without = self._links.intersection(robot.meshes) if entry.trajectory is None else ()
-        for link in without:
+        for link in sorted(without):
             self._notes.append(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
         with prefixed(f"{self._source}: actor {entry.name!r}"):
             return robot.actors(
@@ -443,17 +447,17 @@ class Scenario(Section):
                 tell=self._notes.append,
             )
 
-    def _robot(self, number: int) -> Robot:
-        """Robot of an actor, read once."""
-        if number not in self._robots:
-            file = self.actors[number].file
-            assert file is not None, "it is a robot"
+    def _robot(self, entry: ActorSection) -> Robot:
+        """Robot of an actor; those of one file are the same."""
+        file = entry.file
+        assert file is not None, "it is a robot"
+        if file not in self._robots:
             with prefixed(self._source):
                 path = self._path(file.file)
-            self._robots[number] = load_robot(
+            self._robots[file] = load_robot(
                 path, opacity=file.opacity, colours=self.coloured, tell=self._notes.append
             )
-        return self._robots[number]
+        return self._robots[file]
 
     def _joints(self, entry: ActorSection) -> Path | None:
         return None if entry.joints is None else self._path(entry.joints)
@@ -468,20 +472,17 @@ class Scenario(Section):
         """Pose of a sensor in the carrier's axes."""
         if mount.link is None:
             return mount.pose()
-        carriers = [
-            n for n, one in enumerate(self.actors) if one.trajectory is None and one.is_robot
-        ]
-        names = {number: self._robot(number).links for number in carriers}
-        on = [number for number in carriers if mount.link in names[number]]
+        carriers = [one for one in self.actors if one.trajectory is None and one.is_robot]
+        on = [entry for entry in carriers if mount.link in self._robot(entry).links]
         if len(on) != 1:
-            hint = did_you_mean(mount.link, [name for links in names.values() for name in links])
+            links = [link for entry in carriers for link in self._robot(entry).links]
             raise LidarpoolError(
                 f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
-                f"have; one must.{hint}"
+                f"have; one must.{did_you_mean(mount.link, links)}"
             )
-        entry = self.actors[on[0]]
+        (entry,) = on
         with prefixed(f"actor {entry.name!r}"):
-            path = self._robot(on[0]).path(mount.link, joints=self._joints(entry))
+            path = self._robot(entry).path(mount.link, joints=self._joints(entry))
         if path.moves:
             raise LidarpoolError(
                 f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "

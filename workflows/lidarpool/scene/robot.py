@@ -123,11 +123,10 @@ class Robot:
     def summary(self) -> str:
         """Links, joints that move, and triangles, in words."""
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
+        verb = "moves" if len(self.moving) == 1 else "move"
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
-        return (
-            f"{len(self.links):,} links, {triangles:,} triangles; "
-            + (f"{len(self.moving):,} of its joints move: " if moving else "no joint moves")
-            + moving
+        return f"{len(self.links):,} links, {triangles:,} triangles; " + (
+            f"{len(self.moving):,} of its joints {verb}: {moving}" if moving else "no joint moves"
         )
 
     @cached_property
@@ -254,7 +253,7 @@ class Robot:
                     f"The values of joint {name!r} must be finite, one for each time_s "
                     f"({len(times)}), or one without time_s; there are {value.size}."
                 )
-        if not (np.isfinite(times).all() and (np.diff(times) > 0).all()):
+        if not (len(times) and np.isfinite(times).all() and (np.diff(times) > 0).all()):
             raise LidarpoolError("time_s of joints must be finite, and ascend.")
         joints = {joint.name: joint for joint in self.joints.values() if joint.moves}
         for name in joints:
@@ -442,7 +441,9 @@ def load_robot(
     except (OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or error
         raise LidarpoolError(f"{path} cannot be read: {reason}.") from error
-    expand = f"{path} is xacro: expand it first: xacro {path.name} > {path.name.split('.')[0]}.urdf"
+    target = path.name.removesuffix(".xacro").removesuffix(".urdf")
+    target += ".expanded" * (path.suffix != ".xacro")  # not to write over what is read
+    expand = f"{path} is xacro: expand it first: xacro {path.name} > {target}.urdf"
     if path.suffix.lower() == ".xacro":
         raise LidarpoolError(expand)
     try:
@@ -492,7 +493,7 @@ def _named(root: Element, kind: str) -> list[Element]:
     if len(found) > _LINKS_MOST:
         raise LidarpoolError(f"it has {len(found):,} {kind}s; at most {_LINKS_MOST:,} are read.")
     names = [_name(element) for element in found]
-    if twice := next((name for name in names if not name or names.count(name) > 1), None):
+    if twice := next((name for name in names if name and names.count(name) > 1), None):
         raise LidarpoolError(f"two {kind}s have the name {twice!r}: give each its own.")
     if "" in names:
         raise LidarpoolError(f"a {kind} has no name.")
@@ -614,8 +615,8 @@ class _Looks:
         self._shared = {entry.get("name", ""): entry.find("color") for entry in materials}
         folder = self.path.parent.resolve()
         self._around = [folder, *folder.parents][: _UP + 1]
-        packages = [one for one in self._around if (one / "package.xml").is_file()]
-        self._package = packages[0] if packages else self._around[: 1 + 1][-1]
+        packages = (one for one in self._around if (one / "package.xml").is_file())
+        self._package = next(packages, folder.parent)
 
     def of(self, link: str, element: Element) -> Iterator[Mesh]:
         """Meshes of a link, in its axes."""
