@@ -128,15 +128,21 @@ def draw_cloud(
 
 
 def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[str]]:
-    """Kinds of objects (objects,), and their names; the last objects are actors, each a kind."""
+    """Kinds of objects (objects,), and their names; the last objects are actors.
+
+    Each actor is a kind, and all links of a robot are one.
+    """
     if len(names) <= LEGEND_ROWS:
         return np.arange(len(names)), list(names)
     known, found = {*names}, dict[str, int]()
     kinds = []
     for k, name in enumerate(names):
         stem, _, number = name.rpartition(".")
-        copied = k < len(names) - actors and number.isdecimal() and stem in known
-        kinds.append(found.setdefault(stem if copied else name, len(found)))
+        if k >= len(names) - actors:
+            kind = name.partition("/")[0]
+        else:
+            kind = stem if number.isdecimal() and stem in known else name
+        kinds.append(found.setdefault(kind, len(found)))
     return np.array(kinds), list(found)
 
 
