@@ -431,6 +431,17 @@ def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground)
     assert len(stored_positions(whole)) > 5000
 
 
+def test_a_sensor_on_a_link_that_moves(ground):
+    """In Python a survey may follow any link."""
+    hand = load_robot(EXAMPLES / "rover.urdf").path("hand", DRIVE, MOTION)
+    mounted = [Mounted(load_sensor("velodyne/vlp16"), Pose((0, 0, 0.1), roll_deg=20))]
+    survey = Survey(sensors=mounted, trajectory=hand, columns=["time"], precision_m=1e-4)
+    found = made(survey, ground)
+    heights = stored_positions(found, 1e-4)[:, 2]
+    assert len(heights) > 5000 and np.abs(heights).max() <= 1e-4
+    assert found["time"].max() > 0.39e9
+
+
 SCENARIO = {
     "scene": {"copies": [{"name": "Crate", "box": [1, 1, 1], "at": [[3, 3, 0]]}]},
     "trajectory": {

@@ -23,7 +23,7 @@ from numpy.typing import ArrayLike, NDArray
 from ..base.allowance import Allowance, check_fits
 from ..base.arguments import as_array, checked, shown
 from ..base.errors import LidarpoolError, prefixed
-from ..base.words import did_you_mean, printable
+from ..base.words import counted, did_you_mean, printable
 from ..base.xmlfile import xml_root
 from ..sensor import Pose, Stations, Trajectory
 from ..sensor.trajectory import CENTRE, rotations_of
@@ -125,7 +125,7 @@ class Robot:
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         verb = "moves" if len(self.moving) == 1 else "move"
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
-        return f"{len(self.links):,} links, {triangles:,} triangles; " + (
+        return f"{counted(len(self.links), 'link')}, {counted(triangles, 'triangle')}; " + (
             f"{len(self.moving):,} of its joints {verb}: {moving}" if moving else "no joint moves"
         )
 
