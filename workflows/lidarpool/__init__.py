@@ -19,8 +19,9 @@ if TYPE_CHECKING:
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
-    from .scene.robot import Robot, load_robot
+    from .scene.robot import Robot
     from .scene.scene import Scene
+    from .scene.urdf import load_robot
     from .sensor import (
         Beams,
         Material,
@@ -89,8 +90,9 @@ _MODULES = {
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),
-    "scene.robot": ("Robot", "load_robot"),
+    "scene.robot": ("Robot",),
     "scene.scene": ("Scene",),
+    "scene.urdf": ("load_robot",),
     "sensor.models": ("load_sensor",),
     "sensor": (
         "Beams",

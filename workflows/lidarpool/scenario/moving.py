@@ -12,7 +12,7 @@ from pydantic import Field, Strict, model_validator
 
 from ..base.declared import Text, Triple, is_text, short
 from ..base.errors import prefixed
-from ..scene.robot import SUFFIXES as ROBOTS
+from ..scene.urdf import SUFFIXES as ROBOTS
 from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps

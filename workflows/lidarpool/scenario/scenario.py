@@ -26,9 +26,10 @@ from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
-from ..scene.robot import Robot, load_robot
+from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
+from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
