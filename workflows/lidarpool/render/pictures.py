@@ -16,7 +16,7 @@ from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of
 from .hits import hit_colours
-from .page import LEGEND_ROWS, Page, without_common_prefix
+from .page import LEGEND_ROWS, Page, whole_of, without_common_prefix
 from .shot import Shot
 
 Floats = NDArray[np.float64]
@@ -138,10 +138,9 @@ def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[s
     kinds = []
     for k, name in enumerate(names):
         stem, _, number = name.rpartition(".")
-        if k >= len(names) - actors:
-            kind = name.partition("/")[0]
-        else:
-            kind = stem if number.isdecimal() and stem in known else name
+        moves = k >= len(names) - actors
+        copied = not moves and number.isdecimal() and stem in known
+        kind = stem if copied else whole_of(name) if moves else name
         kinds.append(found.setdefault(kind, len(found)))
     return np.array(kinds), list(found)
 

@@ -17,7 +17,7 @@ from ..base.arguments import as_array, checked
 from ..base.errors import LidarpoolError
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.trajectory import CENTRE
+from ..sensor.trajectory import CENTRE, presence_ns
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import Actor, one_mesh
 from .mesh import Mesh
@@ -329,6 +329,11 @@ class LinkPath:
         """See `Trajectory.duration_ns`."""
         ends = (float(self.times_s[-1]) - self.start_s) * 1e9 if self.hinges else np.inf
         return min(self.base.duration_ns, ends)
+
+    @property
+    def presence_ns(self) -> tuple[float, float]:
+        """See `lidarpool.sensor.trajectory.presence_ns`."""
+        return presence_ns(self.base)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """See `Trajectory.pose`."""
