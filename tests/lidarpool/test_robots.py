@@ -16,6 +16,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor import Mounted, Stations
+from lidarpool.sensor.trajectory import presence_ns
 from lidarpool.simulator.motion import into_axes
 from lidarpool.simulator.rig import Rig
 
@@ -113,6 +114,8 @@ def test_a_link_is_where_the_joints_before_it_put_it(tmp_path):
     for first, last in pairwise((0, 1, 2, 9, 500, 1001)):
         for one, all_ in zip(path.poses(0, times[first:last]), whole, strict=True):
             assert (one == all_[first:last]).all()
+    there = Track([10, 12], [[0, 0, 0], [8, 0, 0]], beyond="absent")
+    assert presence_ns(robot.path("tip", there, values)) == (0, 2e9)
     again = pickle.loads(pickle.dumps(path))
     assert (again.poses(0, times)[0] == whole[0]).all()
     assert fingerprint(again) == fingerprint(path)
@@ -132,6 +135,8 @@ def test_links_that_are_fixed_to_one_another_are_one_actor(tmp_path):
     cube = corner[:3, :3] @ (box("", (0.2, 0.2, 0.2)).vertices - [0, 0, 0.1]).T
     assert np.allclose(plate.mesh.vertices - [0.1, 0.2, 0.3], cube.T, atol=1e-15)
     assert plate.name == "r/base", "the same name, whatever is left out"
+    again = robot.actors(name="Other", tell=notes.append)
+    assert all(a.mesh.vertices is b.mesh.vertices for a, b in zip(actors, again, strict=True))
     # A joint without a value is at zero, or at its limit nearest to zero.
     limits = '<limit lower="0.2" upper="0.5"/>'
     near = robot_of(tmp_path, link("a"), link("b"), joint("j", "prismatic", "a", "b", limits))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -111,6 +111,10 @@ class Robot:
         )
 
     @cached_property
+    def _made(self) -> dict[frozenset[str], dict[str, Mesh]]:
+        return {}  # see `_bodies`
+
+    @cached_property
     def moving(self) -> tuple[str, ...]:
         """Names of the joints that move."""
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
@@ -162,28 +166,36 @@ class Robot:
             If the joints cannot be used.
         """
         times_s, values = self._values(joints, tell)
-        bodies: dict[str, list[Mesh]] = {}  # {link that moves by itself: meshes in its axes}
-        names: dict[str, str] = {}  # {such a link: the first of its body that has triangles}
-        owner = {self.links[0]: (self.links[0], np.eye(4))}  # {link: link that moves, its place}
-        for link in self.links:
-            if link in self.joints:
-                joint = self.joints[link]
-                body, place = owner[joint.parent]
-                owner[link] = (link, np.eye(4)) if joint.moves else (body, place @ joint.origin)
-            if (mesh := self.meshes.get(link)) is not None:
-                body, place = owner[link]
-                names.setdefault(body, link)
-                if link not in without:
-                    moved = mesh.moved(link, place[:3, :3], place[:3, 3])
-                    bodies.setdefault(body, []).append(moved)
         called = self.name if name is None else name
         return tuple(
             Actor(
-                one_mesh(f"{called}/{names[body]}", meshes),
+                replace(mesh, name=f"{called}/{mesh.name}"),
                 self._path(body, trajectory, times_s, values),
             )
-            for body, meshes in bodies.items()
+            for body, mesh in self._bodies(frozenset(without)).items()
         )
+
+    def _bodies(self, without: frozenset[str]) -> dict[str, Mesh]:
+        """Return {link that moves by itself: all that is fixed to it}, made once.
+
+        Actors that share arrays share a tree. Each is named by its first link with triangles.
+        """
+        if without not in self._made:
+            parts: dict[str, list[Mesh]] = {}
+            names: dict[str, str] = {}
+            owner = {self.links[0]: (self.links[0], np.eye(4))}  # {link: its body, its place}
+            for link in self.links:
+                if (joint := self.joints.get(link)) is not None:
+                    body, place = owner[joint.parent]
+                    owner[link] = (link, np.eye(4)) if joint.moves else (body, place @ joint.origin)
+                if (mesh := self.meshes.get(link)) is not None:
+                    body, place = owner[link]
+                    names.setdefault(body, link)
+                    if link not in without:
+                        moved = mesh.moved(link, place[:3, :3], place[:3, 3])
+                        parts.setdefault(body, []).append(moved)
+            self._made[without] = {body: one_mesh(names[body], own) for body, own in parts.items()}
+        return self._made[without]
 
     def _path(
         self, link: str, base: Trajectory, times_s: Float, values: Mapping[str, Float]
