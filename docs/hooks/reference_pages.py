@@ -34,6 +34,8 @@ _SECTIONS = {
     "sensors": "CarriedSection",
     "mount": "MountSection",
     "actors": "ActorSection",
+    "traffic": "TrafficSection",
+    "traffic: vehicles": "VehicleSection",
     "materials": "MaterialSection",
     "returns": "ReturnsSection",
     "noise": "NoiseSection",

@@ -19,7 +19,9 @@ if TYPE_CHECKING:
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
+    from .scene.robot import Robot
     from .scene.scene import Scene
+    from .scene.urdf import load_robot
     from .sensor import (
         Beams,
         Material,
@@ -56,6 +58,7 @@ __all__ = [
     "Pose",
     "Result",
     "Returns",
+    "Robot",
     "ScanSpec",
     "Scanner",
     "Scene",
@@ -64,6 +67,7 @@ __all__ = [
     "Survey",
     "Track",
     "__version__",
+    "load_robot",
     "load_sensor",
     "load_trajectory",
     "read_cloud",
@@ -86,7 +90,9 @@ _MODULES = {
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),
+    "scene.robot": ("Robot",),
     "scene.scene": ("Scene",),
+    "scene.urdf": ("load_robot",),
     "sensor.models": ("load_sensor",),
     "sensor": (
         "Beams",

@@ -67,7 +67,7 @@ def check(
         with running as client, shown_status("casting some rays", as_json):
             found = forecast(job, read.pool, out, client, formats_of(read), file)
         found["notes"] += read.advice(job.scene)
-        found |= {"colours": read.colours, "rasters": read.rasters}
+        found |= {"colours": read.colours, "rasters": read.rasters, "robots": read.robots}
     except LidarpoolError as error:
         if as_json:
             found = {"can_run": False, "reasons": [str(error)], "notes": []}
@@ -108,6 +108,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
         yield f"masks       {len(masked):,} {have}: {shown}"
     for words in found["rasters"]:
         yield f"raster      {words}"
+    for name, words in found["robots"].items():
+        yield f"robot       {name}: {words}"
     for file, colours in found["colours"].items():
         yield f"colours     {file}: {colours}"
     drive = found["drive"]

@@ -134,15 +134,20 @@ class Page:
             )  # fmt: skip
 
     def _actors(self, axes: Axes, shot: Shot) -> None:
-        """Name the actors, if they are few, each above its position; paler if hidden."""
+        """Name the actors, if they are few, each above its position; paler if hidden.
+
+        Of a robot, whose links are called ROBOT/LINK, the first has its name.
+        """
         boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
         some = np.arange(len(boxes) - shot.actors, len(boxes))
         some = some[np.isfinite(boxes[some]).all(axis=(1, 2))]
+        names = [whole_of(shot.scene.names[k]) for k in some]
+        some = some[np.sort(np.unique(names, return_index=True)[1])]
+        names = list(dict.fromkeys(names))
         if len(some) > MOST_NAMES:
             return
         tops = np.column_stack([boxes[some, :, :2].mean(axis=1), boxes[some, 1, 2]])
         halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
-        names = [shot.scene.names[k] for k in some]
         places, seen = shot.visible(tops)
         for k in np.argsort(-places[:, 1]).tolist():  # those in front first
             pixel, name, colour = places[k], names[k], theme.INK if seen[k] else theme.LINE
@@ -310,6 +315,12 @@ def shortened(name: str, most: int = LEGEND_LETTERS) -> str:
     name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
     tail = (most - 1) // 2
     return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
+
+
+def whole_of(name: str) -> str:
+    """Name of the robot of a link, ROBOT/LINK; of another actor its own."""
+    # Traffic has names of its files in brackets, with any letters.
+    return name if "(" in name else name.partition("/")[0]
 
 
 def without_common_prefix(names: Sequence[str]) -> list[str]:

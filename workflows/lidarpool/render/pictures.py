@@ -16,7 +16,7 @@ from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of
 from .hits import hit_colours
-from .page import LEGEND_ROWS, Page, without_common_prefix
+from .page import LEGEND_ROWS, Page, whole_of, without_common_prefix
 from .shot import Shot
 
 Floats = NDArray[np.float64]
@@ -128,15 +128,20 @@ def draw_cloud(
 
 
 def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[str]]:
-    """Kinds of objects (objects,), and their names; the last objects are actors, each a kind."""
+    """Kinds of objects (objects,), and their names; the last objects are actors.
+
+    Each actor is a kind, and all links of a robot are one.
+    """
     if len(names) <= LEGEND_ROWS:
         return np.arange(len(names)), list(names)
     known, found = {*names}, dict[str, int]()
     kinds = []
     for k, name in enumerate(names):
         stem, _, number = name.rpartition(".")
-        copied = k < len(names) - actors and number.isdecimal() and stem in known
-        kinds.append(found.setdefault(stem if copied else name, len(found)))
+        moves = k >= len(names) - actors
+        copied = not moves and number.isdecimal() and stem in known
+        kind = stem if copied else whole_of(name) if moves else name
+        kinds.append(found.setdefault(kind, len(found)))
     return np.array(kinds), list(found)
 
 

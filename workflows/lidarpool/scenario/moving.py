@@ -12,7 +12,8 @@ from pydantic import Field, Strict, model_validator
 
 from ..base.declared import Text, TextOrTexts, Triple, is_text, short
 from ..base.errors import LidarpoolError, prefixed
-from ..sensor import Mounted, Track, load_trajectory
+from ..scene.urdf import SUFFIXES as ROBOTS
+from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
 from ..sensor.trajectory import Beyond
@@ -20,11 +21,21 @@ from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quate
 from .sections import Lengths, MeshEntry, PoseSection, Section, SensorSection, told
 from .standing import Standing, following
 
+_OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
+
 
 class MountSection(PoseSection):
     """Position and angles of a sensor on its carrier, in the carrier's axes."""
 
     position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
+    link: Annotated[
+        Text | None,
+        told(
+            "link of the robot that carries it, whose axes these are; what is seen of it is left "
+            "out of the scene",
+            "top_lidar_link",
+        ),
+    ] = None
 
 
 class CarriedSection(SensorSection):
@@ -39,10 +50,10 @@ class CarriedSection(SensorSection):
         told("its time steps (scans), instead of the survey's", 120),
     ] = None
 
-    def mounted(self, folder: Path, name: str) -> Mounted:
+    def mounted(self, folder: Path, name: str, mount: Pose) -> Mounted:
         """Return it on its carrier; LidarpoolError if its files cannot be used."""
         sensor = replace(self.sensor(folder), start_ns=self.start_s * 1e9)
-        return Mounted(sensor, self.mount.pose(), name, self.steps)
+        return Mounted(sensor, mount, name, self.steps)
 
 
 class TimedPose(PoseSection):
@@ -159,17 +170,31 @@ TrajectoryEntry = Annotated[
 
 
 class ActorSection(Section):
-    """An object that moves through the scene; its axes have x ahead and z up."""
+    """An object or robot that moves through the scene; its axes have x ahead and z up."""
 
     name: Annotated[Text, told("name of the object")]
     file: Annotated[
-        MeshEntry | None, told("its mesh in its own axes, as in scene.files", "car.glb")
+        MeshEntry | None,
+        told("its mesh in its own axes, as in scene.files, or a robot: .urdf", "car.glb"),
     ] = None
     box: Annotated[
         Lengths | None,
         told("instead of a file: length, width and height of a box, metres"),
     ] = None
-    trajectory: Annotated[TrajectoryEntry, told("its trajectory, by the clock of the survey's")]
+    trajectory: Annotated[
+        TrajectoryEntry | None,
+        told(
+            "its trajectory, by the clock of the survey's; by default it is the carrier, and has "
+            "the survey's",
+            "van.csv",
+        ),
+    ] = None
+    joints: Annotated[
+        Text | None,
+        told(
+            "of a robot: a table of time_s and the values of joints, radians or metres", "arm.csv"
+        ),
+    ] = None
     semantic_class: Annotated[
         SemanticClass | None,
         Field(alias="class", description="class of its points; by default that of its material"),
@@ -179,11 +204,25 @@ class ActorSection(Section):
     def _one_shape(self) -> ActorSection:
         if (self.file is None) == (self.box is None):
             raise ValueError("give either file or box.")
-        if self.trajectory.start_s is not None or self.trajectory.duration_s is not None:
+        way = self.trajectory
+        if way is not None and (way.start_s is not None or way.duration_s is not None):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
+        if not self.is_robot and self.joints is not None:
+            raise ValueError("joints are those of a robot: give a .urdf as its file.")
+        if self.is_robot and self.file is not None and self.file.model_fields_set - _OF_ROBOTS:
+            raise ValueError("a robot is in metres and in its own axes: give just its file.")
         return self
 
-    def way(self, folder: Path, standing: Standing, start_s: float) -> Track:
+    @property
+    def is_robot(self) -> bool:
+        """Whether its file is that of a robot."""
+        return self.file is not None and self.file.file.lower().endswith(ROBOTS)
+
+    def way(self, folder: Path, standing: Standing, carrier: Track | None) -> Track:
         """Return its trajectory from the survey's start on."""
+        if self.trajectory is None:
+            assert carrier is not None, "checked with the scenario"
+            return carrier
+        start_s = 0.0 if carrier is None else carrier.start_s
         with prefixed(f"actor {self.name!r}"):
             return self.trajectory.track(folder, standing, start_s)

@@ -27,8 +27,10 @@ from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.nodes import Raster
+from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
+from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
@@ -134,7 +136,7 @@ class Scenario(Section):
         tuple[ActorSection, ...],
         Strict(False),
         told(
-            "moving objects: meshes or boxes, each with a trajectory",
+            "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
             max_length=10_000,
         ),
@@ -182,6 +184,7 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
     _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
+    _robots: dict[MeshFile, Robot] = PrivateAttr(default_factory=dict)  # {their file: robot}
     # Triangles of a scene, and the trajectory there.
     _way: tuple[Any, Track] | None = PrivateAttr(default=None)
     _rasters: list[tuple[MeshFile, Raster]] = PrivateAttr(default_factory=list)
@@ -254,6 +257,17 @@ class Scenario(Section):
             wrong.append("give both planning.start and planning.target, or neither.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
+        carried = [entry for entry in self.actors if entry.trajectory is None]
+        if carried and self.trajectory is None:
+            wrong.append(
+                f"actor {carried[0].name!r} has no trajectory: give it one, or give the survey a "
+                "trajectory in place of poses, to be its carrier."
+            )
+        if self._links and not any(entry.is_robot for entry in carried):
+            wrong.append(
+                "mount names a link, and no robot is the carrier: give an actor with a .urdf as "
+                "its file, and without a trajectory."
+            )
         copies = [entry.name for entry in self.scene.copies]
         named = Counter([*copies, *(entry.name for entry in self.actors)])
         if twice := next((name for name in copies if named[name] > 1), None):
@@ -275,6 +289,7 @@ class Scenario(Section):
         files = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
         files += [entry.table.file for entry in self.scene.copies if entry.table]
+        files += [entry.joints for entry in self.actors if entry.joints]
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
         for file in files if mistakes.lines else ():
             with suppress(RuntimeError):  # of a user who is not known
@@ -303,6 +318,15 @@ class Scenario(Section):
     def rasters(self) -> list[str]:
         """Rasters that `build_scene` read, and what it took of them."""
         return [f"{entry.file}: {raster.told}" for entry, raster in self._rasters]
+
+    @property
+    def robots(self) -> dict[str, str]:
+        """Robots that `build_scene` read: {name of the actor: what it has}."""
+        return {
+            entry.name: self._robots[entry.file].summary
+            for entry in self.actors
+            if entry.file in self._robots
+        }
 
     def _of_colours(self, scene: Scene) -> str:
         if scene.coloured or not self.coloured:
@@ -357,6 +381,7 @@ class Scenario(Section):
         self._remarks.clear()
         self._colours.clear()
         self._rasters.clear()
+        self._robots.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
@@ -374,9 +399,10 @@ class Scenario(Section):
             return scene
         standing = Standing(scene)
         with prefixed(self._source):
-            start = 0.0 if self.trajectory is None else self._track(scene, standing).start_s
+            carrier = None if self.trajectory is None else self._track(scene, standing)
+        start = 0.0 if carrier is None else carrier.start_s
         assert start is not None  # of every track
-        actors = (*self._actors(standing, start), *self._traffic(scene, standing, start))
+        actors = (*self._actors(standing, carrier), *self._traffic(scene, standing, start))
         return replace(scene, actors=actors)
 
     def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
@@ -438,13 +464,76 @@ class Scenario(Section):
         corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
         return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
-    def _actors(self, standing: Standing, start_s: float) -> tuple[Actor, ...]:
+    def _actors(self, standing: Standing, carrier: Track | None) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
         shapes: dict[Any, Mesh] = {}
-        meshes = [replace(self._shape(entry, shapes), name=entry.name) for entry in self.actors]
         with prefixed(self._source):
-            ways = [entry.way(self._folder, standing, start_s) for entry in self.actors]
-        return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
+            ways = [entry.way(self._folder, standing, carrier) for entry in self.actors]
+        out: list[Actor] = []
+        for entry, way in zip(self.actors, ways, strict=True):
+            if entry.is_robot:
+                out += self._links_of(entry, way)
+            else:
+                out.append(Actor(replace(self._shape(entry, shapes), name=entry.name), way))
+        return tuple(out)
+
+    def _links_of(self, entry: ActorSection, way: Track) -> tuple[Actor, ...]:
+        """Actors of a robot, without the links that sensors are mounted on."""
+        robot = self._robot(entry)
+        without = self._links.intersection(robot.meshes) if entry.trajectory is None else ()
+        for link in sorted(without):
+            self._notes.append(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
+        with prefixed(f"{self._source}: actor {entry.name!r}"):
+            return robot.actors(
+                way,
+                self._joints(entry),
+                name=entry.name,
+                without=without,
+                tell=self._notes.append,
+            )
+
+    def _robot(self, entry: ActorSection) -> Robot:
+        """Robot of an actor; those of one file are the same."""
+        file = entry.file
+        assert file is not None, "it is a robot"
+        if file not in self._robots:
+            with prefixed(self._source):
+                path = self._path(file.file)
+            self._robots[file] = load_robot(
+                path, opacity=file.opacity, colours=self.coloured, tell=self._notes.append
+            )
+        return self._robots[file]
+
+    def _joints(self, entry: ActorSection) -> Path | None:
+        return None if entry.joints is None else self._path(entry.joints)
+
+    @property
+    def _links(self) -> set[str]:
+        """Links of the carrier that sensors are mounted on."""
+        mounts = [self.mount, *(section.mount for section in self.sensors.values())]
+        return {mount.link for mount in mounts if mount is not None and mount.link is not None}
+
+    def _mount(self, mount: MountSection) -> Pose:
+        """Pose of a sensor in the carrier's axes."""
+        if mount.link is None:
+            return mount.pose()
+        carriers = [one for one in self.actors if one.trajectory is None and one.is_robot]
+        on = [entry for entry in carriers if mount.link in self._robot(entry).links]
+        if len(on) != 1:
+            links = [link for entry in carriers for link in self._robot(entry).links]
+            raise LidarpoolError(
+                f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
+                f"have; one must.{did_you_mean(mount.link, links)}"
+            )
+        (entry,) = on
+        with prefixed(f"actor {entry.name!r}"):
+            path = self._robot(entry).path(mount.link, joints=self._joints(entry))
+        if path.moves:
+            raise LidarpoolError(
+                f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "
+                "mount the sensor on a link that does not move, or leave out those joints' columns."
+            )
+        return path.pose(0).then(mount.pose())
 
     def _shape(
         self, entry: ActorSection | CopiesSection | VehicleSection, made: dict[Any, Mesh]
@@ -485,10 +574,15 @@ class Scenario(Section):
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
         for entry in placed:
+            if entry.semantic_class is None:
+                continue
             names, numbered = [escape(entry.name)], f"{escape(entry.name)}.[0-9]*"
             if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
                 names.append(numbered)
-            if entry.semantic_class is not None:
+            if isinstance(entry, ActorSection) and entry.is_robot:
+                links = [a.name for a in scene.actors if a.name.startswith(f"{entry.name}/")]
+                own += [(link, [escape(link)], entry.semantic_class) for link in links]
+            else:
                 own.append((entry.name, names, entry.semantic_class))
         for names, semantic_class in self.traffic.classes if self.traffic else ():
             rows = {name: rows_named(name, scene.all_names) for name in names}
@@ -570,9 +664,12 @@ class Scenario(Section):
     def _carried(self) -> list[Mounted]:
         """Return the sensors on their carrier."""
         if self.sensors:
-            return [section.mounted(self._folder, name) for name, section in self.sensors.items()]
+            return [
+                section.mounted(self._folder, name, self._mount(section.mount))
+                for name, section in self.sensors.items()
+            ]
         mount = MountSection() if self.mount is None else self.mount
-        return [Mounted(self.sensor.sensor(self._folder), mount.pose())]
+        return [Mounted(self.sensor.sensor(self._folder), self._mount(mount))]
 
     def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
         with prefixed(self._source):

@@ -161,10 +161,7 @@ def columns_of_table(
         If a column is missing, or a cell holds no finite number.
     """
     lines = text.splitlines()
-    # Remarks may come first, and some programs write # before the header as well.
-    first = next((i for i, line in enumerate(lines) if any(m in line for m in _MARKS)), 0)
-    mark = next((mark for mark in _MARKS if mark in lines[first]), ",")
-    head = [name.strip().strip('"') for name in lines[first].split(mark)]
+    first, mark, head = head_of_table(lines)
     if unknown := [name for name in names if name not in known]:
         raise ValueError(f"columns names {unknown[0]!r}; possible names are {', '.join(known)}")
     small = [name.lower() for name in head]
@@ -198,6 +195,14 @@ def columns_of_table(
                     ) from error
         raise
     return dict(zip(at, rows.T, strict=True))
+
+
+def head_of_table(lines: Sequence[str]) -> tuple[int, str, list[str]]:
+    """Line of a table's header, what separates its columns, and their names."""
+    # Remarks may come first, and some programs write # before the header as well.
+    first = next((i for i, line in enumerate(lines) if any(m in line for m in _MARKS)), 0)
+    mark = next((mark for mark in _MARKS if mark in lines[first]), ",")
+    return first, mark, [name.strip().strip('"') for name in lines[first].split(mark)]
 
 
 def _is_finite(cell: str) -> bool:

@@ -1,0 +1,532 @@
+"""Robots from URDF: kinematics, what is seen of links, and sensors that links carry."""
+
+from __future__ import annotations
+
+import pickle
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tests.lidarpool.test_moving import made, stored_positions
+
+from lidarpool import Actor, LidarpoolError, Pose, Scene, Survey, Track, load_robot, load_sensor
+from lidarpool.base.fingerprint import fingerprint
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.actors import box
+from lidarpool.scene.mesh import Mesh
+from lidarpool.sensor import Mounted, Stations
+from lidarpool.sensor.trajectory import presence_ns
+from lidarpool.simulator.motion import into_axes
+from lidarpool.simulator.rig import Rig
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+BOX = '<visual><geometry><box size="0.2 0.2 0.2"/></geometry></visual>'
+
+
+def robot_of(folder, *elements, name="robot.urdf", **options):
+    path = folder / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(f'<robot name="r">{"".join(elements)}</robot>')
+    return load_robot(path, **options)
+
+
+def link(name, inside=BOX):
+    return f'<link name="{name}">{inside}</link>'
+
+
+def joint(name, kind, parent, child, inside=""):
+    ends = f'<parent link="{parent}"/><child link="{child}"/>'
+    return f'<joint name="{name}" type="{kind}">{ends}{inside}</joint>'
+
+
+def visual(shape, origin=""):
+    return f"<visual>{origin}<geometry>{shape}</geometry></visual>"
+
+
+def turn(axis, angle):
+    """Rotation (4, 4) about x, y or z, written out."""
+    c, s, out = np.cos(angle), np.sin(angle), np.eye(4)
+    i, j = {"x": (1, 2), "y": (2, 0), "z": (0, 1)}[axis]
+    out[[i, i, j, j], [i, j, i, j]] = c, -s, s, c
+    return out
+
+
+def shift(*by):
+    out = np.eye(4)
+    out[:3, 3] = by
+    return out
+
+
+ARM = [
+    link("base"),
+    joint("seat", "fixed", "base", "plate", '<origin xyz="0.1 0.2 0.3" rpy="0.4 -0.5 0.6"/>'),
+    link("plate"),
+    joint(
+        "pan", "revolute", "plate", "upper",
+        '<origin xyz="0 0 0.5" rpy="0 0.2 0"/><axis xyz="0 0 2"/><limit lower="-1" upper="3"/>',
+    ),
+    link("upper"),
+    joint("slide", "prismatic", "upper", "rod", '<origin xyz="1 0 0"/><axis xyz="0 3 4"/>'),
+    link("rod"),
+    joint(
+        "tilt", "continuous", "rod", "tip",
+        '<axis xyz="0 1 0"/><mimic joint="pan" multiplier="-2" offset="0.5"/>',
+    ),
+    link("tip"),
+]  # fmt: skip
+
+
+def tip_at(pan, slide):
+    rpy = turn("z", 0.6) @ turn("y", -0.5) @ turn("x", 0.4)
+    fixed = shift(0.1, 0.2, 0.3) @ rpy @ shift(0, 0, 0.5) @ turn("y", 0.2)
+    rod = fixed @ turn("z", pan) @ shift(1, 0, 0) @ shift(0, 0.6 * slide, 0.8 * slide)
+    return rod @ turn("y", -2 * pan + 0.5)
+
+
+def test_a_link_is_where_the_joints_before_it_put_it(tmp_path):
+    robot = robot_of(tmp_path, *ARM)
+    assert robot.moving == ("pan", "slide", "tilt")
+    for pan, slide in ((0.0, 0.0), (0.7, 0.3), (2.9, -1.5)):
+        pose = robot.path("tip", joints={"pan": pan, "slide": slide}).pose(0)
+        expected = tip_at(pan, slide)
+        assert np.allclose(pose.position, expected[:3, 3], atol=1e-14)
+        assert np.allclose(pose.rotation, expected[:3, :3], atol=1e-13)
+    # On a base that moves, at times between the given values, which are linear in time.
+    half = np.sqrt(0.5)
+    base = Track([10, 14], [[0, 0, 0], [8, 0, 0]], [[0, 0, half, half]] * 2, start_s=11)
+    values = {"time_s": [10, 12, 15], "pan": [0, 1, 2.5], "slide": [0.5, -0.5, 0.7]}
+    path = robot.path("tip", base, values)
+    assert (path.duration_ns, path.stations, path.moves) == (3e9, 1, True)
+    seconds = np.array([0.0, 0.5, 1.7, 2.999])
+    positions, rotations = path.poses(0, seconds * 1e9)
+    for k, at in enumerate(seconds + 11):
+        expected = (
+            shift(2 * (at - 10), 0, 0)
+            @ turn("z", np.pi / 2)
+            @ tip_at(*(np.interp(at, values["time_s"], values[name]) for name in ("pan", "slide")))
+        )
+        assert np.allclose(positions[k], expected[:3, 3], atol=1e-13)
+        assert np.allclose(rotations[k], expected[:3, :3], atol=1e-13)
+    # The same bits, however many times there are.
+    times = np.linspace(0, 3e9, 1001)
+    whole = path.poses(0, times)
+    for first, last in pairwise((0, 1, 2, 9, 500, 1001)):
+        for one, all_ in zip(path.poses(0, times[first:last]), whole, strict=True):
+            assert (one == all_[first:last]).all()
+    there = Track([10, 12], [[0, 0, 0], [8, 0, 0]], beyond="absent")
+    assert presence_ns(robot.path("tip", there, values)) == (0, 2e9)
+    again = pickle.loads(pickle.dumps(path))
+    assert (again.poses(0, times)[0] == whole[0]).all()
+    assert fingerprint(again) == fingerprint(path)
+    other = robot.path("tip", base, values | {"pan": [0, 1, 2.4]})
+    assert fingerprint(other) != fingerprint(path)
+
+
+def test_links_that_are_fixed_to_one_another_are_one_actor(tmp_path):
+    notes = []
+    robot = robot_of(tmp_path, *ARM)
+    actors = robot.actors(joints={"pan": 3.5}, name="Arm", tell=notes.append)
+    assert [actor.name for actor in actors] == ["Arm/base", "Arm/upper", "Arm/rod", "Arm/tip"]
+    assert [len(actor.mesh.faces) for actor in actors] == [24, 12, 12, 12]
+    assert notes == ["r: joint pan goes from 3.5 to 3.5, beyond its limits of -1 to 3"]
+    (plate,) = robot.actors(without=["base", "upper", "rod", "tip"])
+    corner = shift(0.1, 0.2, 0.3) @ turn("z", 0.6) @ turn("y", -0.5) @ turn("x", 0.4)
+    cube = corner[:3, :3] @ (box("", (0.2, 0.2, 0.2)).vertices - [0, 0, 0.1]).T
+    assert np.allclose(plate.mesh.vertices - [0.1, 0.2, 0.3], cube.T, atol=1e-15)
+    assert plate.name == "r/base", "the same name, whatever is left out"
+    again = robot.actors(name="Other", tell=notes.append)
+    assert all(a.mesh.vertices is b.mesh.vertices for a, b in zip(actors, again, strict=True))
+    # A joint without a value is at zero, or at its limit nearest to zero.
+    limits = '<limit lower="0.2" upper="0.5"/>'
+    near = robot_of(tmp_path, link("a"), link("b"), joint("j", "prismatic", "a", "b", limits))
+    assert near.path("b").pose(0) == Pose((0.2, 0.0, 0.0))
+
+
+def test_shapes_and_their_colours(tmp_path):
+    (tmp_path / "quad.obj").write_text("v 0 0 0\nv 1 0 0\nv 1 1 0\nv 0 1 0\nf 1 2 3 4\n")
+    red = '<material name="red"/>'
+    shapes = {
+        "box": ('<box size="1 2 3"/>', (1, 2, 3)),
+        "ball": ('<sphere radius="0.5"/>', (1, 1, 1)),
+        "rod": ('<cylinder radius="0.5" length="4"/>', (1, 1, 4)),
+        "pill": ('<capsule radius="0.5" length="4"/>', (1, 1, 5)),
+        "mesh": ('<mesh filename="quad.obj" scale="2 -3 1"/>', (2, 3, 0)),
+    }
+    turned = '<origin xyz="0 0 9" rpy="0 0 1.5707963267948966"/>'
+    links = [
+        link(name, visual(shape, turned).replace("</visual>", red + "</visual>"))
+        for name, (shape, _) in shapes.items()
+    ]
+    joints = [joint(name, "fixed", "box", name) for name in list(shapes)[1:]]
+    colour = '<material name="red"><color rgba="1 0.5 0 1"/></material>'
+    robot = robot_of(tmp_path, *links, *joints, colour, colours=True)
+    for name, (_, (x, y, z)) in shapes.items():
+        mesh = robot.meshes[name]
+        assert np.allclose(np.ptp(mesh.bounds, axis=0), (y, x, z), rtol=2e-3), name
+        assert mesh.colours.means()[0].tolist() == [255, 128, 0]
+    assert robot_of(tmp_path, *links, *joints, colour).meshes["box"].colours is None
+    # Mirrored by a negative scale: faces still look the same way.
+    corners = robot.meshes["mesh"].vertices[robot.meshes["mesh"].faces]
+    assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] > 0).all()
+
+
+DAE = """<COLLADA version="1.4.1"><asset><unit meter="0.01"/><up_axis>Y_UP</up_axis></asset>
+<library_geometries><geometry id="g"><mesh><source id="s"><float_array id="f" count="9">
+0 0 0 100 0 0 0 0 300</float_array><technique_common><accessor source="#f" count="3" stride="3"/>
+</technique_common></source><vertices id="v"><input semantic="POSITION" source="#s"/></vertices>
+<triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles>
+</mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="w"><node>
+<instance_geometry url="#g"/></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#w"/></scene></COLLADA>"""
+
+
+def test_mesh_files_of_packages(tmp_path):
+    package = tmp_path / "ws" / "my_robot"
+    for file in (package / "meshes" / "leg.dae", tmp_path / "ws" / "other" / "leg.dae"):
+        file.parent.mkdir(parents=True)
+        file.write_text(DAE)
+    (tmp_path / "secret.dae").write_text(DAE)
+    (package / "package.xml").write_text("<package><name>robot_description</name></package>")
+
+    def read(name):
+        return robot_of(package / "urdf", link("leg", visual(f'<mesh filename="{name}"/>')))
+
+    for name in (
+        "../meshes/leg.dae",
+        "package://my_robot/meshes/leg.dae",
+        "package://robot_description/meshes/leg.dae",
+        "package://other/leg.dae",
+        f"file://{package}/meshes/leg.dae",
+    ):
+        # In metres by its unit; with the axes of the file, as RViz takes it.
+        assert read(name).meshes["leg"].bounds[1].tolist() == [1, 0, 3], name
+    for name, words in (
+        ("../../../secret.dae", "outside the package"),
+        ("package://my_robot/../../secret.dae", "outside the package"),
+        (f"file://{tmp_path}/secret.dae", "outside the package"),
+        ("package://../secret.dae", "package that is not there"),
+        ("package://unknown/leg.dae", "put the .urdf into the folder 'unknown'"),
+        ("../meshes/arm.dae", "does not exist"),
+        ("http://example.org/leg.dae", "must be a file's name"),
+    ):
+        with pytest.raises(LidarpoolError, match=words) as caught:
+            read(name)
+        assert "link 'leg'" in str(caught.value) and len(str(caught.value).splitlines()) == 1
+    (package / "package.xml").unlink()  # now the folder above the file's counts
+    assert read("../meshes/leg.dae").meshes
+    with pytest.raises(LidarpoolError, match="outside the package"):
+        read("../../other/leg.dae")
+
+
+HINGE = joint("j", "revolute", "a", "b")
+BROKEN = {
+    "it has no link": [],
+    "two links have the name 'a'": [link("a"), link("a")],
+    "not connected": [link("a"), link("b")],
+    "no link is the root": [link("a"), link("b"), HINGE, joint("k", "fixed", "b", "a")],
+    "'b' go round in a circle": [
+        link("a"), link("b"), link("c"),
+        joint("j", "fixed", "b", "c"), joint("k", "fixed", "c", "b"),
+    ],
+    "two joints that hold it": [link("a"), link("b"), HINGE, joint("k", "fixed", "a", "b")],
+    "its child 'c' is no link": [link("a"), joint("j", "fixed", "a", "c")],
+    "its type is 'ball'": [link("a"), link("b"), joint("j", "ball", "a", "b")],
+    "its axis has no direction": [
+        link("a"), link("b"), joint("j", "revolute", "a", "b", '<axis xyz="0 0 0"/>'),
+    ],
+    "mimics 'x', which does not move": [
+        link("a"), link("b"), joint("j", "revolute", "a", "b", '<mimic joint="x"/>'),
+    ],
+    "mimics itself": [
+        link("a"), link("b"), joint("j", "revolute", "a", "b", '<mimic joint="j"/>'),
+    ],
+    "xyz of <origin> is 'nan 0 0'": [
+        link("a"), link("b"), joint("j", "fixed", "a", "b", '<origin xyz="nan 0 0"/>'),
+    ],
+    "by xacro first": [link("a", visual('<box size="${w} 1 1"/>'))],
+    "must be 3 finite numbers": [link("a", visual('<box size="1 1e300 1"/>'))],
+    "must not be negative": [link("a", visual('<sphere radius="-1"/>'))],
+    "its shape is <cone>": [link("a", visual("<cone/>"))],
+    "nothing to see": [link("a", "")],
+    "at most 1,000 are read": [link(f"l{k}") for k in range(1001)],
+    "would unpack to": [link("a", visual('<sphere radius="1"/>') * 4000)],
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("words", BROKEN)
+def test_broken_robots_are_refused_in_a_line(tmp_path, words):
+    with pytest.raises(LidarpoolError) as caught:
+        robot_of(tmp_path, *BROKEN[words])
+    assert words in str(caught.value)
+    assert len(str(caught.value).splitlines()) == 1 and len(str(caught.value)) < 500
+
+
+def test_xacro_other_files_and_garbled_copies(tmp_path):
+    path = tmp_path / "arm.urdf"
+    for text, words in (
+        (
+            "<robot xmlns:xacro='http://ros.org/wiki/xacro'><xacro:arm/></robot>",
+            "xacro arm.urdf > arm.exp",
+        ),
+        ("<robot><xacro:arm/></robot>", "xacro arm.urdf > arm.expanded.urdf"),
+        ("<sdf version='1.7'/>", "convert an SDF"),
+        ("<!DOCTYPE r [<!ENTITY a 'b'>]><robot>&a;</robot>", "XML entity"),
+    ):
+        path.write_text(text)
+        with pytest.raises(LidarpoolError, match=words):
+            load_robot(path)
+    with pytest.raises(LidarpoolError, match=r"xacro arm.urdf.xacro > arm.urdf"):
+        (tmp_path / "arm.urdf.xacro").write_text("<robot/>")
+        load_robot(tmp_path / "arm.urdf.xacro")
+    with pytest.raises(LidarpoolError, match="cannot be read"):
+        load_robot(tmp_path / "none.urdf")
+    whole, rng, read = (EXAMPLES / "rover.urdf").read_bytes(), np.random.default_rng(0), 0
+    for _ in range(150):
+        data = bytearray(whole)
+        for at in rng.integers(0, len(data), rng.integers(1, 4)):
+            data[at] = rng.integers(32, 127)
+        path.write_bytes(data[: rng.integers(0, len(data))] if rng.random() < 0.2 else data)
+        try:
+            read += bool(load_robot(path, colours=True, tell=lambda line: None).actors())
+        except LidarpoolError as error:
+            assert len(str(error).splitlines()) == 1
+    assert 5 < read < 140
+
+
+def test_what_is_left_out_is_told(tmp_path):
+    notes = []
+    robot = robot_of(
+        tmp_path,
+        link("a", visual('<box size="1 1 1"/>') + visual('<box size="1 0 1"/>')),
+        link("b", "<collision><geometry><box size='1 1 1'/></geometry></collision>"),
+        joint("j", "floating", "a", "b"),
+        tell=notes.append,
+    )
+    assert list(robot.meshes) == ["a"] and not robot.moving
+    held, collide, flat = notes
+    assert held.endswith("joint j is floating: it stays at zero")
+    assert collide.endswith("collision shapes and no visual ones, and are left out: b")
+    assert flat.endswith("shapes of size zero, which are left out: a")
+
+
+def test_tables_of_joints(tmp_path):
+    robot, table, notes = robot_of(tmp_path, *ARM), tmp_path / "joints.csv", []
+    table.write_text("time_ns;pan;effort\n0;0;1\n1000000000;1;1\n")
+    (*_, tip) = robot.actors(joints=table, tell=notes.append)
+    assert np.allclose(tip.trajectory.pose(0, 5e8).position, tip_at(0.5, 0)[:3, 3])
+    assert notes == [f"{table} has columns of no joint that moves: effort"]
+    with pytest.raises(LidarpoolError, match=r"'r/tip': The joints have values from 0 to 1 s"):
+        tip.check(0, 2e9)
+    for text, words in (
+        ("", "it is empty"),
+        ("time_s,seat\n0,1\n", "of no joint that moves: name its columns.*pan, slide, tilt"),
+        ("pan,slide\n0,1\n", "no column 'time_s'"),
+        ("time_s,pan\n0,nan\n", "has 'nan' in line 2"),
+        ("time_s,pan\n1,0\n0,0\n", "must be finite, and ascend"),
+    ):
+        table.write_text(text)
+        with pytest.raises(LidarpoolError, match=words):
+            robot.actors(joints=table)
+    for given, words in (
+        ({"pam": 1}, "no joint 'pam' that moves. Did you mean 'pan'"),
+        ({"pan": [0, 1]}, "one for each time_s"),
+        ({"time_s": [0, 1], "pan": [0, np.inf]}, "must be finite"),
+    ):
+        with pytest.raises(LidarpoolError, match=words):
+            robot.actors(joints=given)
+    with pytest.raises(LidarpoolError, match=r"no link 'tin'\. Did you mean 'tip'"):
+        robot.path("tin")
+
+
+@pytest.fixture(scope="module")
+def ground():
+    corners = np.array([[-50, -50, 0], [50, -50, 0], [50, 50, 0], [-50, 50, 0.0]])
+    return Scene.from_meshes([Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))])
+
+
+COLUMNS = ["ray", "time", "range", "triangle", "intensity"]
+DRIVE = Track(
+    [0, 0.2, 0.4],
+    [[0, 0, 0], [2, 0, 0], [4, 1, 0]],
+    [[0, 0, np.sin(a), np.cos(a)] for a in (0, 0.1, 0.3)],
+    smooth=True,
+)
+MOTION = {
+    "time_s": np.linspace(0, 0.4, 5),
+    "front_left": np.linspace(0, 12, 5),
+    "turret": np.array([-0.5, 1.0, 0.2, 2.0, -1.0]),
+    "shoulder": np.array([0, 0.6, 0.2, -0.3, 0.1]),
+    "elbow": np.array([1.5, 0.2, 0.9, 2.0, 1.0]),
+}
+
+
+def rover_at(name, time_ns):
+    """Matrix (4, 4) of what a link of the example moves with, written out."""
+    at = np.eye(4)
+    (at[:3, 3],), (at[:3, :3],) = DRIVE.poses(0, np.array([time_ns]))
+    value = {joint: np.interp(time_ns / 1e9, MOTION["time_s"], MOTION[joint]) for joint in MOTION}
+    if "wheel" in name:
+        right, rear = "right" in name, "rear" in name
+        at = at @ shift(0.34 - 0.68 * rear, 0.34 - 0.68 * right, 0.18)
+        return at if right else at @ turn("y", value["front_left"])
+    chain = {
+        "shoulder_block": shift(0.3, 0, 0.4) @ turn("z", value["turret"]),
+        "upper_arm": shift(0, 0, 0.16) @ turn("y", value["shoulder"]),
+        "forearm": shift(0, 0, 0.4) @ turn("y", value["elbow"]),
+        "finger": shift(0, 0.015 if "left" in name else -0.015, 0.43),
+    }
+    if name != "base_link":
+        for part, step in chain.items():
+            at = at @ step
+            if part in name:
+                break
+    return at
+
+
+def test_a_sensor_sees_its_own_robot_where_it_is_at_the_time_of_each_ray(ground):
+    robot = load_robot(EXAMPLES / "rover.urdf")
+    actors = robot.actors(DRIVE, MOTION, without=["lidar"])
+    scene = ground.with_actors(actors)
+    mount = robot.path("lidar").pose(0).then(Pose((0, 0, 0.26), pitch_deg=35))
+    assert np.allclose(mount.position, (-0.36, 0, 0.3 + 0.13 + 0.61 + 0.26))
+    sensor = load_sensor("velodyne/vlp16", min_range_m=0)
+    survey = Survey(
+        sensors=[Mounted(sensor, mount)], trajectory=DRIVE, columns=COLUMNS, precision_m=1e-4
+    )
+    batches = list(Rig(scene, survey, "numpy").cast(0, survey.scan_count))
+    hits = dict.fromkeys(scene.all_names, 0)
+    for batch in batches:
+        # Where the sensor was when the ray was fired, with poses made here.
+        place, rotation = DRIVE.poses(0, batch.time.astype(np.float64))
+        origins = place + into_axes(
+            np.broadcast_to(mount.position, place.shape), rotation.transpose(0, 2, 1)
+        )
+        ranges = np.linalg.norm(batch.positions - origins, axis=1)
+        assert np.allclose(ranges, batch.range, atol=2e-5)  # straight between firings
+        for number, actor in enumerate(actors, 1):
+            on = np.flatnonzero(batch.object == number)
+            if not len(on):
+                continue
+            hits[actor.name] += len(on)
+            on = on[:: max(1, len(on) // 300)]  # of these
+            own = []
+            for time, point in zip(batch.time[on], batch.positions[on], strict=True):
+                at = rover_at(actor.name.partition("/")[2], float(time))
+                own.append((point - at[:3, 3]) @ at[:3, :3])
+            first = len(ground.faces) + sum(len(a.mesh.faces) for a in actors[: number - 1])
+            corners = actor.mesh.vertices[actor.mesh.faces[batch.triangle[on] - first]]
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+            off = ((own - corners[:, 0]) * normals).sum(axis=1)
+            assert np.abs(off).max() < 1e-6, actor.name
+    seen = {name.partition("/")[2] for name, count in hits.items() if count > 5}
+    assert {"base_link", "upper_arm", "forearm", "front_left_wheel", "front_right_wheel"} <= seen
+    # The same bytes in batches of any size, and on any backend.
+    whole = made(survey, scene)
+    for backend, each in (("numpy", 7), ("embree", 50)):
+        rig = Rig(scene, survey, backend)
+        parts = [
+            batch
+            for first in range(0, survey.scan_count, each)
+            for batch in rig.cast(first, min(first + each, survey.scan_count))
+        ]
+        for column in survey.stored_columns:
+            assert (np.concatenate([column.make(p) for p in parts]) == whole[column.name]).all()
+    assert len(stored_positions(whole)) > 5000
+
+
+def test_a_sensor_on_a_link_that_moves(ground):
+    """In Python a survey may follow any link."""
+    hand = load_robot(EXAMPLES / "rover.urdf").path("hand", DRIVE, MOTION)
+    mounted = [Mounted(load_sensor("velodyne/vlp16"), Pose((0, 0, 0.1), roll_deg=20))]
+    survey = Survey(sensors=mounted, trajectory=hand, columns=["time"], precision_m=1e-4)
+    found = made(survey, ground)
+    heights = stored_positions(found, 1e-4)[:, 2]
+    assert len(heights) > 5000 and np.abs(heights).max() <= 1e-4
+    assert found["time"].max() > 0.39e9
+
+
+SCENARIO = {
+    "scene": {"copies": [{"name": "Crate", "box": [1, 1, 1], "at": [[3, 3, 0]]}]},
+    "trajectory": {
+        "points": [{"time_s": 5, "position": [0, 0, 0]}, {"time_s": 7, "position": [2, 0, 0]}]
+    },
+    "sensor": {"model": "velodyne/vlp16"},
+    "planning": {"enabled": False},
+}  # fmt: skip
+ROVER = {"name": "Rover", "file": "rover.urdf", "joints": "joints.csv"}
+
+
+@pytest.fixture
+def folder(tmp_path):
+    (tmp_path / "rover.urdf").write_bytes((EXAMPLES / "rover.urdf").read_bytes())
+    (tmp_path / "joints.csv").write_text("time_s,turret,elbow\n5,0,1\n7,1,2\n")
+    return tmp_path
+
+
+def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
+    data = SCENARIO | {
+        "actors": [
+            ROVER | {"class": 7},
+            {"name": "Box", "box": [1, 1, 1]},
+            {"name": "Arm", "file": "rover.urdf",
+             "trajectory": {"points": [{"time_s": 4, "position": [9, 0, 0]},
+                                       {"time_s": 8, "position": [9, 1, 0]}]}},
+        ],
+        "mount": {"link": "lidar", "position": [0, 0, 0.036], "yaw_deg": 90},
+        "materials": [{"objects": "*"}, {"objects": "Rover/*wheel", "reflectance": 0.1}],
+    }  # fmt: skip
+    scenario = Scenario.from_data(data, folder=folder)
+    scene = scenario.build_scene()
+    actors = {actor.name: actor for actor in scene.actors}
+    assert [name for name in actors if name.startswith("Rover/")][:2] == [
+        "Rover/base_link", "Rover/front_left_wheel",
+    ]  # fmt: skip
+    assert (
+        len(actors["Arm/base_link"].mesh.faces) - len(actors["Rover/base_link"].mesh.faces) == 256
+    )
+    assert actors["Box"].trajectory.pose(0, 1e9) == Pose((1.0, 0.0, 0.0))
+    turret = actors["Rover/shoulder_block"].trajectory.pose(0, 1e9)
+    assert np.allclose([*turret.position, turret.yaw_deg], [1.3, 0, 0.4, np.degrees(0.5)])
+    survey = scenario.survey(scene)
+    (carried,) = survey.carried
+    assert np.allclose(carried.mount.position, (-0.36, 0, 1.076))
+    assert carried.mount.yaw_deg == pytest.approx(90)
+    kinds = {name: [m for m in survey.materials if m.named(name)][-1] for name in actors}
+    assert kinds["Rover/rear_left_wheel"].reflectance == 0.1
+    assert {kinds[name].semantic_class == 7 for name in actors if "Rover/" in name} == {True}
+    assert kinds["Arm/base_link"].semantic_class != 7
+    notes = scenario.advice(scene)
+    assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
+    assert scenario.robots["Rover"].startswith("14 links, 6,592 triangles; 9 of its joints move")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"trajectory": None, "poses": [[0, 0, 1]]}, "give the survey a trajectory"),
+        ({"actors": []}, "no robot is the carrier"),
+        ({"mount": {"link": "lidor"}}, "no robots on the carrier have.*Did you mean 'lidar'"),
+        ({"mount": {"link": "hand"}}, "'hand', which joints.csv moves"),
+        ({"actors": [ROVER | {"name": name} for name in "AB"]}, "which 2 robots on the carrier"),
+        ({"actors": [{"name": "B", "box": [1, 1, 1], "joints": "a.csv"}]}, "those of a robot"),
+        ({"actors": [{"name": "R", "file": {"file": "rover.urdf", "scale": 2}}]}, "just its file"),
+    ],
+)
+def test_scenarios_that_do_not_fit_their_robot(folder, change, words):
+    data = SCENARIO | {"actors": [ROVER], "mount": {"link": "lidar"}} | change
+    data = {key: value for key, value in data.items() if value is not None}
+    with pytest.raises(LidarpoolError, match=words):
+        scenario = Scenario.from_data(data, folder=folder)
+        scenario.survey(scenario.build_scene())
+
+
+def test_a_robot_in_a_loop_is_placed_link_by_link(ground):
+    robot = load_robot(EXAMPLES / "rover.urdf")
+    at = Stations((Pose((3, 0, 0), yaw_deg=90),))
+    base, hand = (robot.path(name, at, {"elbow": 1.0}) for name in ("base_link", "hand"))
+    assert isinstance(hand, Stations)
+    assert base.pose(0).position == (3, 0, 0.3)
+    actor = Actor(robot.meshes["hand"], hand)
+    assert np.allclose(actor.placed(0).bounds.mean(axis=0), hand.pose(0).position, atol=1e-9)
