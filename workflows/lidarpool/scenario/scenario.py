@@ -403,7 +403,7 @@ class Scenario(Section):
         start = 0.0 if carrier is None else carrier.start_s
         assert start is not None  # of every track
         actors = (*self._actors(standing, carrier), *self._traffic(scene, standing, start))
-        return replace(scene, actors=actors)
+        return scene.with_actors(actors)
 
     def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
         """Return the trajectory in the coordinates of a scene; it is made once."""
