@@ -22,14 +22,15 @@ from ..columns.table import COLOURS
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
+from ..scene.cityjson import CLASSES as CITY_CLASSES
 from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.meshfile import CITYJSON, SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
-from ..sensor.materials import rows_named
+from ..sensor.materials import rows_named, with_classes
 from ..sensor.survey import SENSORS_MOST, Steps
 from .copies import Standing, copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
@@ -408,7 +409,7 @@ class Scenario(Section):
         return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
 
     def _materials(self, scene: Scene) -> list[Material]:
-        """Materials by name, and those of actors and copies that have a class of their own."""
+        """Materials by name, with the classes of actors and copies, and of city objects."""
         made = [Material(**dict(entry)) for entry in self.materials]
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own = [(one, one.semantic_class) for one in placed if one.semantic_class is not None]
@@ -422,6 +423,8 @@ class Scenario(Section):
             if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
                 objects.append(numbered)
             made.insert(after + 1, replace(of, objects=objects, semantic_class=semantic_class))
+        if any(entry.file.lower().endswith(CITYJSON) for entry in self.scene.files):
+            made = with_classes(made or [Material("*")], CITY_CLASSES, scene.all_names)
         return made
 
     def survey(self, scene: Scene) -> Survey:

@@ -69,7 +69,8 @@ class MeshFile(Section):
     file: Annotated[
         str,
         told(
-            ".glb .gltf .obj .stl .ply .off .dae .3mf or .usd, from the scenario's folder",
+            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd or CityJSON (.city.json), from the "
+            "scenario's folder",
             min_length=1,
             max_length=4096,
         ),

@@ -45,6 +45,7 @@ class Content:
     unit_note: str = ""  # clause on a unit that it does not state
     skipped: list[str] = field(default_factory=list)  # names of objects that nodes scale to zero
     notes: list[str] = field(default_factory=list)  # clauses that follow the file's name
+    epsg: int | None = None  # code of the reference system that it states
 
 
 @dataclass

@@ -123,7 +123,7 @@ class Scene:
         opacity: Opacity = "mask",
         colours: bool = False,
     ) -> Scene:
-        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf .usd .usda .usdc .usdz.
+        """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf .usd, or CityJSON.
 
         Parameters
         ----------
@@ -142,8 +142,8 @@ class Scene:
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj). With "ignore", triangles are solid, and no image is read.
         colours
-            Whether to read base colours and their images (.glb, .gltf, .obj, .dae), and colours of
-            vertices (.glb, .gltf, .obj, .ply, .off).
+            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, CityJSON without
+            images), and colours of vertices (.glb, .gltf, .obj, .ply, .off).
 
         Raises
         ------
