@@ -85,7 +85,7 @@ def read_cityjson(data: bytes, path: Path, colours: bool) -> Content:
 
 def _unpacked(text: bytes) -> int:
     """Bytes that JSON takes at most while it is read."""
-    return 2 * len(text) + 100 * text.count(b"[") + 300 * text.count(b"{") + 48 * text.count(b",")
+    return 5 * len(text) + 100 * text.count(b"[") + 300 * text.count(b"{") + 48 * text.count(b",")
 
 
 class _City:
@@ -184,7 +184,10 @@ class _City:
             try:
                 for (outline, *holes), material in self._surfaces(geometries):
                     if holes:
-                        found = with_holes(points, [_whole(ring) for ring in (outline, *holes)])
+                        rings = [_whole(ring) for ring in (outline, *holes)]
+                        found = with_holes(
+                            points, [r for r in rings if r is rings[0] or len(r) > 2]
+                        )
                         cut.append(found)
                         cut_owners += [(number, material)] * len(found)
                     else:
@@ -244,22 +247,20 @@ class _City:
                 if kinds.get(kind) in _OPEN:
                     self._left[kinds[kind]] += 1
                     continue
-                outline, *holes = rings
-                if len(outline) > 2:
-                    painted = -1 if material is None else int(material)
-                    yield [outline, *(hole for hole in holes if len(hole) > 2)], painted
+                yield rings, -1 if material is None else int(material)
 
     def content(self) -> Content:
         """All objects, in metres."""
         found = re.search(r"EPSG\b.*?(\d+)$", str(self._reference()))
         epsg = int(found[1]) if found else None
-        bounds = [mesh.bounds + matrix[:3, 3] for mesh, matrix, _ in self._placed]
-        width, depth, height = np.ptp(np.reshape(bounds or [[0, 0, 0]], (-1, 3)), axis=0)
-        near = not bounds or np.abs(np.array(bounds)[..., :2]).max() <= 360
+        ends = [np.zeros((1, 3)), *(mesh.bounds + at[:3, 3] for mesh, at, _ in self._placed)]
+        corners = np.concatenate(ends)[bool(self._placed) :]
+        width, depth, height = np.ptp(corners, axis=0)
+        near = np.abs(corners[:, :2]).max() <= 360
         if epsg in _DEGREES or (near and height > _STEEP * max(width, depth)):
             raise MeshFileError(
                 f"has coordinates in degrees{f' (EPSG:{epsg})' if epsg else ''}, and metres are "
-                "needed: reproject it, for example by citygml-tools or FME"
+                "needed: reproject it, for example by cjio FILE crs_reproject EPSG save NEW"
             )
         content = settled(self._placed)
         content.unit_m, content.up_axis, content.epsg = 1.0, "z", epsg
