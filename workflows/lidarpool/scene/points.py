@@ -7,6 +7,9 @@ from, and closed what is open, so that a tenth of the ranges were wrong by more 
 
 from __future__ import annotations
 
+import io
+import struct
+from collections.abc import Callable
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -18,11 +21,11 @@ from ..base.allowance import bytes_of, check_fits, memory
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError, prefixed
 from ..base.open3d_module import load_open3d
+from ..base.words import printable
 from .instances import FARTHEST_M
 from .mesh import Mesh
+from .polygon_files import read_ply_points
 from .scene import Scene
-
-SUFFIXES = (".ply", ".pcd", ".xyz", ".xyzn", ".xyzrgb", ".pts", ".las", ".laz")
 
 # Chosen on scans of a city, from 7 to 30 neighbours and 0.7 to 1.4: more of either closes more gaps
 # between points, and makes surfels reach farther beyond edges.
@@ -30,6 +33,7 @@ _NEIGHBOURS, _EXTENT = 12, 0.85
 _MOST_VOXELS = 3  # that half a surfel is long: distant and stray points have no neighbours
 _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
+_RECORD = 54  # least bytes of a variable-length record of .las, all before the first point
 _BYTES = 700  # for a point while its surfel is made and written
 
 Float = NDArray[np.float64]
@@ -45,7 +49,8 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     Parameters
     ----------
     path
-        One of `SUFFIXES`; .las and .laz need laspy. In metres, Z-up.
+        .ply, .pcd, .xyz (x, y and z are the first numbers of a line), .las or .laz, which need
+        laspy. In metres, Z-up.
     voxel_m
         Edge of the cubes in each of which all points become their mean. By default the median
         distance of points to the eighth of their neighbours.
@@ -73,13 +78,14 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     voxel_m = voxel_m or _spacing(o3d, points)
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     del points
-    if voxel_m:
-        try:
-            cloud = cloud.voxel_down_sample(voxel_m)
-        except RuntimeError as error:
-            raise LidarpoolError(
-                f"{path} is too wide for voxels of {voxel_m:.3g} m: give a larger voxel_m."
-            ) from error
+    if not voxel_m:
+        raise LidarpoolError(f"{path} has most of its points in the same places: give voxel_m.")
+    try:
+        cloud = cloud.voxel_down_sample(voxel_m)
+    except RuntimeError as error:
+        raise LidarpoolError(
+            f"{path} is too wide for voxels of {voxel_m:.3g} m: give a larger voxel_m."
+        ) from error
     count = len(cloud.points)
     if count * _BYTES > memory() // 2:
         raise LidarpoolError(
@@ -131,17 +137,21 @@ def _read(path: Path) -> Float:
             f"{' '.join(SUFFIXES)}."
         )
     try:
-        with prefixed(path), path.open("rb"):
+        with prefixed(path):
             check_fits(path)
-        points = _read_las(path) if suffix in (".las", ".laz") else _read_open3d(path)
+            points = _READERS[suffix](path)
+    except LidarpoolError:
+        raise
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
-    good = np.isfinite(points).all(axis=1)
-    points = points[good]
+    except Exception as error:  # readers raise whatever they stumble over
+        reason = printable(str(error))[:200] or type(error).__name__
+        raise LidarpoolError(f"{path} is broken or cut short ({reason}).") from error
+    points = points[np.isfinite(points).all(axis=1)]  # depth cameras write NaN where nothing is
     if len(points) < _NEIGHBOURS:
         raise LidarpoolError(
-            f"{path} has {len(points)} points that can be read, and at least {_NEIGHBOURS} are "
-            "needed: it is empty, cut short, or no point cloud."
+            f"{path} has {len(points)} points, and at least {_NEIGHBOURS} are needed: it is empty, "
+            "cut short, or no point cloud."
         )
     if (reach := np.abs(points).max()) > FARTHEST_M:
         raise LidarpoolError(
@@ -151,30 +161,50 @@ def _read(path: Path) -> Float:
     return points
 
 
-def _read_open3d(path: Path) -> Float:
-    o3d = load_open3d()
-    quiet = o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error)
-    try:
-        with quiet:
-            return np.array(o3d.io.read_point_cloud(str(path)).points)
-    except (RuntimeError, MemoryError) as error:
-        raise LidarpoolError(f"{path} is broken or cut short ({error}).") from error
+def _read_pcd(path: Path) -> Float:
+    """Read text here, of which Open3D does not see that it is cut; the other kinds by Open3D."""
+    head, _, rest = path.read_bytes().partition(b"\nDATA ")
+    lines = {words[0]: words[1:] for words in map(str.split, head.decode("latin-1").splitlines())
+             if words}  # fmt: skip
+    count = int(lines["POINTS"][0])
+    if not 0 <= count <= len(rest):
+        raise ValueError(f"{count:,} points announced, but there are fewer")
+    if rest.startswith(b"ascii"):
+        columns = [lines["FIELDS"].index(axis) for axis in "xyz"]
+        points = np.loadtxt(io.BytesIO(rest), usecols=columns, skiprows=1, ndmin=2)
+    else:
+        o3d = load_open3d()
+        with o3d.utility.VerbosityContextManager(o3d.utility.VerbosityLevel.Error):
+            points = np.array(o3d.io.read_point_cloud(str(path), remove_nan_points=False).points)
+    if len(points) != count:
+        raise ValueError(f"{count:,} points announced, and {len(points):,} are there")
+    return points
 
 
 def _read_las(path: Path) -> Float:
     if find_spec("laspy") is None:
-        raise LidarpoolError(f'{path} is read by laspy: pip install "lidarpool[las]"')
+        raise LidarpoolError('it is read by laspy: pip install "lidarpool[las]"')
     import laspy  # an extra
 
-    try:
-        with laspy.open(path) as file:
-            if (size := file.header.point_count * _BYTES) > memory():
-                raise LidarpoolError(
-                    f"{path} has {file.header.point_count:,} points, which take {bytes_of(size)} "
-                    "of memory: thin it first."
-                )
-            return np.array(file.read().xyz)
-    except LidarpoolError:
-        raise
-    except Exception as error:  # laspy and lazrs raise whatever they stumble over
-        raise LidarpoolError(f"{path} is broken or cut short ({error}).") from error
+    with path.open("rb") as start:
+        first, records = struct.unpack("<II", start.read(104)[96:])
+    if _RECORD * records > first:  # laspy would go through four thousand million of them
+        raise ValueError("its header is wrong")
+    with laspy.open(path, read_evlrs=False) as file:
+        if (size := file.header.point_count * _BYTES) > memory():
+            raise LidarpoolError(
+                f"it has {file.header.point_count:,} points, which take {bytes_of(size)} of "
+                "memory: thin it first."
+            )
+        found = file.read_points(-1)
+    return np.stack([found.x, found.y, found.z], axis=1)
+
+
+_READERS: dict[str, Callable[[Path], Float]] = {
+    ".ply": lambda path: read_ply_points(path.read_bytes()),
+    ".pcd": _read_pcd,
+    ".xyz": lambda path: np.loadtxt(path, usecols=(0, 1, 2), ndmin=2),
+    ".las": _read_las,
+    ".laz": _read_las,
+}
+SUFFIXES = tuple(_READERS)
