@@ -245,3 +245,12 @@ def test_scenes_are_made_of_it(tmp_path):
     scene = Scene.load(path)
     assert scene.names == ("Building a",)
     np.testing.assert_array_equal(scene.origin + scene.bounds[0], [84000, 447000, 3])
+
+
+def test_a_tower_is_not_suspected_of_another_unit(tmp_path):
+    tall = [[300 * x, 300 * y, 300 * z] for x, y, z in CUBE]
+    write(tmp_path / "a.city.json", city({"a": thing(geometry())}, tall))
+    scenario = Scenario.load(tmp_path / "a.city.json")
+    notes = scenario.advice(scenario.build_scene())
+    assert any("this looks like an object" in note for note in notes)
+    assert not any("unit" in note for note in notes)

@@ -294,6 +294,7 @@ class Scenario(Section):
 
     def _of_size(self, scene: Scene) -> str:
         files = [entry.file for entry in self.scene.files if entry.unit is None]
+        files = [file for file in files if not file.lower().endswith(CITYJSON)]  # towns are large
         unitless = [
             f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(self._path(f))
         ]
