@@ -253,10 +253,12 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool, monkeypatch):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000
 
 
-def test_a_scene_of_openusd_is_checked_as_shown(tmp_path, lidarpool, monkeypatch):
-    pytest.importorskip("pxr", reason="usd-core is an extra")
+@pytest.mark.parametrize("page", ["openusd", "cityjson"])
+def test_a_scene_is_checked_as_shown(tmp_path, lidarpool, monkeypatch, page):
+    if page == "openusd":
+        pytest.importorskip("pxr", reason="usd-core is an extra")
     monkeypatch.chdir(tmp_path)
-    blocks = blocks_of(ROOT / "docs/how-to/openusd.md")
+    blocks = blocks_of(ROOT / f"docs/how-to/{page}.md")
     [scene] = [block for block in blocks if block.title]
     Path(scene.title).write_text(scene.code, encoding="utf-8")
     [shown] = [block for block in blocks if block.language == "console"]

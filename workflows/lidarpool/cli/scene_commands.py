@@ -1,4 +1,4 @@
-"""The commands `lidarpool scene …`: generated scenes as mesh files."""
+"""The commands `lidarpool scene …`: generated scenes, and point clouds, as mesh files."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ MOST_COPIED = 20_000_000  # triangles of files that cannot share them
 
 @click.group(name="scene")
 def scene() -> None:
-    """Generate scenes as mesh files."""
+    """Make scenes as mesh files: generated ones, or of a point cloud."""
+
+
+_out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj")
 
 
 def _made(triangles: int) -> Callable[[Command], Command]:
@@ -29,7 +32,7 @@ def _made(triangles: int) -> Callable[[Command], Command]:
         click.option("--seed", default=0, help="The same seed gives the same scene."),
         click.option("--triangles", default=triangles, help="Approximate number."),
         overwrite,
-        click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.glb|.obj"),
+        _out,
     )
     return lambda command: reduce(lambda made, option: option(made), added, command)
 
@@ -68,6 +71,34 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
     from ..scene.terrain import terrain as make
 
     _write(out, lambda: make(triangles, seed, side, trees), overwrite)
+
+
+@scene.command()
+@click.option(
+    "--voxel-m",
+    type=float,
+    help="Edge of cubes with one point each; by default the spacing of the points.",
+)
+@click.option(
+    "--size",
+    default=1.0,
+    show_default=True,
+    help="Factor of the surfels' sides: larger ones close gaps, and reach farther beyond edges.",
+)
+@overwrite
+@click.argument("cloud", type=click.Path(path_type=Path), metavar="CLOUD.ply|.pcd|.xyz|.las|.laz")
+@_out
+def points(cloud: Path, out: Path, voxel_m: float | None, size: float, overwrite: bool) -> None:
+    """Make a scene of a point cloud, in metres and Z-up: a scan that can be scanned again.
+
+    \b
+    Examples:
+      lidarpool scene points scan.ply place.glb
+      lidarpool scene points survey.laz place.obj --voxel-m 0.5
+    """  # noqa: D301 - click wants the character, not its name
+    from ..scene.points import scene_of_points
+
+    _write(out, lambda: scene_of_points(cloud, voxel_m=voxel_m, size=size), overwrite)
 
 
 def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:

@@ -22,17 +22,18 @@ from ..columns.table import COLOURS
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
+from ..scene.cityjson import CLASSES as CITY_CLASSES
 from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.meshfile import CITYJSON, SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.nodes import Raster
 from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
-from ..sensor.materials import rows_named
+from ..sensor.materials import rows_named, with_classes
 from ..sensor.survey import SENSORS_MOST, Steps
 from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
@@ -338,6 +339,7 @@ class Scenario(Section):
 
     def _of_size(self, scene: Scene) -> str:
         files = [entry.file for entry in self.scene.files if entry.unit is None]
+        files = [file for file in files if not file.lower().endswith(CITYJSON)]  # towns are large
         unitless = [
             f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(self._path(f))
         ]
@@ -569,7 +571,7 @@ class Scenario(Section):
         return actors
 
     def _materials(self, scene: Scene) -> list[Material]:
-        """Materials by name, and those of actors and copies that have a class of their own."""
+        """Materials by name, with the classes of actors and copies, and of city objects."""
         made = [Material(**dict(entry)) for entry in self.materials]
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
@@ -595,6 +597,8 @@ class Scenario(Section):
             after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
             of = made[after] if after >= 0 else Material("*")
             made.insert(after + 1, replace(of, objects=names, semantic_class=semantic_class))
+        if any(entry.file.lower().endswith(CITYJSON) for entry in self.scene.files):
+            made = with_classes(made or [Material("*")], CITY_CLASSES, scene.all_names)
         return made
 
     def survey(self, scene: Scene) -> Survey:

@@ -30,12 +30,14 @@ _TYPES = {"f": 5126, "u": 5125}
 def glb_of(scene: Scene) -> bytes:
     """Content of a .glb file with all objects of a scene but the actors, in metres, Y-up.
 
+    Nodes have the scene's origin, in double precision, so that far scenes lose no digits.
+
     Raises
     ------
     LidarpoolError
         If it would have more than 4 GiB.
     """
-    writer = _Writer()
+    writer = _Writer(scene.origin)
     for name, parts in groupby(scene.meshes(), lambda one: one.name):
         places: dict[bytes, list[Mesh | Instance]] = {}
         for one in parts:
@@ -49,7 +51,8 @@ def glb_of(scene: Scene) -> bytes:
 class _Writer:
     """The JSON object of a file, and its buffer."""
 
-    def __init__(self) -> None:
+    def __init__(self, origin: NDArray[np.float64]) -> None:
+        self._origin = origin
         self._pieces: list[bytes] = []
         self._size = 0
         self._meshes: dict[tuple[int, ...], int] = {}  # {ids of parts: number of the mesh}
@@ -72,8 +75,11 @@ class _Writer:
         """Add an object of parts in one place."""
         meshes = [one.mesh if isinstance(one, Instance) else one for one in parts]
         key = tuple(id(mesh) for mesh in meshes)
+        far = self._origin.any() and not isinstance(parts[0], Instance)
         if key not in self._meshes:
             self._kept += meshes
+            if far:
+                meshes = [one.moved(name, np.eye(3), -self._origin) for one in meshes]
             primitives = [primitive for mesh in meshes for primitive in self._primitives(mesh)]
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
@@ -81,6 +87,8 @@ class _Writer:
             turn = np.eye(4)
             turn[:3, :3] = UP_AXES["y"].T
             node["matrix"] = (turn @ parts[0].matrix @ turn.T).T.ravel().tolist()
+        elif far:
+            node["translation"] = (self._origin @ UP_AXES["y"]).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: Mesh) -> list[dict[str, Any]]:

@@ -1,4 +1,4 @@
-"""Mesh files and rasters, such as .glb, .obj, .usd and .tif, to named meshes in metres, Z-up."""
+"""Files of scenes, of the formats in `SUFFIXES`, to named meshes in metres, Z-up."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError, prefixed
 from ..base.vocabulary import UNITS_M
 from ..base.words import did_you_mean, printable
+from .cityjson import read_cityjson
 from .dae import read_dae
 from .gltf import read_gltf
 from .instances import FARTHEST_M, Instance
@@ -31,6 +32,7 @@ from .transform import UP_AXES, Transform
 from .usd import read_usd
 
 _USD = (".usd", ".usda", ".usdc", ".usdz")
+CITYJSON = (".json", ".cityjson", ".jsonl")
 
 # A reader gets the content of a file and its path; read_raster gets the path alone. It raises
 # MeshFileError for unsupported content, and any error for a broken file. All but read_usd and
@@ -45,13 +47,17 @@ _COLOURED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether 
     ".ply": read_ply_mesh,
     ".off": read_off,
     ".dae": read_dae,
+    **dict.fromkeys(CITYJSON, read_cityjson),
 }
 _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".stl": read_stl,
     ".3mf": read_3mf,
     **dict.fromkeys(_USD, read_usd),
 }
-SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf", *_USD, *RASTERS)
+SUFFIXES = (
+    *(".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf"),
+    *(*_USD, *CITYJSON, *RASTERS),
+)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -91,11 +97,11 @@ def load_meshes(
     path
         One of `SUFFIXES`, in any case.
     unit
-        None takes the file's own (.dae, .3mf, .usd, .glb and .gltf), else metres. Of a raster it is
-        the unit of its heights.
+        None takes the file's own (.dae, .3mf, .usd, .glb and .gltf), else metres, as CityJSON has.
+        Of a raster it is the unit of its heights.
     up_axis
         None takes the file's own (.dae, .usd), the standard's (Y-up for .glb and .gltf, Z-up for
-        .3mf), else Z-up.
+        .3mf and CityJSON), else Z-up.
     transform
         Placement in the world, in metres, after unit and up axis.
     opacity
@@ -112,8 +118,8 @@ def load_meshes(
         Code of the coordinate system that a raster is brought to, one in metres. None keeps its
         own if it is in metres, else takes the UTM zone of its middle.
     tell
-        Called with a line on objects left out, on images that cannot be read, or on materials that
-        may be glass; by default this module's logger warns.
+        Called with a line on objects left out, on images that cannot be read, on materials that
+        may be glass, or on a reference system; by default this module's logger warns.
     axes
         Called with a line on axes that a file did not state, or that were turned; by default this
         module's logger has it, as a warning if the scene seems to lie on its side.

@@ -373,11 +373,11 @@ def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
     if counts.get("tristrips"):
         raise MeshFileError("has triangle strips, which are not read: export it with faces")
     if not counts.get("face"):
-        raise MeshFileError("is a point cloud, it has no faces: make a mesh of it first")
+        raise MeshFileError(
+            "is a point cloud, it has no faces: make a mesh of it by lidarpool scene points"
+        )
     rows = _ply_rows(elements, order, body)
-    if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
-        raise ValueError(f"its vertices have no {', '.join(missing)}")
-    vertices = np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=1).astype(np.float64)
+    vertices = _ply_vertices(rows)
     name = next((name for name in _PLY_LISTS if name in rows["face"]), None)
     if name is None:
         raise ValueError(f"its faces have no {_PLY_LISTS[0]}")
@@ -393,6 +393,17 @@ def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
         small = kind.kind in "iu" and kind.itemsize < 4
         shown = _tinted(given / np.iinfo(kind).max if small else _shares(given), faces)
     return Content(_mesh(path.stem, vertices, faces, colours=shown))
+
+
+def read_ply_points(data: bytes) -> Float:
+    """Read the vertices of a Stanford polygon file: (n, 3)."""
+    return _ply_vertices(_ply_rows(*_ply_header(data)))
+
+
+def _ply_vertices(rows: _Rows) -> Float:
+    if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
+        raise ValueError(f"its vertices have no {', '.join(missing)}")
+    return np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=1).astype(np.float64)
 
 
 def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:

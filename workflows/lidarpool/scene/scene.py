@@ -127,7 +127,7 @@ class Scene:
         window: Window | None = None,
         epsg: int | None = None,
     ) -> Scene:
-        """Read a mesh file or a raster of heights, such as .glb, .obj, .stl, .usd or .tif.
+        """Read a scene file, such as .glb, .obj, .usd, CityJSON, or a raster of heights (.tif).
 
         Parameters
         ----------
@@ -146,8 +146,8 @@ class Scene:
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
             .obj). With "ignore", triangles are solid, and no image is read.
         colours
-            Whether to read base colours and their images (.glb, .gltf, .obj, .dae), and colours of
-            vertices (.glb, .gltf, .obj, .ply, .off).
+            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, CityJSON without
+            images), and colours of vertices (.glb, .gltf, .obj, .ply, .off).
         step_m, window, epsg
             Of a raster: see `lidarpool.scene.meshfile.load_meshes`.
 

@@ -6,6 +6,7 @@ import os
 from itertools import groupby
 from pathlib import Path
 
+import numpy as np
 import trimesh
 from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
@@ -26,14 +27,14 @@ def write_scene(path: str | Path, scene: Scene) -> Path:
 
     A .ply holds one object without a name; .glb and .obj keep objects and names. Masks are kept in
     .glb only: in the others, triangles are solid. All store metres; .glb is Y-up, by its standard,
-    the others are Z-up. Coordinates are those of the world; .ply and .glb have single precision. A
-    comment, or the generator of .glb, tells `load_meshes` who wrote it. An existing file is
-    replaced only by a complete one.
+    the others are Z-up. Coordinates are those of the world; .ply and .glb have single precision,
+    .glb from the scene's origin. A comment, or the generator of .glb, tells `load_meshes` who wrote
+    it. An existing file is replaced only by a complete one.
 
     Raises
     ------
     LidarpoolError
-        As for `check_target`, or if the disk is full.
+        As for `check_target`, if the disk is full, or a .ply is too coarse for so far a scene.
     """
     path = Path(path)
     check_target(path)
@@ -70,6 +71,13 @@ def check_target(path: Path) -> None:
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Content of a file of one of `SUFFIXES`."""
     if suffix == ".ply":
+        if scene.origin.any():
+            step = np.spacing(np.float32(np.abs(scene.origin).max()))
+            x, y, _ = scene.origin
+            raise LidarpoolError(
+                f"A .ply would have coordinates in steps of {step:.2g} m around x {x:.0f}, "
+                f"y {y:.0f}, because they are in single precision: write a .glb or .obj."
+            )
         drawn = Drawn.of(scene, scene.triangles).scene
         whole = trimesh.Trimesh(drawn.vertices + drawn.origin, drawn.faces, process=False)
         data = bytes(export_ply(whole, vertex_normal=False))

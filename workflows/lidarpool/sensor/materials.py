@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase, translate
 from functools import cache
+from glob import escape
 from importlib.resources import files
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -176,6 +177,43 @@ def rows_named(pattern: str, names: Sequence[str]) -> NDArray[np.intp]:
     return np.array([r for r, name in enumerate(names) if name == pattern or fits(name)], np.intp)
 
 
+def _last_for(materials: Sequence[Material], names: Sequence[str]) -> NDArray[np.intp]:
+    """Last material that names each object, -1 for none: (objects,)."""
+    last = np.full(len(names), -1)
+    known = {name: row for row, name in enumerate(names)}
+    for number, material in enumerate(materials):
+        for pattern in material.objects:
+            plain = pattern in known and not any(sign in pattern for sign in "*?[")
+            rows = np.array([known[pattern]]) if plain else rows_named(pattern, names)
+            if not len(rows):
+                raise LidarpoolError(
+                    f"materials names {pattern!r}, but no object has that name."
+                    + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
+                )
+            last[rows] = number
+    return last
+
+
+def with_classes(
+    materials: Sequence[Material], classes: Mapping[int, Sequence[str]], names: Sequence[str]
+) -> list[Material]:
+    """Give objects whose material has no class one by their names: {class: patterns}.
+
+    LidarpoolError if a material is for no object.
+    """
+    out, last = list(materials), _last_for(materials, names)
+    for semantic_class, patterns in classes.items():
+        for pattern in patterns:
+            rows = rows_named(pattern, names)
+            for number in np.unique(last[rows]).tolist():
+                of, some = materials[number], rows[last[rows] == number]
+                if number >= 0 and not of.semantic_class:
+                    whole = len(some) == len(rows)
+                    objects = [pattern] if whole else [escape(names[row]) for row in some]
+                    out.append(replace(of, objects=objects, semantic_class=semantic_class))
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
     """Materials of objects: each array has one value for each."""
@@ -200,16 +238,7 @@ class MaterialTable:
         LidarpoolError
             If a name fits no object, or there are materials and an object has none.
         """
-        last = np.full(len(names), -1)  # for each object the last material that names it
-        for number, material in enumerate(materials):
-            for pattern in material.objects:
-                rows = rows_named(pattern, names)
-                if not len(rows):
-                    raise LidarpoolError(
-                        f"materials names {pattern!r}, but no object has that name."
-                        + (did_you_mean(pattern, names) or f" There are {', '.join(names[:5])}, …")
-                    )
-                last[rows] = number
+        last = _last_for(materials, names)
         without = np.flatnonzero(last < 0)
         if len(without) and materials:
             more = f" and {len(without) - 1} more" if without[1:].size else ""

@@ -1,0 +1,256 @@
+"""CityJSON: the finest geometry of each object, once, with its name, place, colour and class."""
+
+import json
+
+import numpy as np
+import pytest
+from tests.lidarpool.meshes import NESTED
+
+from lidarpool import Scene
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.instances import Instance
+from lidarpool.scene.mesh import triangle_areas
+from lidarpool.scene.meshfile import load_meshes
+from lidarpool.sensor.materials import MaterialTable
+
+# A cube of 2 units, its rings running outward.
+CUBE = [[x, y, z] for z in (0, 2) for y in (0, 2) for x in (0, 2)]
+SIDES = [[0, 2, 3, 1], [4, 5, 7, 6], [0, 1, 5, 4], [2, 6, 7, 3], [0, 4, 6, 2], [1, 3, 7, 5]]
+SOLID = [[[ring] for ring in SIDES]]
+TRANSFORM = {"scale": [0.5, 0.5, 0.5], "translate": [84000, 447000, 3]}
+
+
+def geometry(kind="Solid", boundaries=SOLID, lod="2.2", **more):
+    return {"type": kind, "lod": lod, "boundaries": boundaries, **more}
+
+
+def thing(*geometries, kind="Building", **more):
+    return {"type": kind, "geometry": list(geometries), **more}
+
+
+def city(objects, vertices=CUBE, **more):
+    head = {"type": "CityJSON", "version": "2.0", "transform": TRANSFORM}
+    return {**head, "CityObjects": objects, "vertices": vertices, **more}
+
+
+def write(path, document):
+    path.write_text(document if isinstance(document, str) else json.dumps(document))
+    return path
+
+
+def load(tmp_path, document, notes=None, **options):
+    path = write(tmp_path / "a.city.json", document)
+    return load_meshes(path, tell=[].append if notes is None else notes.append, **options)
+
+
+def area(mesh):
+    return triangle_areas(mesh.vertices[mesh.faces]).sum()
+
+
+def volume(mesh):
+    a, b, c = (mesh.vertices - mesh.vertices[0])[mesh.faces].transpose(1, 0, 2)
+    return (a * np.cross(b, c)).sum() / 6
+
+
+@pytest.mark.parametrize(
+    ("kind", "boundaries"),
+    [
+        ("Solid", SOLID),
+        ("MultiSurface", SOLID[0]),
+        ("CompositeSurface", SOLID[0]),
+        ("MultiSolid", [SOLID]),
+        ("CompositeSolid", [SOLID]),
+    ],
+)
+def test_each_type_of_geometry(tmp_path, kind, boundaries):
+    (cube,) = load(tmp_path, city({"a": thing(geometry(kind, boundaries))}))
+    assert cube.name == "Building a"
+    np.testing.assert_array_equal(cube.bounds, [[84000, 447000, 3], [84001, 447001, 4]])
+    assert area(cube) == pytest.approx(6)
+    assert volume(cube) == pytest.approx(1), "its triangles face outward"
+
+
+def test_holes_and_faces_that_are_not_convex(tmp_path):
+    outline = [[0, 0, 0], [8, 0, 0], [8, 0, 8], [0, 0, 8]]
+    door = [[2, 0, 2], [2, 0, 6], [6, 0, 6], [6, 0, 2]]
+    notched = [[0, 4, 0], [8, 4, 0], [8, 4, 8], [4, 4, 2], [0, 4, 8]]
+    surfaces = [[[0, 1, 2, 3], [4, 5, 6, 7]], [[8, 9, 10, 11, 12]]]
+    document = city({"a": thing(geometry("MultiSurface", surfaces))}, outline + door + notched)
+    (wall,) = load(tmp_path, document)
+    assert area(wall) == pytest.approx((64 - 16 + 64 - 24) / 4)
+
+
+def test_the_highest_lod_of_each_object_and_none_twice(tmp_path):
+    footprint = geometry("MultiSurface", [[SIDES[0]]], "0")
+    block, fine = geometry(lod=1.3), geometry(lod="2.2")
+    objects = {
+        "whole": thing(footprint, block, children=["part"]),
+        "part": thing(block, fine, kind="BuildingPart", parents=["whole"]),
+        "house": thing(fine, children=["balcony"]),
+        "balcony": thing(block, kind="BuildingInstallation", parents=["house"]),
+        "garden": thing(footprint, kind="LandUse"),
+        "line": thing(geometry("MultiLineString", [[0, 1]], "3"), footprint, kind="Road"),
+        "empty": thing(),
+    }
+    notes = []
+    meshes = load(tmp_path, city(objects), notes)
+    assert {mesh.name: area(mesh) for mesh in meshes} == {
+        "BuildingPart part": pytest.approx(6),  # without the coarse whole
+        "Building house": pytest.approx(6),
+        "BuildingInstallation balcony": pytest.approx(6),
+        "LandUse garden": pytest.approx(1),
+        "Road line": pytest.approx(1),
+    }
+    assert "2 objects of LoD 2.2, 1 object of LoD 1.3, 2 objects of LoD 0" in notes[0]
+    assert "is read without 1 MultiLineString" in notes[1]
+
+
+def test_templates_are_placed_and_large_ones_shared(tmp_path):
+    def placed(x, turn):
+        rows = [*turn, 0, 0, 0, 1]
+        return geometry("GeometryInstance", [x], template=0, transformationMatrix=rows)
+
+    upright, scaled = [1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 5], [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0]
+    objects = {
+        "t1": thing(placed(1, upright), kind="SolitaryVegetationObject"),
+        "t2": thing(placed(2, scaled), kind="SolitaryVegetationObject"),
+    }
+    templates = {"templates": [geometry()], "vertices-templates": CUBE}
+    one, two = load(tmp_path, city(objects, **{"geometry-templates": templates}))
+    assert one.name == "SolitaryVegetationObject t1"
+    np.testing.assert_array_equal(one.bounds, [[84001, 447000, 8], [84003, 447002, 10]])
+    np.testing.assert_array_equal(two.bounds, [[84000, 447001, 3], [84004, 447005, 7]])
+    many = {"templates": [geometry("MultiSurface", SOLID[0] * 10_000)], "vertices-templates": CUBE}
+    shared = load(tmp_path, city(objects, **{"geometry-templates": many}))
+    assert all(isinstance(one, Instance) for one in shared)
+    assert shared[0].mesh is shared[1].mesh
+
+
+def test_a_sequence_is_read_like_a_file(tmp_path):
+    feature = {"type": "CityJSONFeature", "id": "b", "vertices": CUBE[::-1]}
+    lines = [city({}, []), {**feature, "CityObjects": {"b": thing(geometry())}}]
+    path = write(tmp_path / "a.city.jsonl", "\n".join(map(json.dumps, lines)) + "\n\n")
+    (cube,) = load_meshes(path)
+    assert cube.name == "Building b"
+    np.testing.assert_array_equal(cube.bounds, [[84000, 447000, 3], [84001, 447001, 4]])
+    write(path, "\n".join(map(json.dumps, lines[1:])))
+    with pytest.raises(LidarpoolError, match="not CityJSON"):
+        load_meshes(path)
+
+
+def test_surfaces_that_are_not_there_and_colours(tmp_path):
+    semantics = {
+        "surfaces": [{"type": "WallSurface"}, {"type": "ClosureSurface"}],
+        "values": [[0, 0, None, 0, 0, 1]],
+    }
+    material = {"": {"values": [[0, 0, 0, 0, None, 1]]}}
+    appearance = {"materials": [{"name": "red", "diffuseColor": [1, 0, 0]}, {"name": "plain"}]}
+    one = thing(geometry(semantics=semantics, material=material, texture={"": {}}), kind="Tunnel")
+    notes = []
+    (tube,) = load(tmp_path, city({"a": one}, appearance=appearance), notes, colours=True)
+    assert area(tube) == pytest.approx(5)
+    assert "1 texture, 1 ClosureSurface" in notes[-1]
+    shown = tube.colours.means()
+    assert (shown == [255, 0, 0]).all(axis=1).sum() == 8, "four sides"
+    assert (shown == 188).all(axis=1).sum() == 2, "one without a material"
+
+
+def table_of(tmp_path, objects, materials=()):
+    write(tmp_path / "a.city.json", city(objects))
+    data = {"scene": {"files": ["a.city.json"]}, "materials": list(materials)}
+    scenario = Scenario.from_data(data, folder=tmp_path)
+    scene = scenario.build_scene()
+    table = MaterialTable.of(scenario.survey(scene).materials, scene.all_names)
+    found = zip(scene.names, table.semantic_class, table.reflectance, strict=True)
+    return {name: (number, reflectance) for name, number, reflectance in found}
+
+
+def test_types_are_classes_unless_a_material_has_one(tmp_path):
+    kinds = ("Building", "BuildingPart", "Road", "Bridge", "WaterBody", "TINRelief", "Railway",
+             "SolitaryVegetationObject", "CityFurniture", "+Shed")  # fmt: skip
+    objects = {f"{kind}{k}": thing(geometry(), kind=kind) for kind in kinds for k in (1, 2)}
+    plain = table_of(tmp_path, objects)
+    classes = [plain[f"{kind} {kind}1"][0] for kind in kinds]
+    assert classes == [6, 6, 11, 17, 9, 2, 10, 5, 1, 1]
+    materials = [
+        {"objects": "*", "reflectance": 0.3},
+        {"objects": "Building Building2", "reflectance": 0.8},
+        {"objects": ["Road *", "Bridge Bridge1"], "reflectance": 0.1, "class": 99},
+    ]
+    own = table_of(tmp_path, objects, materials)
+    assert own["Building Building1"] == (6, 0.3)
+    assert own["Building Building2"] == (6, 0.8)
+    assert own["Road Road1"] == own["Bridge Bridge1"] == (99, 0.1)
+    assert own["Bridge Bridge2"] == (17, 0.3)
+
+
+def test_reference_systems(tmp_path):
+    metadata = {"referenceSystem": "https://www.opengis.net/def/crs/EPSG/0/7415"}
+    notes = []
+    load(tmp_path, city({"a": thing(geometry())}, metadata=metadata), notes)
+    assert any("is in EPSG:7415" in note for note in notes)
+    for more in (
+        {"metadata": {"referenceSystem": "urn:ogc:def:crs:EPSG::4979"}},
+        {"transform": {"scale": [1e-5, 1e-5, 1], "translate": [4.3, 52, 0]}},
+    ):
+        with pytest.raises(LidarpoolError, match="in degrees"):
+            load(tmp_path, city({"a": thing(geometry())}, **more))
+
+
+def test_the_first_version_needs_no_transform(tmp_path):
+    document = city({"a": thing(geometry(lod=2))}, version="1.0")
+    del document["transform"]
+    notes = []
+    (cube,) = load(tmp_path, document, notes)
+    np.testing.assert_array_equal(cube.bounds, [[0, 0, 0], [2, 2, 2]])
+    assert not notes
+    load(tmp_path, {**document, "version": "2.0"}, notes)
+    assert "lacks its transform" in notes[0]
+
+
+@pytest.mark.parametrize(
+    ("document", "words"),
+    [
+        ('{"scene": {"files": ["a.glb"]}}', "not CityJSON"),
+        ("[1, 2]", "not CityJSON"),
+        (city({"a": thing(geometry())}, version="0.9"), "CityJSON 0.9, and 1.0 to 2.0"),
+        (city({"a": thing(geometry("Solid", SOLID[0]))}), "'Building a'.*"),
+        (city({"a": thing(geometry("MultiSurface", SOLID))}), "'Building a': .*nested"),
+        (city({"a": thing(geometry("MultiSurface", [[[0, 1, 8]]]))}), "'Building a': .*0 to 8"),
+        (city({"a": thing(geometry("MultiSurface", [[[0, 1, -1]]]))}), "'Building a': .*-1 to 1"),
+        (city({"a": thing(geometry("MultiSurface", [[[0, 1, 2**70]]]))}), "'Building a'"),
+        (city({"a": thing(geometry("MultiSurface", [[[0, 1, 0.5]]]))}), "'Building a'"),
+        (city({"a": thing(geometry())}, [*CUBE[:7], [1, 2]]), "broken or cut short"),
+        (city({"a": thing(geometry())}, [*CUBE[:7], [1e300, 2, 3]]), "farther than anything"),
+        (json.dumps(city({"a": thing(geometry())}))[:-9], "broken or cut short"),
+        ('{"type": "CityJSON", "version": "2.0", "x": ' + NESTED, "broken or cut short"),
+        (city({"a": thing()}), "no triangles"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, document, words):
+    with pytest.raises(LidarpoolError, match=words) as caught:
+        load(tmp_path, document)
+    assert len(str(caught.value).removeprefix(str(tmp_path))) < 400
+
+
+def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
+    monkeypatch.setattr("lidarpool.base.allowance.memory", lambda: 100_000_000)
+    with pytest.raises(LidarpoolError, match=r"would unpack to .* CityJSONSeq"):
+        load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
+
+
+def test_scenes_are_made_of_it(tmp_path):
+    path = write(tmp_path / "a.CityJSON", city({"a": thing(geometry())}))
+    scene = Scene.load(path)
+    assert scene.names == ("Building a",)
+    np.testing.assert_array_equal(scene.origin + scene.bounds[0], [84000, 447000, 3])
+
+
+def test_a_tower_is_not_suspected_of_another_unit(tmp_path):
+    tall = [[300 * x, 300 * y, 300 * z] for x, y, z in CUBE]
+    write(tmp_path / "a.city.json", city({"a": thing(geometry())}, tall))
+    scenario = Scenario.load(tmp_path / "a.city.json")
+    notes = scenario.advice(scenario.build_scene())
+    assert any("this looks like an object" in note for note in notes)
+    assert not any("unit" in note for note in notes)

@@ -1,0 +1,155 @@
+"""Point clouds as scenes: scanned again, a place gives the ranges of the real one."""
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+
+from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor
+from lidarpool.base.errors import LidarpoolError
+from lidarpool.base.open3d_module import load_open3d
+from lidarpool.cli.scene_commands import scene as command
+from lidarpool.scene.points import scene_of_points
+from lidarpool.scene.scene_file import write_scene
+
+GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T
+FAR = (500_000.0, 5_000_000.0, 100.0)
+
+
+def plane(at=(0, 0, 0)):
+    """Points of a rectangle that leans, in the plane z = x / 2."""
+    return np.column_stack([GRID, GRID[:, 0] / 2]) + at
+
+
+def written(path, points):
+    if path.suffix == ".xyz":
+        np.savetxt(path, np.column_stack([points, np.zeros(len(points))]), "%.9f")
+    elif path.suffix in (".las", ".laz"):
+        laspy = pytest.importorskip("laspy", reason="laspy is an extra")
+        las = laspy.LasData(laspy.LasHeader(version="1.4", point_format=6))
+        las.header.offsets, las.header.scales = points[0].round(), [1e-6] * 3
+        las.x, las.y, las.z = points.T
+        las.write(str(path))
+    else:
+        o3d = load_open3d()
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+        o3d.io.write_point_cloud(str(path), cloud, write_ascii="text" in path.name)
+    return path
+
+
+def off_plane(scene, at=(0, 0, 0)):
+    x, _, z = (scene.vertices + (scene.origin - at)).T
+    return np.abs(z - x / 2).max()
+
+
+@pytest.mark.parametrize("name", ["a.ply", "a.pcd", "text.pcd", "a.XYZ", "a.las", "a.laz"])
+def test_all_formats_give_surfels_in_the_plane_of_the_points(tmp_path, name):
+    path = written(tmp_path / name.lower(), plane()).rename(tmp_path / name)
+    scene = scene_of_points(path, voxel_m=1e-3)
+    assert scene.names == (path.stem,)
+    assert len(scene.faces) == 2 * len(GRID)
+    assert off_plane(scene) < 1e-5
+    np.testing.assert_allclose(scene.bounds, [[0, 0, 0], [4, 3, 2]], atol=0.2)
+
+
+def test_points_in_one_voxel_become_one_surfel(tmp_path):
+    path = written(tmp_path / "a.ply", plane())
+    few, many = scene_of_points(path, voxel_m=0.5), scene_of_points(path)
+    assert 50 <= len(few.faces) / 2 <= 100
+    assert 400 < len(many.faces) / 2 < len(GRID), "by default about the spacing of the points"
+
+
+def test_a_place_scanned_again_has_the_ranges_of_the_real_one(tmp_path):
+    real, sensor = Scene.seed(), load_sensor("ouster/os1-64")
+    scanner = Scanner(real, sensor, noise=Noise(range_m=0.005))
+    sweeps = [scanner.sweep(Pose((x, y, 2))) for x, y in ((0, 0), (3, 2), (-2, 3))]
+    points = np.concatenate([sweep.positions for sweep in sweeps])
+    Cloud(points.astype(np.float64), {}).save(tmp_path / "scan.ply")
+    write_scene(tmp_path / "place.glb", scene_of_points(tmp_path / "scan.ply"))
+    pose = [(1, 2, 1.5)]
+    true, again = (
+        Scanner(scene, load_sensor("velodyne/vlp16")).ranges(pose)
+        for scene in (real, Scene.load(tmp_path / "place.glb"))
+    )
+    both = np.isfinite(true) & np.isfinite(again)
+    assert both.sum() > 0.9 * np.isfinite(true).sum()
+    off = np.abs(true[both] - again[both])
+    assert np.quantile(off, 0.5) < 0.01
+    assert np.quantile(off, 0.9) < 0.1
+
+
+def test_far_clouds_keep_their_digits(tmp_path):
+    scene = scene_of_points(written(tmp_path / "a.ply", plane(FAR)), voxel_m=1e-3)
+    assert off_plane(scene, FAR) < 1e-5
+    for name in ("b.glb", "b.obj"):
+        again = Scene.load(write_scene(tmp_path / name, scene))
+        difference = again.vertices + again.origin - (scene.vertices + scene.origin)
+        assert np.abs(difference).max() < 1e-6
+    with pytest.raises(LidarpoolError, match=r"steps of 0.5 m .* write a .glb or .obj"):
+        write_scene(tmp_path / "b.ply", scene)
+
+
+def test_stray_points_make_no_large_surfels(tmp_path):
+    points = np.concatenate([plane(), [[0, 0, 50], [30, 0, 0], [0, np.nan, 0]]])
+    scene = scene_of_points(written(tmp_path / "a.xyz", points), voxel_m=0.1)
+    sides = np.ptp(scene.vertices[scene.faces], axis=1)
+    assert sides.max() <= 2 * np.sqrt(2) * 0.3 + 1e-9
+
+
+@pytest.mark.parametrize("name", ["a.ply", "text.ply", "a.pcd", "text.pcd", "a.las", "a.laz"])
+def test_cut_files_are_refused(tmp_path, name):
+    path = written(tmp_path / name, plane())
+    data = path.read_bytes()
+    for share in (0, 0.01, 0.5, 0.98):
+        path.write_bytes(data[: int(share * len(data))])
+        with pytest.raises(LidarpoolError, match=r"cut short"):
+            scene_of_points(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.xyz", "", "broken or cut short"),
+        ("a.xyz", "1 2 3\n" * 11, "11 points"),
+        ("a.xyz", "1 2 3\n" * 50, "most of its points in the same places"),
+        ("a.xyz", "nan 2 3\n" * 50, "0 points"),
+        ("a.xyz", "x y z\n" * 50, "broken or cut short"),
+        ("a.xyz", "1 2 1e30\n" * 50, "farther than anything"),
+        ("a.glb", "glTF", "point clouds are read from"),
+        ("b.ply", None, "cannot be read"),
+    ],
+)
+def test_what_is_wrong_is_said(tmp_path, name, text, words):
+    path = tmp_path / name
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(LidarpoolError, match=words):
+        scene_of_points(path)
+
+
+def test_too_many_points_are_refused(tmp_path, monkeypatch):
+    path = written(tmp_path / "a.ply", plane())
+    monkeypatch.setattr("lidarpool.scene.points.memory", lambda: 1_000_000)
+    with pytest.raises(LidarpoolError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
+        scene_of_points(path, voxel_m=0.01)
+    assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500
+
+
+def test_a_huge_number_of_records_is_refused_at_once(tmp_path):
+    path = written(tmp_path / "a.las", plane())
+    data = bytearray(path.read_bytes())
+    data[100:104] = b"\xff\xff\xff\x7f"
+    path.write_bytes(data)
+    with pytest.raises(LidarpoolError, match="its header is wrong"):
+        scene_of_points(path)
+
+
+def test_the_command(tmp_path):
+    path, out = written(tmp_path / "a.ply", plane()), tmp_path / "b.glb"
+    arguments = ["points", str(path), str(out)]
+    CliRunner().invoke(command, [*arguments, "--voxel-m", "0.001"], catch_exceptions=False)
+    assert Scene.load(out).triangles == 2 * len(GRID)
+    with pytest.raises(LidarpoolError, match="exists"):
+        CliRunner().invoke(command, arguments, catch_exceptions=False)
+    with pytest.raises(LidarpoolError, match=r"size is -1.0"):
+        arguments += ["--size", "-1", "--overwrite"]
+        CliRunner().invoke(command, arguments, catch_exceptions=False)
