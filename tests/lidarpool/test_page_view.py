@@ -144,6 +144,27 @@ def test_colours_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
     assert (low, high) == ("0.0", "3.0")
 
 
+def test_points_are_shown_in_their_own_colours(tmp_path):
+    rows = np.zeros(300, [*((a, "<f8") for a in "xyz"), *((c, "|u1") for c in ("red", "green"))])
+    rows["x"], rows["red"], rows["green"] = np.arange(300), np.arange(300) % 256, 9
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header(rows.dtype, 300) + rows.tobytes())
+    assert "rgb" not in told(open_result(path), "state")[0]["colours"], "blue is missing"
+    rgb = np.dtype([*rows.dtype.descr, ("blue", "|u1")])
+    more = np.zeros(300, rgb)
+    for name in rows.dtype.names:
+        more[name] = rows[name]
+    more["blue"] = 200
+    path.write_bytes(header(rgb, 300) + more.tobytes())
+    view = open_result(path)
+    state = told(view, "state")[0]
+    assert state["colours"][0] == "z" and state["colours"][-1] == "rgb"
+    assert "rgb" not in [column["name"] for column in state["columns"]], "no column to filter by"
+    answer, arrays = told(view, "points", colour="rgb", most=ALL, filter="x,10,19")
+    assert arrays["colours"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
+    assert answer["legend"]["labels"] == []
+
+
 def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
     view = result_view(CloudFile(cloud), pictured)
     grey, arrays = told(view, "surface", colour="grey")

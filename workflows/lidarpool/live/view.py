@@ -20,7 +20,7 @@ from ..columns.table import AXES as POSITION
 from ..columns.table import Column, X, Y, Z
 from ..export.sweeps import Sweeps
 from ..render.closeup import around_ways, floor_and_cut
-from ..render.colouring import MOST_ENTRIES, Colouring, colours_of
+from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import Pictured, SensorWay, ways_of
 from ..scene.actors import Actor
@@ -68,6 +68,7 @@ class View:
         self.origin, self._bounds = self._around()
         rest = {column.name: column for column in self.points.table if column not in POSITION}
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
+        self._coloured = with_rgb(self.columns)
         self._lock = threading.Lock()
         self._surface: Surface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
@@ -175,6 +176,7 @@ class View:
                 {"name": name, "unit": "s" if column.unit == "ns" else column.unit,
                  "meaning": column.meaning} for name, column in self.columns.items()
             ],
+            "colours": [*self._coloured],
             "origin": self.origin.tolist(),
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
@@ -226,13 +228,13 @@ class View:
         finder, version = self._finder, self.version
         wanted = Filter.read(asked.get("filter", ""), list(self.columns))
         name = asked["colour"]
-        column = self.columns[name]
+        column = self._coloured[name]
         eye = Eye.read(asked["eye"]) if "eye" in asked else None
         scans = _scans(asked["scans"]) if "scans" in asked else None
         most = max(1, min(int(asked["most"]), MOST_POINTS))
         rows, count = finder.find(most, wanted, scans, eye, abandoned)
         colouring = self._colouring(finder, name, wanted, abandoned)
-        values = finder.points.values(name, rows)
+        values = values_of(column, lambda one: finder.points.values(one, rows))
         colours = np.full((len(rows), 4), 255, np.uint8)
         colours[:, :3] = as_bytes(colouring.paint(values))
         legend: Legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
@@ -251,8 +253,9 @@ class View:
         known = self._colourings
         if (name, wanted) not in known:
             rows, _ = finder.find(_SAMPLE, wanted, None, None, abandoned)
-            values = finder.points.values(name, rows)
-            known[name, wanted] = colours_of(values, self.columns[name], self._names(name))
+            column = self._coloured[name]
+            values = values_of(column, lambda one: finder.points.values(one, rows))
+            known[name, wanted] = colours_of(values, column, self._names(name))
         return known[name, wanted]
 
     def _sample(self, name: str) -> NDArray[Any]:
