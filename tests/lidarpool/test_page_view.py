@@ -18,6 +18,7 @@ from lidarpool.live.view import range_image
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.colours import Colours
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)
@@ -203,11 +204,13 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     scene = Scene.from_meshes([box("Hall", (8, 8, 8)), box("Table", (2, 2, 2))])
     half = np.sqrt(0.5)
     track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
-    scene = replace(scene, actors=(Actor(box("Cart", (1, 1, 1)), track),))
+    cart = replace(box("Cart", (1, 1, 1)), colours=Colours.plain(np.uint8([[[9, 8, 7]]]), 12))
+    scene = replace(scene, actors=(Actor(cart, track),))
     view = result_view(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
     state, arrays = told(view, "state")
     assert (state["actors"], state["statics"]) == ([{"name": "Cart"}], 2)
     assert len(state["actor_colours"]) == 1
+    assert arrays["actor0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
     assert arrays["actor0_places"][[0, -1]] == pytest.approx(np.array([[1, 1, 0], [5, 1, 0]]))
     assert np.abs(arrays["actor0_turns"][-1]) == pytest.approx([0, 0, half, half])

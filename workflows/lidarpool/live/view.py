@@ -418,7 +418,10 @@ def _actor_arrays(name: str, actor: Actor, duration_ns: float) -> dict[str, NDAr
     times = np.linspace(0, max(duration_ns, 1.0), _ACTOR_PLACES)
     places, rotations = actor.trajectory.poses(0, times)
     turns = np.eye(3)[None].repeat(len(times), axis=0) if rotations is None else rotations
-    return {
+    own, arrays = actor.mesh.colours, {}
+    if own is not None:
+        arrays[f"{name}_colours"] = own.means().repeat(3, axis=0)  # at the corners
+    return arrays | {
         f"{name}_corners": actor.mesh.vertices[actor.mesh.faces].astype(np.float32),
         f"{name}_times": times / _NS,
         f"{name}_places": places,

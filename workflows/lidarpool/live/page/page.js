@@ -406,7 +406,7 @@ async function loadSurface() {
   if (!state.scene) return;
   const hidden = chosen.scene === HIDDEN;
   picture.actorsHidden = hidden;
-  picture.colourActors(chosen.scene === "object");
+  picture.colourActors(chosen.scene);
   const told = hidden ? null : await ask("surface", { colour: chosen.scene });
   if (hidden !== (chosen.scene === HIDDEN)) return;
   picture.setSurface(told);
@@ -726,7 +726,7 @@ function takeState(told) {
   }
   picture.setSensors(own);
   picture.setActors(state.actors.map((actor, k) => ({
-    ...actor, object: state.statics + k, colour: state.actor_colours[k], corners: arrays[`actor${k}_corners`],
+    ...actor, object: state.statics + k, colour: state.actor_colours[k], corners: arrays[`actor${k}_corners`], own: arrays[`actor${k}_colours`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
   })));
   picture.setRays(arrays.rays);
