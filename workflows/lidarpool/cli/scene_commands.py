@@ -73,12 +73,13 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
 def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     from ..base.errors import LidarpoolError
     from ..base.words import counted
+    from ..scene.paint import painted
     from ..scene.scene_file import check_target, write_scene
 
     check_target(out)
     if out.exists() and not overwrite:
         raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
-    made = make()
+    made = painted(make())
     if made.instances and out.suffix.lower() != ".glb" and made.triangles > MOST_COPIED:
         raise LidarpoolError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "
