@@ -7,6 +7,7 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import partial
 from glob import escape
 from pathlib import Path
 from typing import Annotated, Any
@@ -22,14 +23,13 @@ from ..columns.table import COLOURS
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
-from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
-from ..sensor.materials import rows_named
+from ..sensor.materials import MaterialTable, rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
 from .copies import Standing, copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
@@ -171,7 +171,7 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
-    _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
+    _sources: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: what it gave}
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -279,16 +279,26 @@ class Scenario(Section):
         return [*notes, *filter(None, (self._of_size(scene), poses, self._of_colours(scene)))]
 
     @property
-    def colours(self) -> dict[str, str]:
-        """Colours that `build_scene` found: {mesh file: what it has}; empty if it read none."""
-        return dict(self._colours)
+    def sources(self) -> dict[str, str]:
+        """What `build_scene` read: {mesh file: a line on what it gave}."""
+        return dict(self._sources)
 
     def _of_colours(self, scene: Scene) -> str:
-        if scene.coloured or not self.coloured:
+        if not self.coloured:
             return ""
+        if not scene.coloured:
+            return (
+                "a column or reflectance: texture needs colours, but nothing in the scene has any, "
+                "so that all is grey"
+            )
+        names = scene.all_names
+        textured = MaterialTable.of(self._materials(scene), names).scale > 0
+        if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):
+            return ""
+        shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)
         return (
-            "a column or reflectance: texture needs colours, but nothing in the scene has any, so "
-            "that all is grey"
+            f"{len(grey):,} of {counted(int(textured.sum()), 'object')} with reflectance: texture "
+            f"have no colours and are grey: {shown}"
         )
 
     def _of_size(self, scene: Scene) -> str:
@@ -334,7 +344,7 @@ class Scenario(Section):
         """
         self._notes.clear()
         self._remarks.clear()
-        self._colours.clear()
+        self._sources.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         mistakes = Mistakes()
@@ -367,7 +377,11 @@ class Scenario(Section):
                     meshes.setdefault(shape, box(entry.name, entry.box))
                 with prefixed(f"{self._source}: scene.copies[{number}]"):
                     table = self._path(entry.table.file) if entry.table else None
-                    out += copies_of(entry, meshes[shape], standing, table)
+                    made = copies_of(entry, meshes[shape], standing, table)
+                if entry.file is not None:
+                    words = f", {counted(len(made), 'copy', 'copies')}"
+                    self._sources[entry.file.file] += words
+                out += made
         mistakes.tell()
         return out
 
@@ -497,7 +511,7 @@ class Scenario(Section):
     def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
-        meshes = load_meshes(
+        return load_meshes(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
@@ -506,11 +520,8 @@ class Scenario(Section):
             colours=self.coloured,
             tell=self._notes.append,
             axes=self._remarks.append,
+            taken=partial(self._sources.setdefault, entry.file),
         )
-        if self.coloured:
-            shown = [one.mesh if isinstance(one, Instance) else one for one in meshes]
-            self._colours[entry.file] = told_colours(mesh.colours for mesh in shown)
-        return meshes
 
     @property
     def coloured(self) -> bool:

@@ -27,7 +27,7 @@ _PALETTE = tuple(
     np.array([[[*bytes.fromhex(one)]]], np.uint8) for some in _PAINTS.values() for one in some
 )
 _TRUNK_M = 0.6  # crowns begin higher
-_UP, _FLAT, _STEEP = 0.2, 0.98, 0.65 # of normals along z: roofs, level ones; of ground: rock
+_UP, _FLAT, _STEEP = 0.2, 0.98, 0.65  # of normals along z: roofs, level ones; of ground: rock
 
 
 def painted(scene: Scene) -> Scene:
