@@ -44,10 +44,10 @@ _COLOURED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether 
     ".ply": read_ply_mesh,
     ".off": read_off,
     ".dae": read_dae,
+    ".3mf": read_3mf,
 }
 _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".stl": read_stl,
-    ".3mf": read_3mf,
     **dict.fromkeys(_USD, read_usd),
 }
 SUFFIXES = (".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf", *_USD)
