@@ -423,7 +423,10 @@ class Scenario(Section):
 
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, and those of actors and copies that have a class of their own."""
-        made = [Material(**dict(entry)) for entry in self.materials]
+        made = []
+        for number, entry in enumerate(self.materials):
+            with prefixed(f"materials[{number}]"):
+                made.append(Material(**dict(entry)))
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own = [(one, one.semantic_class) for one in placed if one.semantic_class is not None]
         if own and not made:
