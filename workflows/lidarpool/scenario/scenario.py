@@ -424,9 +424,9 @@ class Scenario(Section):
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, and those of actors and copies that have a class of their own."""
         made = []
-        for number, entry in enumerate(self.materials):
+        for number, given in enumerate(self.materials):
             with prefixed(f"materials[{number}]"):
-                made.append(Material(**dict(entry)))
+                made.append(Material(**dict(given)))
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own = [(one, one.semantic_class) for one in placed if one.semantic_class is not None]
         if own and not made:
