@@ -79,7 +79,9 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     check_target(out)
     if out.exists() and not overwrite:
         raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
-    made = painted(make())
+    made = make()
+    if out.suffix.lower() == ".glb":  # others keep no colours
+        made = painted(made)
     if made.instances and out.suffix.lower() != ".glb" and made.triangles > MOST_COPIED:
         raise LidarpoolError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "

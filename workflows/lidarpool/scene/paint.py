@@ -38,10 +38,14 @@ def painted(scene: Scene) -> Scene:
         _FIRST[kind] + turn % len(_PAINTS[kind]) if kind in _PAINTS else 0
         for kind, turn in zip(kinds, turns, strict=True)
     ]
-    owner, corners = scene.face_object, scene.vertices[scene.faces]
-    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    up = normals[:, 2] / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
-    above = corners[..., 2].min(axis=1) - scene.object_bounds[owner, 0, 2]
+    owner = scene.face_object
+    x, y, z = (axis[scene.faces].T for axis in scene.vertices.T.astype(np.float32))
+    (ax, bx), (ay, by), (az, bz) = ((axis[1] - axis[0], axis[2] - axis[0]) for axis in (x, y, z))
+    normal = ax * by - ay * bx
+    up = normal / np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + normal**2 + 1e-20)
+    lowest, foot = z.min(axis=0), np.full(len(kinds), np.inf, np.float32)
+    np.minimum.at(foot, owner, lowest)
+    above = lowest - foot[owner]
     image = np.array(paints, np.int32)[owner]
     kind = np.array([_NAMES.index(kind) if kind in _PAINTS else -1 for kind in kinds])[owner]
 
