@@ -150,9 +150,66 @@ def test_draco(tmp_path):
     np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 1, 0], atol=1e-3)
 
 
-def weigh(header, where):
-    header["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}]
+@pytest.mark.parametrize("where", ["nodes", "meshes"])
+def test_morph_targets_have_their_weights(tmp_path, where):
+    header = triangle()
+    header["meshes"][0]["primitives"][0]["targets"] = [{"POSITION": 0}, {"POSITION": 0}]
     header[where][0]["weights"] = [0.0, 0.5]
+    (mesh,) = load(tmp_path, header)
+    corners = np.frombuffer(CORNERS, "<f4").reshape(3, 3)
+    np.testing.assert_array_equal(mesh.vertices, [*(1.5 * corners), *corners])
+
+
+def skinned():
+    """A bar of two triangles with a joint at each end; the upper one is turned by a quarter."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 2, 0], [1, 2, 0]], "<f4")
+    joints = np.array([[0, 0, 0, 0]] * 2 + [[1, 0, 0, 0]] * 2, "u1")
+    weights = np.array([[1, 0, 0, 0]] * 2 + [[1, 0, 0, 0], [0.5, 0.5, 0, 0]], "<f4")
+    bound = np.tile(np.eye(4, dtype="<f4"), (2, 1, 1))
+    bound[1, 3, :3] = 0, -2, 0  # columns
+    faces = np.array([0, 1, 2, 1, 3, 2], "<u2")
+    arrays = corners, joints, weights, bound, faces
+    header = triangle(corners.tobytes())
+    kinds = [(5126, "VEC3", 4), (5121, "VEC4", 4), (5126, "VEC4", 4), (5126, "MAT4", 2),
+             (5123, "SCALAR", 6)]  # fmt: skip
+    begins = np.cumsum([0, *(array.nbytes for array in arrays)]).tolist()
+    header["bufferViews"] = [
+        {"buffer": 0, "byteOffset": begin, "byteLength": array.nbytes}
+        for begin, array in zip(begins, arrays, strict=False)
+    ]
+    header["accessors"] = [
+        {"bufferView": k, "componentType": part, "type": kind, "count": count}
+        for k, (part, kind, count) in enumerate(kinds)
+    ]
+    header["buffers"][0]["byteLength"] = begins[-1]
+    turned = {"translation": [0, 2, 0], "rotation": [0, 0, 0.5**0.5, 0.5**0.5]}
+    header["nodes"] = [
+        {"children": [1], "translation": [10, 0, 0]},  # which does not count
+        {"name": "Bar", "mesh": 0, "skin": 0, "scale": [3, 3, 3]},
+        {"children": [3], "translation": [0, 0, 5]},
+        turned,
+    ]
+    header["scenes"][0]["nodes"] = [0, 2]
+    header["skins"] = [{"joints": [2, 3], "inverseBindMatrices": 3}]
+    named = {"POSITION": 0, "JOINTS_0": 1, "WEIGHTS_0": 2}
+    header["meshes"][0]["primitives"] = [{"attributes": named, "indices": 4}]
+    return header, b"".join(array.tobytes() for array in arrays)
+
+
+def test_skins_are_bent_by_their_joints_as_they_stand(tmp_path):
+    header, body = skinned()
+    header["animations"] = [{"channels": [], "samplers": []}]
+    notes = []
+    path = write(tmp_path / "m.glb", glb(header, body))
+    (bar,) = load_meshes(path, up_axis="z", tell=notes.append)
+    # The first two follow the lower joint, the third the upper one, the last is between them.
+    upper = np.array([0, 2, 5]), np.array([0, 3, 5])
+    expected = [[0, 0, 5], [1, 0, 5], upper[0], (upper[1] + [1, 2, 5]) / 2]
+    np.testing.assert_allclose(bar.vertices, expected, atol=1e-6)
+    assert notes == [f"{path} has 1 animation, of 1 bent mesh: all stands still"]
+    header["nodes"][3]["children"] = [2]
+    with pytest.raises(LidarpoolError, match="nodes contain each other"):
+        load(tmp_path, header, body)
 
 
 @pytest.mark.parametrize(
@@ -161,9 +218,7 @@ def weigh(header, where):
         (lambda h: h.update(asset={"version": "1.0"}), "glTF 1.0"),
         (lambda h: h.update(nodes={"root": {}}), "glTF 1.0"),
         (lambda h: h.update(extensionsRequired=["EXT_meshopt_compression"]), "needs EXT_meshopt"),
-        (lambda h: weigh(h, "nodes"), "morph targets"),
-        (lambda h: weigh(h, "meshes"), "morph targets"),
-        (lambda h: h["nodes"][0].update(skin=0), "skeleton"),
+        (lambda h: h["nodes"][0].update(skin=0), "skins"),
         (lambda h: h["nodes"][0].update(translation=[1e999, 0, 0]), "by a matrix"),
         (lambda h: h["nodes"][0].update(mesh=-1), "-1 is given"),
         (lambda h: h["accessors"][0].update(count=9), "9 elements announced, 36 bytes there"),

@@ -210,7 +210,7 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     state, arrays = told(view, "state")
     assert (state["actors"], state["statics"]) == ([{"name": "Cart"}], 2)
     assert len(state["actor_colours"]) == 1
-    assert arrays["actor0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
+    assert arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
     assert arrays["actor0_places"][[0, -1]] == pytest.approx(np.array([[1, 1, 0], [5, 1, 0]]))
     assert np.abs(arrays["actor0_turns"][-1]) == pytest.approx([0, 0, half, half])

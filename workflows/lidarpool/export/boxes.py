@@ -25,6 +25,7 @@ class Boxes:
     quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to the world's
     sizes: Floats  # (a, 3): length, width and height, metres, along the actor's axes
     points: NDArray[np.int64]  # (a,): how many points of the sweep are the actor's
+    there: NDArray[np.bool_]  # (a,): whether it is in the scene
 
     @classmethod
     def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Boxes:
@@ -54,16 +55,18 @@ class Boxes:
         turn /= np.linalg.norm(turn, axis=1, keepdims=True)
         low, high = sweeps.actor_bounds[:, 0], sweeps.actor_bounds[:, 1]
         middle = (matrices(turn) @ ((low + high) / 2)[..., None])[..., 0]
-        return cls(place + middle, turn, high - low, counts)
+        return cls(
+            place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
+        )
 
 
 def type_of(name: str) -> str:
-    """Type of an actor for labels: its name without a number at the end, and without spaces.
+    """Type of an actor for labels: its name without spaces, and a number or identity at the end.
 
     Examples
     --------
-    >>> [type_of(name) for name in ("Car 1", "Car.2", "Delivery van", "7")]
+    >>> [type_of(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
     ['Car', 'Car', 'Delivery_van', '7']
     """
-    plain = re.sub(r"[\s._-]*\d+$", "", name.strip())
+    plain = re.sub(r"(\s*\([^()]*\)|[\s._-]*\d+)$", "", name.strip())
     return re.sub(r"\s+", "_", plain or name.strip())

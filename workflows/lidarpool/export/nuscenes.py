@@ -136,15 +136,19 @@ class _Tables:
         for kind in dict.fromkeys(kinds):
             self._add("category", kind, name=kind, description="")
         for actor, kind in enumerate(kinds):
-            whats = [(actor, number) for number in range(len(boxes))]
+            there = [number for number, box in enumerate(boxes) if box.there[actor]]
+            if not there:
+                continue
+            whats = [(actor, number) for number in there]
             self._add(
                 "instance", actor, category_token=self._token("category", kind),
-                nbr_annotations=len(boxes),
+                nbr_annotations=len(there),
                 first_annotation_token=self._token("sample_annotation", whats[0]),
                 last_annotation_token=self._token("sample_annotation", whats[-1]),
             )  # fmt: skip
             chain = self._chain("sample_annotation", whats)
-            for number, (box, beside) in enumerate(zip(boxes, chain, strict=True)):
+            for number, beside in zip(there, chain, strict=True):
+                box = boxes[number]
                 x, y, z, w = box.quaternions[actor].tolist()
                 length, width, height = box.sizes[actor].tolist()
                 self._add(

@@ -117,7 +117,13 @@ def _messages(
         frame = frames[sweeps.sensor[sweep]]
         topic = f"/{frame}/points" if sweeps.sensors[sweeps.sensor[sweep]] else "/points"
         rows = _rows(layout, row, points, sweeps, sweep)
-        in_world = [(WORLD, name, placed, sweep) for name, placed in moving]
+        in_world = [
+            (WORLD, name, placed, sweep)
+            for (name, placed), there in zip(
+                moving, [True, *sweeps.actor_there[:, sweep]], strict=True
+            )
+            if there
+        ]
         yield "/clock", types["rosgraph_msgs/msg/Clock"](make.stamp(time_ns)), time_ns
         yield "/tf", make.transforms(in_world, time_ns), time_ns
         message = types["sensor_msgs/msg/PointCloud2"](
@@ -222,7 +228,8 @@ class _Messages:
         always = types["builtin_interfaces/msg/Duration"](0, 0)
         return types["visualization_msgs/msg/MarkerArray"]([
             marker(
-                header, "actors", number, marker.CUBE, marker.ADD,
+                header, "actors", number, marker.CUBE,
+                marker.ADD if boxes.there[number] else marker.DELETE,
                 pose(point(*boxes.centres[number].tolist()),
                      turn(*boxes.quaternions[number].tolist())),
                 vector(*boxes.sizes[number].tolist()), orange, always, False, [], [], "",

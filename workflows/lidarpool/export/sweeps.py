@@ -21,7 +21,7 @@ from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.survey import nanoseconds
-from ..sensor.trajectory import matrices, quaternions_of
+from ..sensor.trajectory import matrices, presence_ns, quaternions_of
 
 Floats = NDArray[np.float64]
 SWEEPS_FILE = "sweeps.npz"
@@ -30,9 +30,9 @@ MIXED_UP = (
     f"({SWEEPS_FILE}): give both of one run, and keep the order."
 )
 _PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
-_FORMAT = 2
+_FORMAT = 3
 # Fields of `Sweeps` that a file holds under their names: as an array each, and as JSON.
-_ARRAYS = ("scans", "begins_ns", "sensor", "actor_bounds")
+_ARRAYS = ("scans", "begins_ns", "sensor", "actor_bounds", "actor_there")
 _WORDS = ("sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns")
 
 
@@ -64,6 +64,7 @@ class Sweeps:
     actors: tuple[str, ...]  # they follow the objects in the column `object`
     actor_poses: tuple[Placed, ...]  # of each actor
     actor_bounds: Floats  # (a, 2, 3): corners of each actor's box in its own axes, metres
+    actor_there: NDArray[np.bool_]  # (a, n): whether each actor is in the scene
     coordinates: str  # of the cloud's points, "world" or "sensor"
     precision_m: float  # step to which positions were rounded
     epsg: int | None = None  # code of the coordinate system of the world
@@ -96,7 +97,7 @@ class Sweeps:
         none = Placed(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
             np.zeros(1, np.int64), np.empty(0), np.empty(0, np.uint8), none, none, (), (), (), (),
-            np.empty((0, 2, 3)), "world", 0.001,
+            np.empty((0, 2, 3)), np.empty((0, 0), bool), "world", 0.001,
         )  # fmt: skip
 
     @classmethod
@@ -121,10 +122,12 @@ class Sweeps:
                 done += steps
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
         when = np.concatenate(begins)
-        actor_poses = []
+        actor_poses, there = [], []
         for actor in scene.actors:
             at, turned_by = actor.trajectory.poses(0, when)
             actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(when))))
+            appears, leaves = presence_ns(actor.trajectory)
+            there.append((appears <= when) & (when <= leaves))
         bounds = [
             np.stack([a.mesh.vertices.min(axis=0), a.mesh.vertices.max(axis=0)])
             for a in scene.actors
@@ -140,6 +143,7 @@ class Sweeps:
             tuple(actor.name for actor in scene.actors),
             tuple(actor_poses),
             np.array(bounds).reshape(-1, 2, 3),
+            np.array(there, bool).reshape(-1, len(when)),
             survey.coordinates,
             survey.precision_m,
             survey.epsg,

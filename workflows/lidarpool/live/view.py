@@ -23,8 +23,8 @@ from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import Pictured, SensorWay, ways_of
-from ..scene.actors import Actor
-from ..sensor.trajectory import quaternions_of
+from ..scene.actors import Actor, shapes_of
+from ..sensor.trajectory import presence_ns
 from .legend import Legend, as_bytes, legend_of
 from .points import Eye, Filter, PointFinder, Points, Scans, positions
 from .server import Answer, Arguments
@@ -161,6 +161,11 @@ class View:
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
+        meshes, arrays["actor_mesh"] = shapes_of(self._actors)
+        for number, mesh in enumerate(meshes):
+            arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
+            if mesh.colours is not None:  # at the corners
+                arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
         for number, actor in enumerate(self._actors):
             arrays |= _actor_arrays(f"actor{number}", actor, self._duration_ns)
         if self.sweeps is not None:
@@ -414,18 +419,13 @@ def _corners_of(box: Floats) -> Floats:
 
 
 def _actor_arrays(name: str, actor: Actor, duration_ns: float) -> dict[str, NDArray[Any]]:
-    """Mesh of an actor, and its poses over time."""
-    times = np.linspace(0, max(duration_ns, 1.0), _ACTOR_PLACES)
-    places, rotations = actor.trajectory.poses(0, times)
-    turns = np.eye(3)[None].repeat(len(times), axis=0) if rotations is None else rotations
-    own, arrays = actor.mesh.colours, {}
-    if own is not None:
-        arrays[f"{name}_colours"] = own.means().repeat(3, axis=0)  # at the corners
-    return arrays | {
-        f"{name}_corners": actor.mesh.vertices[actor.mesh.faces].astype(np.float32),
+    """Poses of an actor over time."""
+    times, places, turns = actor.samples(duration_ns, _ACTOR_PLACES)
+    return {
         f"{name}_times": times / _NS,
         f"{name}_places": places,
-        f"{name}_turns": quaternions_of(turns),
+        f"{name}_turns": turns,
+        f"{name}_there": np.array(presence_ns(actor.trajectory)) / _NS,
     }
 
 

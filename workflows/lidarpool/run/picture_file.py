@@ -16,22 +16,22 @@ from ..base.archives import open_archive
 from ..base.words import counted
 from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
-from ..scene.actors import Actor
+from ..scene.actors import Actor, shapes_of
 from ..scene.colours import Colours
 from ..scene.drawn import Drawn, cut
 from ..scene.mesh import Mesh
 from ..scene.scene import Scene
 from ..sensor import Survey, Track
 from ..sensor.materials import MaterialTable
-from ..sensor.trajectory import quaternions_of
+from ..sensor.trajectory import ALWAYS, Beyond, presence_ns
 from .result import RunResult
 
 PICTURE_FILE = "pictures.npz"
 
 MODELS_MOST = 4  # sensors named in a picture
 PLACES_MOST = 1000  # positions of a moving sensor or actor
-_FORMAT = 5
-_ACTOR = ("vertices", "faces", "times", "positions", "quaternions")
+_FORMAT = 6
+_TRACK = ("times", "positions", "quaternions")  # of an actor
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
 
@@ -152,12 +152,14 @@ class Pictured:
             track = actor.trajectory
             if not isinstance(track, Track):
                 raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
-            mesh = actor.mesh
-            made = (mesh.vertices, mesh.faces, track.times_s, track.positions, track.quaternions)
-            values = zip(_ACTOR, made, strict=True)
+            values = zip(_TRACK, (track.times_s, track.positions, track.quaternions), strict=True)
             arrays |= {f"actor{number}_{part}": value for part, value in values}
+            arrays[f"actor{number}_absent"] = track.beyond == "absent"
+        meshes, arrays["actor_mesh"] = shapes_of(self.scene.actors)
+        for number, mesh in enumerate(meshes):
+            arrays |= {f"mesh{number}_vertices": mesh.vertices, f"mesh{number}_faces": mesh.faces}
             if mesh.colours is not None:
-                arrays[f"actor{number}_colours"] = mesh.colours.means()
+                arrays[f"mesh{number}_colours"] = mesh.colours.means()
         if self.planning is not None and self.plan is not None:
             arrays |= {
                 "ends": [self.planning.start, self.planning.target],
@@ -183,11 +185,17 @@ class Pictured:
         if (made := int(arrays["format"])) != _FORMAT:
             raise ValueError(f"it is of format {made}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
-        actors = []
+        actors, which = [], arrays["actor_mesh"].tolist()
+        meshes = [
+            Mesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
+                 colours=_colours(arrays, f"{mesh}_colours"))
+            for mesh in (f"mesh{number}" for number in range(max(which, default=-1) + 1))
+        ]  # fmt: skip
         for number, name in enumerate(names["actors"]):
-            vertices, faces, *track = (arrays[f"actor{number}_{part}"] for part in _ACTOR)
-            shown = _colours(arrays, f"actor{number}_colours")
-            actors.append(Actor(Mesh(name, vertices, faces, colours=shown), Track(*track)))
+            times, places, turns = (arrays[f"actor{number}_{part}"] for part in _TRACK)
+            beyond: Beyond = "absent" if arrays[f"actor{number}_absent"] else "hold"
+            way = Track(times, places, turns, start_s=0.0, beyond=beyond)
+            actors.append(Actor(replace(meshes[which[number]], name=name), way))
         scene = Scene(
             arrays["vertices"],
             arrays["faces"],
@@ -259,7 +267,6 @@ def ways_of(
 
 def _sampled(actor: Actor, duration_ns: float) -> Actor:
     """Return an actor with poses of a survey, whatever its trajectory is."""
-    times = np.linspace(0, max(duration_ns, 1.0), PLACES_MOST)
-    positions, rotations = actor.trajectory.poses(0, times)
-    turns = np.eye(3)[None].repeat(len(times), axis=0) if rotations is None else rotations
-    return replace(actor, trajectory=Track(times / 1e9, positions, quaternions_of(turns)))
+    times, places, turns = actor.samples(duration_ns, PLACES_MOST)
+    beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
+    return replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))

@@ -3,27 +3,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import RayCaster, available_backends
-
 from ..base.allowance import check_fits
 from ..base.errors import LidarpoolError
-from ..base.words import counted, did_you_mean
-from ..scene.drawn import Drawn
+from ..base.words import counted
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
-from ..scene.scene import Scene
 from ..sensor.calibrations import said
-from ..sensor.materials import rows_named
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
 from .sections import COPIES_MOST, CopiesSection, Scatter
+from .standing import Standing
 
 SCALE_LEAST = 1e-6
 DRAWN = 1 << 14  # places that are drawn at a time
@@ -34,86 +29,6 @@ _PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
 
 Float = NDArray[np.float64]
-
-
-class Standing:
-    """What one can stand on in a scene: the triangles of some objects that face up.
-
-    Of several above a place the highest counts. None is a scene without triangles.
-    """
-
-    def __init__(self, scene: Scene | None, objects: NDArray[np.intp] | None = None) -> None:
-        self._scene, self._objects = scene, objects
-
-    def only(self, names: Sequence[str]) -> Standing:
-        """Return the same of some objects; LidarpoolError if there is nothing to stand on."""
-        scene = self._scene
-        if scene is None:
-            raise LidarpoolError(
-                "there is nothing to stand on: add scene.files, or scene.ground and a rectangle "
-                "(within)."
-            )
-        rows = [rows_named(name, scene.names) for name in names]
-        for name, found in zip(names, rows, strict=True):
-            if not len(found):
-                hint = (
-                    did_you_mean(name, scene.names) or f" There are {', '.join(scene.names[:5])}."
-                )
-                raise LidarpoolError(
-                    f"scatter.surfaces names {name!r}, but no object has that name.{hint}"
-                )
-        found = np.unique(np.concatenate(rows))
-        made = self if len(found) == len(scene.names) else Standing(scene, found)
-        if not len(made._tops[0]):
-            raise LidarpoolError(f"nothing of {', '.join(map(repr, names))} faces up.")
-        return made
-
-    @cached_property
-    def _tops(self) -> tuple[Float, NDArray[np.int32]]:
-        """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
-        assert self._scene is not None
-        drawn = Drawn.of(self._scene).scene
-        corners, owner = drawn.vertices[drawn.faces], drawn.face_object
-        if self._objects is not None:
-            own = np.isin(owner, self._objects)
-            corners, owner = corners[own], owner[own]
-        (ax, ay), (bx, by) = ((corners[:, k] - corners[:, 0]).T[:2] for k in (1, 2))
-        up = ax * by - ay * bx > 0
-        return corners[up], owner[up]
-
-    @cached_property
-    def _caster(self) -> RayCaster:
-        # Never CUDA, whose context would stay in this process.
-        backend = "numpy" if available_backends()["embree"] else "embree"
-        corners = self._tops[0].reshape(-1, 3)
-        return RayCaster(corners, np.arange(len(corners)).reshape(-1, 3), backend)
-
-    @property
-    def rectangle(self) -> Float:
-        """Lowest and highest x and y, world metres: (4,)."""
-        assert self._scene is not None
-        x, y = self._tops[0][..., :2].reshape(-1, 2).T
-        at = self._scene.origin[[0, 1, 0, 1]]
-        return np.array([x.min(), y.min(), x.max(), y.max()]) + at
-
-    @cached_property
-    def owners(self) -> NDArray[np.int32]:
-        """Objects that have triangles here."""
-        return np.unique(self._tops[1])
-
-    def under(self, places: Float) -> tuple[Float, NDArray[np.int32]]:
-        """Heights below places (n, 2), world metres, nan for none; and their objects, -1."""
-        heights, objects = np.full(len(places), np.nan), np.full(len(places), -1, np.int32)
-        if self._scene is None or not len(self._tops[0]):
-            return heights, objects
-        corners, owner = self._tops
-        origin, top = self._scene.origin, float(corners[..., 2].max()) + 1.0
-        origins = np.column_stack([places - origin[:2], np.full(len(places), top)])
-        hits = self._caster.cast(origins, np.broadcast_to([0.0, 0.0, -1.0], origins.shape))
-        on = hits.hit
-        heights[on] = top - hits.distance[on] + origin[2]
-        objects[on] = owner[hits.triangle[on]]
-        return heights, objects
 
 
 def copies_of(

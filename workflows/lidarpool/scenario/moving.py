@@ -10,13 +10,15 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field, Strict, model_validator
 
-from ..base.declared import Text, Triple, is_text, short
-from ..base.errors import prefixed
+from ..base.declared import Text, TextOrTexts, Triple, is_text, short
+from ..base.errors import LidarpoolError, prefixed
 from ..sensor import Mounted, Track, load_trajectory
 from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
+from ..sensor.trajectory import Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import Lengths, MeshEntry, PoseSection, Section, SensorSection, told
+from .standing import Standing, following
 
 
 class MountSection(PoseSection):
@@ -86,6 +88,17 @@ class TrajectorySection(Section):
     duration_s: Annotated[
         Duration | None, told("duration of the survey; by default to the end")
     ] = None
+    surfaces: Annotated[
+        TextOrTexts | None,
+        told("names of objects to follow, with * and ?; heights are then above them", "Terrain"),
+    ] = None
+    beyond: Annotated[
+        Beyond,
+        told(
+            "of actors, before the first and after the last time: an error (refuse), the same "
+            "pose (hold), or not in the scene (absent)"
+        ),
+    ] = "refuse"
 
     @model_validator(mode="after")
     def _one_source(self) -> TrajectorySection:
@@ -93,13 +106,24 @@ class TrajectorySection(Section):
             raise ValueError("give either file or points.")
         return self
 
-    def track(
-        self, folder: Path, origin: NDArray[np.float64], start_s: float | None = None
-    ) -> Track:
+    def track(self, folder: Path, standing: Standing, start_s: float | None = None) -> Track:
         """Return it in a scene's local coordinates; LidarpoolError if it cannot be used.
 
-        `start_s` is that of a survey, of whose clock it is.
+        `standing` is what there is to follow; `start_s` is that of a survey, of whose clock it is.
         """
+        way = self._level(folder, standing.origin, start_s)
+        if self.surfaces is None:
+            return way
+        # Pieces may end before the survey does.
+        for piece in following(replace(way, beyond="hold"), standing.only(self.surfaces)):
+            if piece.times_s[[0, -1]].tolist() == way.times_s[[0, -1]].tolist():
+                return replace(piece, beyond=way.beyond)
+        raise LidarpoolError(
+            f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
+        )
+
+    def _level(self, folder: Path, origin: NDArray[np.float64], start_s: float | None) -> Track:
+        """Return it without surfaces."""
         start_s = self.start_s if start_s is None else start_s
         smooth = self.interpolation == "smooth"
         if self.file is not None:
@@ -113,6 +137,7 @@ class TrajectorySection(Section):
                 smooth=smooth,
                 start_s=start_s,
                 duration_s=self.duration_s,
+                beyond=self.beyond,
             )
             return replace(track, positions=track.positions - origin)
         angles = [[p.yaw_deg, p.pitch_deg, p.roll_deg] for p in self.points]
@@ -124,6 +149,7 @@ class TrajectorySection(Section):
             smooth,
             start_s,
             self.duration_s,
+            self.beyond,
         )
 
 
@@ -157,7 +183,7 @@ class ActorSection(Section):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")
         return self
 
-    def way(self, folder: Path, origin: NDArray[np.float64], start_s: float) -> Track:
+    def way(self, folder: Path, standing: Standing, start_s: float) -> Track:
         """Return its trajectory from the survey's start on."""
         with prefixed(f"actor {self.name!r}"):
-            return self.trajectory.track(folder, origin, start_s)
+            return self.trajectory.track(folder, standing, start_s)

@@ -28,10 +28,10 @@ from ..scene.mesh import Mesh
 from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named
 from ..sensor.survey import SENSORS_MOST, Steps
-from .copies import Standing, copies_of
+from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .placing import Placing, inside_note, place
 from .sections import (
@@ -53,6 +53,8 @@ from .sections import (
     scene_in_short,
     told,
 )
+from .standing import Standing
+from .traffic import TrafficSection, VehicleSection, actors_of, read_fcd
 from .validation_errors import validation_errors
 
 # Objects lower than this are floors and markings, which a path may cross.
@@ -136,6 +138,13 @@ class Scenario(Section):
             max_length=10_000,
         ),
     ] = ()
+    traffic: Annotated[
+        TrafficSection | None,
+        told(
+            "vehicles and persons of a SUMO simulation, as actors",
+            {"file": "fcd.xml", "vehicles": [{"box": [4.5, 1.8, 1.5], "class": 10}]},
+        ),
+    ] = None
     mount: Annotated[
         MountSection | None,
         told(
@@ -172,6 +181,8 @@ class Scenario(Section):
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
     _sources: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: what it gave}
+    # Triangles of a scene, and the trajectory there.
+    _way: tuple[Any, Track] | None = PrivateAttr(default=None)
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
     @classmethod
@@ -256,8 +267,10 @@ class Scenario(Section):
                     sensor = section.sensor(self._folder)
                     self.returns.of(sensor.optics)
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
-        entries = [*self.scene.files, *(entry.file for entry in placed if entry.file)]
+        shaped = (*placed, *(self.traffic.vehicles if self.traffic else ()))
+        entries = [*self.scene.files, *(entry.file for entry in shaped if entry.file)]
         files = [entry.file for entry in entries]
+        files += [self.traffic.file] if self.traffic else []
         files += [entry.table.file for entry in self.scene.copies if entry.table]
         files += [one for one in (self.trajectory and self.trajectory.file,) if one]
         for file in files if mistakes.lines else ():
@@ -327,7 +340,7 @@ class Scenario(Section):
         if self.scene.has_seed:
             return ""
         if self.trajectory is not None:
-            track = self.trajectory.track(self._folder, scene.origin)
+            track = self._track(scene)
             at, _ = track.poses(0, np.linspace(0, track.duration_ns, _LOOKED_FROM))
         else:
             positions = [pose.position for pose in self._world_poses(scene)]
@@ -357,7 +370,22 @@ class Scenario(Section):
         scene = Scene.from_meshes(meshes)
         if self.scene.ground is not None:
             scene = Scene.from_meshes([*meshes, self._ground(scene)])
-        return replace(scene, actors=self._actors(scene.origin)) if self.actors else scene
+        if not (self.actors or self.traffic):
+            return scene
+        standing = Standing(scene)
+        with prefixed(self._source):
+            start = 0.0 if self.trajectory is None else self._track(scene, standing).start_s
+        assert start is not None  # of every track
+        actors = (*self._actors(standing, start), *self._traffic(scene, standing, start))
+        return replace(scene, actors=actors)
+
+    def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
+        """Return the trajectory in the coordinates of a scene; it is made once."""
+        assert self.trajectory is not None
+        if self._way is None or self._way[0] is not scene.faces:
+            way = self.trajectory.track(self._folder, standing or Standing(scene))
+            self._way = (scene.faces, way)
+        return self._way[1]
 
     def _copies(self, base: list[Mesh | Instance]) -> list[Instance]:
         """Place the copies; they stand on other objects and on the ground, not on one another."""
@@ -365,19 +393,15 @@ class Scenario(Section):
         if self.scene.ground is not None and (base or self._scattered_in()):
             scene = Scene.from_meshes([*base, self._ground(scene)])
         standing = Standing(scene)
-        meshes: dict[Any, Mesh] = {}  # {file and its placement, or size of a box: mesh}
+        shapes: dict[Any, Mesh] = {}
         out: list[Instance] = []
         mistakes = Mistakes()
         for number, entry in enumerate(self.scene.copies):
-            shape = entry.file or entry.box
             with mistakes.noted():
-                if entry.file is not None and shape not in meshes:
-                    meshes[shape] = one_mesh(entry.name, self._read(entry.file))
-                elif entry.box is not None:
-                    meshes.setdefault(shape, box(entry.name, entry.box))
+                mesh = self._shape(entry, shapes)
                 with prefixed(f"{self._source}: scene.copies[{number}]"):
                     table = self._path(entry.table.file) if entry.table else None
-                    made = copies_of(entry, meshes[shape], standing, table)
+                    made = copies_of(entry, mesh, standing, table)
                 if entry.file is not None:
                     words = f", {counted(len(made), 'copy', 'copies')}"
                     self._sources[entry.file.file] += words
@@ -406,20 +430,46 @@ class Scenario(Section):
         corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
         return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
-    def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
+    def _actors(self, standing: Standing, start_s: float) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
-        meshes = [
-            one_mesh(entry.name, self._read(entry.file))
-            if entry.file is not None
-            else box(entry.name, entry.box or (1, 1, 1))
-            for entry in self.actors
-        ]
+        shapes: dict[Any, Mesh] = {}
+        meshes = [replace(self._shape(entry, shapes), name=entry.name) for entry in self.actors]
         with prefixed(self._source):
-            start = 0.0
-            if self.trajectory is not None:
-                start = self.trajectory.track(self._folder, origin).start_s or 0.0
-            ways = [entry.way(self._folder, origin, start) for entry in self.actors]
+            ways = [entry.way(self._folder, standing, start_s) for entry in self.actors]
         return tuple(Actor(mesh, way) for mesh, way in zip(meshes, ways, strict=True))
+
+    def _shape(
+        self, entry: ActorSection | CopiesSection | VehicleSection, made: dict[Any, Mesh]
+    ) -> Mesh:
+        """Return the mesh of an entry, of those in `made` if it is there: {file or size: mesh}."""
+        shape = entry.file or entry.box or (1.0, 1.0, 1.0)
+        if shape not in made:
+            name = entry.name or "vehicle"
+            if isinstance(shape, MeshFile):
+                made[shape] = one_mesh(name, self._read(shape))
+            else:
+                made[shape] = box(name, shape)
+        return made[shape]
+
+    def _traffic(self, scene: Scene, standing: Standing, start_s: float) -> list[Actor]:
+        """Vehicles and persons that are there during the survey."""
+        section = self.traffic
+        if section is None:
+            return []
+        duration = self.survey(scene).duration_ns / 1e9
+        with prefixed(self._source):
+            path = self._path(section.file)
+            begin = start_s - section.offset_s
+            passages, count = read_fcd(path, begin, begin + duration)
+            shapes: dict[Any, Mesh] = {}
+            actors = actors_of(
+                section, passages, lambda entry: self._shape(entry, shapes), standing, start_s
+            )
+        self._notes.append(
+            f"{section.file}: {counted(len(actors), 'actor')} during the survey, of "
+            f"{counted(count, 'vehicle')} and persons until its end"
+        )
+        return actors
 
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, and those of actors and copies that have a class of their own."""
@@ -428,17 +478,24 @@ class Scenario(Section):
             with prefixed(f"materials[{number}]"):
                 made.append(Material(**dict(given)))
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
-        own = [(one, one.semantic_class) for one in placed if one.semantic_class is not None]
+        own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
+        for entry in placed:
+            names, numbered = [escape(entry.name)], f"{escape(entry.name)}.[0-9]*"
+            if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
+                names.append(numbered)
+            if entry.semantic_class is not None:
+                own.append((entry.name, names, entry.semantic_class))
+        for names, semantic_class in self.traffic.classes if self.traffic else ():
+            rows = {name: rows_named(name, scene.all_names) for name in names}
+            if there := [name for name in names if len(rows[name])]:
+                own.append((scene.all_names[rows[there[0]][0]], there, semantic_class))
         if own and not made:
             made = [Material("*")]
-        for entry, semantic_class in own:
+        for name, names, semantic_class in own:
             # After the last that is for it: a later one, for a single copy, counts there.
-            after = max((k for k, m in enumerate(made) if m.named(entry.name)), default=-1)
+            after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
             of = made[after] if after >= 0 else Material("*")
-            objects, numbered = [escape(entry.name)], f"{escape(entry.name)}.[0-9]*"
-            if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
-                objects.append(numbered)
-            made.insert(after + 1, replace(of, objects=objects, semantic_class=semantic_class))
+            made.insert(after + 1, replace(of, objects=names, semantic_class=semantic_class))
         return made
 
     def survey(self, scene: Scene) -> Survey:
@@ -452,7 +509,7 @@ class Scenario(Section):
         with prefixed(self._source):
             track, poses, carried = None, [], self._carried()
             if self.trajectory is not None:
-                track = self.trajectory.track(self._folder, scene.origin)
+                track = self._track(scene)
             else:
                 poses = [
                     replace(pose, position=tuple(np.subtract(pose.position, scene.origin)))

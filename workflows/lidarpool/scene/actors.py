@@ -6,11 +6,12 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..sensor import Stations, Trajectory
-from ..sensor.trajectory import CENTRE
+from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
 from .colours import joined
 from .instances import Instance
 from .mesh import Cutout, Mesh, stacked
@@ -41,11 +42,27 @@ class Actor:
         return self.mesh.name
 
     def placed(self, time_ns: float) -> Mesh:
-        """Its mesh at a time, in the scene's local coordinates."""
+        """Its mesh at a time, in the scene's local coordinates; one point if it is absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
+        first, last = presence_ns(self.trajectory)
+        vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Masks do not show.
         return Mesh(self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours)
+
+    def samples(
+        self, duration_ns: float, count: int
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+        """Return times (k,), nanoseconds, positions (k, 3) and quaternions (k, 4), for drawings.
+
+        They are even over the part of a survey of `duration_ns` in which it is in the scene.
+        """
+        appears, leaves = presence_ns(self.trajectory)
+        first = max(appears, 0.0)
+        times = np.linspace(first, max(min(leaves, duration_ns), first + 1e6), count)
+        positions, rotations = self.trajectory.poses(0, times)
+        turns = np.eye(3)[None].repeat(count, axis=0) if rotations is None else rotations
+        return times, positions, quaternions_of(turns)
 
     def check(self, begin_ns: float, end_ns: float) -> None:
         """Check that its trajectory covers a time; LidarpoolError if not."""
@@ -57,6 +74,23 @@ class Actor:
                 f"Actor {self.name!r}: {words}: let its trajectory begin before the first scan and "
                 "end after the last."
             ) from error
+
+
+def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], NDArray[np.intp]]:
+    """Meshes (m,) of actors, each once, and which of them each actor (a,) has.
+
+    Meshes are the same if they share their arrays.
+    """
+    numbers: dict[tuple[int, ...], int] = {}  # {ids of the arrays: number of the mesh}
+    meshes: list[Mesh] = []
+    which = []
+    for mesh in (actor.mesh for actor in actors):
+        parts = (mesh.vertices, mesh.faces, mesh.colours, *mesh.cutouts)
+        number = numbers.setdefault(tuple(map(id, parts)), len(meshes))
+        if number == len(meshes):
+            meshes.append(mesh)
+        which.append(number)
+    return meshes, np.array(which, np.intp)
 
 
 def one_mesh(name: str, objects: Iterable[Mesh | Instance]) -> Mesh:

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.words import counted
 from .beside import file_beside, spellings
 from .colours import LINEAR, WHITE, Colours, as_srgb
 from .masks import (
@@ -60,7 +61,7 @@ _TRANSMISSION = "KHR_materials_transmission"
 _GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
@@ -76,7 +77,7 @@ def read_gltf(data: bytes, path: Path, masks: bool = True, colours: bool = False
     reader = _Reader(header, body, path, len(data), masks, colours)
     content = settled(instances(_roots(header), reader.node, path.stem))
     content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
-    content.notes = reader.notes.lines()
+    content.notes = [*reader.notes.lines(), *reader.still()]
     content.generator = str(header.get("asset", {}).get("generator", ""))
     return content
 
@@ -107,7 +108,7 @@ def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def _check(header: dict[str, Any]) -> None:
-    """Refuse other versions, and features that move vertices other than by nodes."""
+    """Refuse other versions, and extensions that cannot be read."""
     # Version 1.0 names parts, instead of numbering them.
     if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
         header.get("nodes"), dict
@@ -116,17 +117,6 @@ def _check(header: dict[str, Any]) -> None:
     for name in map(str, header.get("extensionsRequired", ())):
         if not _READ.match(name) and name not in (_DRACO, _INSTANCING):
             raise MeshFileError(f"needs {name}, which cannot be read: export without it")
-    for node in (node for node in header.get("nodes", ()) if "mesh" in node):
-        if "skin" in node:
-            raise MeshFileError(
-                "moves vertices by a skeleton, which is not supported: apply the pose, then export"
-            )
-        mesh = header["meshes"][node["mesh"]]
-        morphs = any("targets" in primitive for primitive in mesh["primitives"])
-        if morphs and any(node.get("weights", mesh.get("weights", ()))):
-            raise MeshFileError(
-                "has active morph targets, which are not supported: apply them, then export"
-            )
 
 
 def _roots(header: dict[str, Any]) -> list[int]:
@@ -154,6 +144,11 @@ class _Reader:
         self._masks, self._colours = masks, colours
         self._allowance = Allowance(size, SMALLER)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
+        nodes = header.get("nodes", ())
+        self._parents = {
+            child: index for index, node in enumerate(nodes) for child in node.get("children", ())
+        }
+        self._bent = cache(self._read_bent)  # keys are (mesh, weights of its targets, skin)
         self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
         self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
@@ -175,7 +170,13 @@ class _Reader:
             name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
             # Some programs write a mesh for each node, all of the same accessors.
             content = json.dumps(self._part("meshes", found["mesh"])["primitives"], sort_keys=True)
-            meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
+            skin, weights = found.get("skin"), self._weights(found)
+            if skin is None and not any(weights):
+                meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
+            else:
+                meshes = self._bent(found["mesh"], weights, skin)
+            if skin is not None:  # its joints place it, not the node
+                copies = np.linalg.inv(self._world(index)).astype(np.float64)[None]
             if instancing := found.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
         return Node(name, _matrix(found), meshes, found.get("children", ()), copies)
@@ -198,12 +199,87 @@ class _Reader:
         rows = {name: self._accessor(at).astype(np.float64) for name, at in indices.items()}
         return _matrices(*(rows.get(name) for name in named))
 
+    def still(self) -> list[str]:
+        """Return a note on what moves in the file, and stands still here."""
+        bent, found = self._bent.cache_info().currsize, len(self._header.get("animations", ()))
+        meshes = f", of {counted(bent, 'bent mesh', 'bent meshes')}" * bool(bent)
+        return [f"has {counted(found, 'animation')}{meshes}: all stands still"] * bool(found)
+
+    def _weights(self, node: dict[str, Any]) -> tuple[float, ...]:
+        """Weights of the morph targets of a node's mesh."""
+        mesh = self._part("meshes", node["mesh"])
+        if not any("targets" in primitive for primitive in mesh["primitives"]):
+            return ()
+        return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
+
+    def _world(self, index: int) -> NDArray[np.float64]:
+        """Matrix (4, 4) from a node's coordinates to those of the scene."""
+        matrix, seen = np.eye(4), set()
+        at: int | None = index
+        while at is not None:
+            if at in seen:
+                raise ValueError("nodes contain each other")
+            seen.add(at)
+            matrix, at = _matrix(self._part("nodes", at)) @ matrix, self._parents.get(at)
+        return matrix
+
     def _read_mesh(self, index: int) -> list[Mesh]:
         """One mesh of all primitives, which differ by material only."""
+        return self._read_bent(index, (), None)
+
+    def _read_bent(self, index: int, weights: tuple[float, ...], skin: int | None) -> list[Mesh]:
+        """Return a mesh with its morph targets; of a skin, in the coordinates of the scene."""
         mesh = self._part("meshes", index)
         surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
         name = str(mesh.get("name") or self._path.stem)
-        return joined(name, map(self._primitive, surfaces), self._allowance)
+        joints = None if skin is None else self._joints(skin)
+
+        def piece(primitive: dict[str, Any]) -> Piece:
+            made = self._primitive(primitive)
+            if not len(made.faces) or (joints is None and not any(weights)):
+                return made
+            if _DRACO in primitive.get("extensions", {}):
+                raise MeshFileError(f"bends what is packed with {_DRACO}: export it without")
+            self._allowance.take(600 * len(made.vertices))  # of matrices and points, for a time
+            vertices = made.vertices.astype(np.float64)
+            for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
+                if weight and "POSITION" in target:
+                    vertices += weight * self._accessor(target["POSITION"])
+            if joints is not None:
+                vertices = self._skinned(vertices, primitive["attributes"], joints)
+            return made._replace(vertices=vertices)
+
+        return joined(name, map(piece, surfaces), self._allowance)
+
+    def _joints(self, skin: int) -> NDArray[np.float64]:
+        """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
+        found = self._part("skins", skin)
+        worlds = np.array([self._world(joint) for joint in found["joints"]])
+        if (bound := found.get("inverseBindMatrices")) is not None:
+            columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
+            worlds = worlds @ columns.reshape(-1, 4, 4).transpose(0, 2, 1)
+        return worlds
+
+    def _skinned(
+        self, vertices: NDArray[np.float64], at: dict[str, Any], joints: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Blend places of vertices (v, 3) by the joints that hold them."""
+        blend, total = np.zeros((len(vertices), 4, 4)), np.zeros(len(vertices))
+        sets = (name.removeprefix("JOINTS") for name in sorted(at) if name.startswith("JOINTS_"))
+        for number in sets:
+            rows = self._accessor(at[f"JOINTS{number}"]).astype(np.int64)
+            weights = self._accessor(at[f"WEIGHTS{number}"]).astype(np.float64)
+            for joint, weight in zip(rows.T, weights.T, strict=True):
+                if joint.max(initial=0) >= len(joints):
+                    raise ValueError(f"a vertex has joint {joint.max()} of {len(joints)}")
+                blend += weight[:, None, None] * joints[joint]
+                total += weight
+        loose = np.flatnonzero(total <= 0)  # other readers give these to their first joint
+        blend[loose] = joints[self._accessor(at["JOINTS_0"])[loose, 0].astype(np.int64)]
+        total[loose] = 1.0
+        blend /= total[:, None, None]
+        moved = np.einsum("vij,vj->vi", blend[:, :3, :3], vertices) + blend[:, :3, 3]
+        return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
         position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")

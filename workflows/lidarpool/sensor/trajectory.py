@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Annotated, Any, ClassVar, Protocol
+from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -18,6 +18,10 @@ QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
 # firing are fired a little after its pose.
 _CLOCK_S, _FIRING_S = 1e-6, 1e-3
+
+ALWAYS = (-np.inf, np.inf)
+
+Beyond = Literal["refuse", "hold", "absent"]
 
 
 @dataclass(frozen=True)
@@ -132,6 +136,15 @@ class Trajectory(Protocol):
         """
 
 
+def presence_ns(path: Trajectory) -> tuple[float, float]:
+    """Return when an actor on a trajectory is in the scene: first and last nanosecond.
+
+    Always, unless its class has a `presence_ns` that says otherwise.
+    """
+    first, last = getattr(path, "presence_ns", ALWAYS)
+    return float(first), float(last)
+
+
 @dataclass(frozen=True)
 class Stations:
     """The simplest trajectory: the sensor stands at one pose after the other."""
@@ -181,6 +194,9 @@ class Track:
         Start of the station, by the same clock; by default the first time.
     duration_s
         Duration of the station; by default until the last time.
+    beyond
+        Before the first and after the last time "refuse" raises an error. An actor stays at its
+        first or last pose with "hold", and is not in the scene with "absent".
 
     Raises
     ------
@@ -201,6 +217,7 @@ class Track:
     smooth: bool = False
     start_s: float | None = None
     duration_s: float | None = None
+    beyond: Beyond = "refuse"
     stations: ClassVar[int] = 1
     moves: ClassVar[bool] = True
 
@@ -236,23 +253,33 @@ class Track:
             object.__setattr__(self, name, array)
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
+        most = _CLOCK_S if self.beyond == "refuse" else np.inf
         for what, time in (("start_s", start), ("the end by duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
-            if not gap <= _CLOCK_S:  # or NaN
+            if not gap <= most:  # or NaN
                 raise LidarpoolError(
                     f"{what} is {time:.9g} s, {gap:.6g} s outside the trajectory, which goes from "
                     f"{times[0]:.9g} to {times[-1]:.9g} s."
                 )
-        if last <= start:
+        if self.beyond == "refuse" and last <= start:
             raise LidarpoolError(f"A trajectory from {start:.9g} to {last:.9g} s has no duration.")
         object.__setattr__(self, "start_s", float(start))
-        object.__setattr__(self, "duration_s", float(last - start))
+        object.__setattr__(self, "duration_s", float(max(last - start, 0.0)))
 
     @property
     def duration_ns(self) -> float:
         """See `Trajectory.duration_ns`."""
         assert self.duration_s is not None  # set above
         return self.duration_s * 1e9
+
+    @property
+    def presence_ns(self) -> tuple[float, float]:
+        """First and last nanosecond at which an actor is in the scene, see `beyond`."""
+        if self.beyond != "absent":
+            return ALWAYS
+        assert self.start_s is not None  # set above
+        first, last = (self.times_s[[0, -1]] - self.start_s) * 1e9
+        return float(first), float(last)
 
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """See `Trajectory.pose`."""
@@ -273,7 +300,9 @@ class Track:
         times, at = self.times_s, times_ns / 1e9 + self.start_s
         low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
         gap = max(times[0] - low, high - times[-1])
-        if gap > _FIRING_S:
+        if self.beyond != "refuse":
+            at = at.clip(times[0], times[-1])
+        elif gap > _FIRING_S:
             raise LidarpoolError(
                 f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
                 f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."

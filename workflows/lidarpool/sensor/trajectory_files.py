@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 from collections.abc import Callable, Container, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -15,7 +16,7 @@ from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from .calibrations import said
-from .trajectory import Track, quaternions_of, rotations_of
+from .trajectory import Beyond, Track, quaternions_of, rotations_of
 
 TrajectoryFormat = Literal["tum", "kitti", "csv"]
 Seconds = Annotated[float, Field(ge=-1e11, le=1e11)]
@@ -39,6 +40,7 @@ def load_trajectory(
     smooth: bool = False,
     start_s: Seconds | None = None,
     duration_s: Duration | None = None,
+    beyond: Beyond = "refuse",
 ) -> Track:
     """Read the trajectory of a carrier.
 
@@ -60,7 +62,7 @@ def load_trajectory(
         z up); by default for KITTI.
     offset_s
         Added to all times.
-    smooth, start_s, duration_s
+    smooth, start_s, duration_s, beyond
         As of `Track`.
 
     Raises
@@ -89,7 +91,7 @@ def load_trajectory(
         else:
             rows = _numbers(text, 8)
             seconds, places, turns = rows[:, 0], rows[:, 1:4], rows[:, 4:]
-        track = Track(seconds + offset_s, places, turns, smooth, start_s, duration_s)
+        track = Track(seconds + offset_s, places, turns, smooth, start_s, duration_s, beyond)
         if camera_axes or (camera_axes is None and kind == "kitti"):
             track = _from_camera(track)
         return track
@@ -216,4 +218,4 @@ def _from_camera(track: Track) -> Track:
     x, y, z, w = track.quaternions.T
     turns = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
     places = track.positions @ _CAMERA.T
-    return Track(track.times_s, places, turns, track.smooth, track.start_s, track.duration_s)
+    return replace(track, positions=places, quaternions=turns)

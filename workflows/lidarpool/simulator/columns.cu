@@ -33,7 +33,8 @@ __device__ __forceinline__ double cosine(
 // Hits: see `DeviceHits`; origins and directions are (3, count).
 // Rays: `firsts` of the scans, start of each firing after `start_ns` and delay of each beam, ns.
 // Surfaces: of each instance its first triangle, its object or -1 to look that up in `owners`, and
-// the row of its first normal; normals (3, faces); a matrix for the normals of each instance.
+// the row of its first normal, or -1 where NumPy makes the energies; normals (3, faces); a matrix
+// for the normals of each instance.
 KERNEL columns(
     const unsigned int* __restrict__ ray, const double* __restrict__ distance,
     const int* __restrict__ triangle, const int* __restrict__ instance,
@@ -82,7 +83,7 @@ KERNEL columns(
     object[k] = owner;
     if (WANTED(TRIANGLE)) triangle_of_scene[k] = (int)(body[0] + face);
     if (WANTED(CLASS)) semantic[k] = classes[owner];
-    if (WANTED(INTENSITY) || WANTED(REFLECTIVITY)) {
+    if (body[2] >= 0 && (WANTED(INTENSITY) || WANTED(REFLECTIVITY))) {
         const double* turn = body[1] < 0 ? 0 : turns + 9 * (Count)instance[k];
         const double along = cosine(normals, faces, body[2] + face, turn, directions + k, count);
         const double scattered = reflectance[owner] * (retro[owner] ? retro_gain : along);

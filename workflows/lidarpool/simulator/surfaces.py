@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey, Trajectory
@@ -79,6 +80,11 @@ class Surfaces:
         # Where the triangles of each instance begin, and those of actors.
         self._begins = plain + np.cumsum([0, *sizes])
         moving = [len(actor.mesh.faces) for actor in scene.actors]
+        self._meshes, which = shapes_of(scene.actors)
+        firsts = plain + np.cumsum([0, *(len(mesh.faces) for mesh in self._meshes)])
+        # What leads from a triangle of an actor to its row among those that are kept once.
+        self._to_kept = firsts[which] - self._begins[-1] - np.cumsum([0, *moving])[:-1]
+        self._parts_begin = int(firsts[-1])
         owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
         # Objects of the triangles of faces and of actors; the last is of no triangle.
         owned = [scene.face_object, np.repeat(owners, moving), np.zeros(1, np.int32)]
@@ -138,11 +144,16 @@ class Surfaces:
 
     def _rows(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
         """Rows among the triangles that are kept once, and the others as `_found`."""
-        if self._scene.instances is None:
-            return triangle, _NONE, _NONE
-        rows, on, which = self._found(triangle)
-        local = rows[on] - self._begins[which]
-        rows[on] = self._first_of_part[self._scene.instances.part[which]] + local
+        rows, on, which = triangle, _NONE, _NONE
+        if self._scene.instances is not None:
+            rows, on, which = self._found(triangle)
+            local = rows[on] - self._begins[which]
+            rows[on] = self._first_of_part[self._scene.instances.part[which]] + local
+        moving = np.flatnonzero(triangle >= self._begins[-1]) if self._meshes else _NONE
+        if len(moving):
+            actor = self.objects(triangle[moving]) - self._standing
+            rows = rows.copy()
+            rows[moving] = triangle[moving] + self._to_kept[actor]
         return rows, on, which
 
     def colours(
@@ -202,14 +213,14 @@ class Surfaces:
         bodies
             (b, 3): the scene's faces, if there are any, each instance, and all actors as one. Of
             each its first triangle, its object, or -1 if `owners` has that of each triangle, and
-            the row of its first normal in `unit_normals`. Rows of the actors begin behind those of
-            the scene's faces.
+            the row of its first normal in `unit_normals`, or -1 for the actors, which share theirs.
+            In `owners`, actors begin behind the scene's faces.
         turns
             (b, 3, 3): matrices that take its normals to the scene's axes, but for their length.
         """
         plain, actors = self._begins[[0, -1]]
         one = np.eye(3)[None]
-        bodies: list[Any] = [[[actors - plain, -1, 0]]]
+        bodies: list[Any] = [[[actors - plain, -1, -1]]]
         turns = [one]
         if (shared := self._scene.instances) is not None:
             firsts = self._first_of_part[shared.part]
@@ -264,14 +275,14 @@ class Surfaces:
     def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
         """Vertices, faces and colours of the triangles that are kept once.
 
-        Those of actors follow the scene's, and those of the parts of instances follow them.
+        Those of the meshes of actors follow the scene's, and those of the parts of instances follow
+        them.
         """
         scene = self._scene
         bodies: list[tuple[Real, Triangles, Colours | None]] = [
             (scene.vertices, scene.faces, scene.colours)
         ]
-        meshes = [actor.mesh for actor in scene.actors]
-        bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in meshes]
+        bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in self._meshes]
         if scene.instances is not None:
             parts = scene.instances.parts
             bodies += [(part.vertices, part.faces, part.colours) for part in parts]
@@ -298,7 +309,7 @@ class Surfaces:
         """Rows at which the parts of instances begin."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
-        return len(self.owners) - 1 + np.cumsum([0, *sizes[:-1]])
+        return self._parts_begin + np.cumsum([0, *sizes[:-1]])
 
 
 def _turns(transforms: Real) -> Real:

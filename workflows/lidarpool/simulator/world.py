@@ -7,8 +7,8 @@ axes of each pose selects them.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
-from hashlib import blake2b
 from typing import Any
 
 import numpy as np
@@ -28,11 +28,12 @@ from raybeam import (
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
-from ..scene.actors import Actor
+from ..scene.actors import shapes_of
 from ..scene.instances import Instances, Part, parts_of
 from ..scene.mesh import Mesh as ActorMesh
 from ..scene.scene import Scene
 from ..sensor import Trajectory
+from ..sensor.trajectory import presence_ns
 from .motion import Poses, into_axes, products
 from .surfaces import Surfaces
 
@@ -82,11 +83,10 @@ class World:
             begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
             self._begins = np.append([0] * bool(own), begins).astype(np.int32)
             faces += self._shared.triangles
-        self._actors = []
-        casters: dict[bytes, RayCaster] = {}
-        for actor in scene.actors:
-            self._actors.append(_Cast(actor, faces, options, casters))
-            faces += len(actor.mesh.faces)
+        moving, self._shape_of = shapes_of(scene.actors)
+        self._shapes = [_Shape(mesh, options) for mesh in moving]
+        sizes = [len(actor.mesh.faces) for actor in scene.actors]
+        self._firsts = (faces + np.cumsum([0, *sizes[:-1]])).astype(np.int32)  # triangles
 
     def place(self, surfaces: Surfaces, shared: Instances, rows: NDArray[np.intp]) -> None:
         """Move some instances to where they are now; no scan may be under way."""
@@ -124,7 +124,7 @@ class World:
         common: dict[str, Any] = {
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
         }  # fmt: skip
-        if self._begins is None and not self._actors:
+        if self._begins is None and not self._shapes:
             return self.caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
@@ -132,7 +132,7 @@ class World:
         if self._begins is not None:
             found = replace(found, triangle=found.triangle + self._begins[found.instance])
         ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
-        if self._actors:
+        if self._shapes:
             window, reach = (start, stop), (t_min, t_max)
             ray, distance, triangle = self._with_actors(found, pattern, poses, window, reach)
         begins = np.zeros(1, np.int64) if groups is None else groups
@@ -175,20 +175,60 @@ class World:
     ) -> OtherHits:
         """Find the nearest hits of rays on actors, whether something stands before them or not."""
         cells = _Cells(pattern, poses, *window)
-        found = []
-        for actor, way in zip(self._actors, poses.ways, strict=True):
-            ray = cells.near(actor, way, reach[1])
-            if len(ray):
-                origins, directions = poses.rays(pattern, ray, window[0])
-                moved = way.poses(0, poses.times(ray))
-                rows, t, face = actor.hits(origins, directions, moved, *reach)
-                found.append((ray[rows], t, face))
+        found: list[tuple[Any, ...]] = []
+        waiting: list[tuple[int, NDArray[np.intp], tuple[Float, Float | None]]] = []
+        for number, way in enumerate(poses.ways):
+            ray = cells.near(self._shapes[self._shape_of[number]], way, reach[1])
+            if not len(ray):
+                continue
+            times = poses.times(ray)
+            first, last = presence_ns(way)
+            if first > times.min() or times.max() > last:
+                there = (first <= times) & (times <= last)
+                ray, times = ray[there], times[there]
+            waiting.append((number, ray, way.poses(0, times)))
+            # Those of several actors together, because most calls have few rays; all would be many.
+            if sum(len(ray) for _, ray, _ in waiting) > window[1] - window[0]:
+                found += self._cast_near(waiting, pattern, poses, window[0], reach)
+                waiting = []
+        found += self._cast_near(waiting, pattern, poses, window[0], reach)
         if not found:
             return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
         ray, t, face = map(np.concatenate, zip(*found, strict=True))
         order = np.lexsort((t, ray))  # of equal distances, that of the first actor comes first
         order = order[np.diff(ray[order], prepend=-1) > 0]
         return OtherHits(ray[order].astype(np.uint32), t[order], face[order])
+
+    def _cast_near(
+        self,
+        near: list[tuple[int, NDArray[np.intp], tuple[Float, Float | None]]],
+        pattern: Pattern,
+        poses: Poses,
+        start: int,
+        reach: tuple[float, float],
+    ) -> Iterator[tuple[Any, ...]]:
+        """Rays, distances and triangles of hits of rays near actors, each with its number."""
+        if not near:
+            return
+        sizes = [len(ray) for _, ray, _ in near]
+        numbers = np.repeat([number for number, _, _ in near], sizes)
+        ray = np.concatenate([ray for _, ray, _ in near])
+        origins, directions = poses.rays(pattern, ray, start)
+        places = np.concatenate([places for *_, (places, _) in near])
+        starts, ways = origins - places, directions
+        if any(turns is not None for *_, (_, turns) in near):
+            turns = [np.eye(3)[None].repeat(n, axis=0) if t is None else t
+                     for n, (*_, (_, t)) in zip(sizes, near, strict=True)]  # fmt: skip
+            rotations = np.concatenate([t.transpose(1, 2, 0) for t in turns], axis=2)
+            rotations = rotations.transpose(2, 0, 1)
+            starts, ways = into_axes(starts, rotations), into_axes(directions, rotations)
+        for shape in np.unique(self._shape_of[numbers]).tolist():
+            own = np.flatnonzero(self._shape_of[numbers] == shape)
+            on, distance, triangle = self._shapes[shape].hits(starts[own], ways[own], *reach)
+            on = own[on]
+            # Directions of a sensor that turns during a pose are not quite of unit length.
+            lengths = np.linalg.norm(directions[on], axis=1)
+            yield ray[on], distance / lengths, triangle + self._firsts[numbers[on]]
 
 
 def _mesh_of(part: Part) -> Mesh:
@@ -228,11 +268,14 @@ class _Cells:
         ends = poses.times(last)
         self._lasts, self._end = (ends - self._begins).max(initial=0), ends.max(initial=0)
 
-    def near(self, actor: _Cast, way: Trajectory, t_max: float) -> NDArray[np.intp]:
+    def near(self, actor: _Shape, way: Trajectory, t_max: float) -> NDArray[np.intp]:
         """Numbers of the rays that come near an actor; no other ray hits it."""
         if not self._rays:
             return np.zeros(0, np.intp)
         low, high = self._begins.min(), self._begins.max()
+        first, last = presence_ns(way)
+        if self._end < first or last < low:
+            return np.zeros(0, np.intp)
         step = max((high - low) * CELLS / len(self._begins), self._lasts, 1.0)
         times = low + step * np.arange((high - low) // step + 1)
         places, rotations = way.poses(0, np.append(times, self._end))
@@ -256,47 +299,26 @@ class _Cells:
         return ray[ray < self._rays]
 
 
-def _arrays(mesh: ActorMesh) -> list[NDArray[Any]]:
-    return [mesh.vertices, mesh.faces, *(a for cut in mesh.cutouts for a in (cut.mask, cut.uv))]
+class _Shape:
+    """A mesh of actors with its ray caster, and the bounding sphere of its vertices."""
 
-
-class _Cast:
-    """An actor with its ray caster, and the bounding sphere of its vertices."""
-
-    def __init__(
-        self, actor: Actor, first: int, options: dict[str, Any], casters: dict[bytes, RayCaster]
-    ) -> None:
-        mesh = actor.mesh
-        vertices = mesh.vertices
-        # Actors of one shape share a tree; what they share as objects is lost on the way here.
-        shape = blake2b(b"".join(a.tobytes() for a in _arrays(mesh))).digest()
-        if shape not in casters:
-            parts = [Instance(_mesh_of(part)) for part in parts_of(mesh)]
-            casters[shape] = RayCaster.of(parts, **options)
-        self._caster = casters[shape]
-        sizes = [len(part.faces) for part in parts_of(mesh)]
-        self._parts = (first + np.cumsum([0, *sizes[:-1]])).astype(np.int32)
-        self.middle = (vertices.min(axis=0) + vertices.max(axis=0)) / 2
-        self.radius = float(np.linalg.norm(vertices - self.middle, axis=1).max())
+    def __init__(self, mesh: ActorMesh, options: dict[str, Any]) -> None:
+        parts = parts_of(mesh)
+        self._caster = RayCaster.of([Instance(_mesh_of(part)) for part in parts], **options)
+        sizes = [len(part.faces) for part in parts]
+        self._parts = np.cumsum([0, *sizes[:-1]]).astype(np.int32)
+        self.middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
+        self.radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
 
     def hits(
-        self,
-        origins: Float,
-        directions: Float,
-        poses: tuple[Float, Float | None],
-        t_min: float,
-        t_max: float,
+        self, origins: Float, directions: Float, t_min: float, t_max: float
     ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
-        """Hits on it of rays (m, 3), each with the actor's pose at its time.
+        """Hits on it of rays (m, 3) in its own axes.
 
         Returns
         -------
-        Numbers of the rays that hit (h,), distances in lengths of their directions, and triangles.
+        Numbers of the rays that hit (h,), distances, and triangles.
         """
-        positions, rotations = poses
-        starts = into_axes(origins - positions, rotations)
-        hits = self._caster.cast(starts, into_axes(directions, rotations), t_min, t_max)
+        hits = self._caster.cast(origins, directions, t_min, t_max)
         on = np.flatnonzero(hits.hit)
-        # Directions of a sensor that turns during a pose are not quite of unit length.
-        lengths = np.linalg.norm(directions[on], axis=1)
-        return on, hits.distance[on] / lengths, hits.triangle[on] + self._parts[hits.instance[on]]
+        return on, hits.distance[on], hits.triangle[on] + self._parts[hits.instance[on]]

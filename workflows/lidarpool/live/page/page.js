@@ -726,8 +726,10 @@ function takeState(told) {
   }
   picture.setSensors(own);
   picture.setActors(state.actors.map((actor, k) => ({
-    ...actor, object: state.statics + k, colour: state.actor_colours[k], corners: arrays[`actor${k}_corners`], own: arrays[`actor${k}_colours`],
+    ...actor, object: state.statics + k, colour: state.actor_colours[k],
+    corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colours`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
+    there: arrays[`actor${k}_there`],
   })));
   picture.setRays(arrays.rays);
   document.title = state.title;

@@ -293,7 +293,8 @@ export class Picture {
         geometry.setIndex(index);
       }
     }
-    for (const actor of this.actors) actor.mesh.visible = shown(actor.object) && !this.actorsHidden;
+    for (const actor of this.actors) actor.shown = shown(actor.object) && !this.actorsHidden;
+    if (this.time !== undefined) this.setTime(this.time);
     if (this.rays) this.rays.visible = !limits && this.raysShown !== false;
     this.dirty = true;
   }
@@ -301,8 +302,11 @@ export class Picture {
   setActors(actors) {
     for (const actor of this.actors) this.scene.remove(actor.mesh);
     this.actors = actors;
+    const made = new Map(); // {corners: geometry that actors share}
     for (const actor of actors) {
-      const geometry = new THREE.BufferGeometry();
+      const geometry = made.get(actor.corners) ?? new THREE.BufferGeometry();
+      made.set(actor.corners, geometry);
+      actor.shown = !this.actorsHidden;
       geometry.setAttribute("position", new THREE.BufferAttribute(actor.corners, 3));
       if (actor.own) geometry.setAttribute("color", new THREE.BufferAttribute(actor.own, 3, true));
       const material = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, clippingPlanes: this.planes });
@@ -397,6 +401,7 @@ export class Picture {
       sensor.marker.visible = sensor.way.visible = sensor.shown;
     }
     for (const actor of this.actors) {
+      actor.mesh.visible = actor.shown && actor.there[0] <= time && time <= actor.there[1];
       actor.at = placeAt(actor.times, actor.places, time, true);
       actor.mesh.position.set(...actor.at);
       const k = Math.max(0, lastNotAbove(actor.times, time));

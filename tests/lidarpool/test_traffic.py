@@ -1,0 +1,287 @@
+"""Actors that appear and leave, and traffic of SUMO."""
+
+from __future__ import annotations
+
+import gzip
+import json
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from tests.lidarpool.casting import cast_between
+
+from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor
+from lidarpool.columns.cloud import Cloud
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.run.job import make_job
+from lidarpool.run.picture_file import Pictured
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.actors import Actor, box
+from lidarpool.simulator.rig import Rig
+
+FLOOR = box("Floor", (60, 60, 0.01))
+COLUMNS = ["time", "range", "triangle", "intensity", "class"]
+
+
+def made(survey, scene, backend="numpy"):
+    """Columns of all points that a survey gives: {name: (n,)}."""
+    batches = list(Rig(scene, survey, backend).cast(0, survey.scan_count))
+    return {
+        column.name: np.concatenate([column.make(batch) for batch in batches])
+        for column in survey.stored_columns
+    }
+
+
+def passing(beyond, times=(0.02, 0.065)):
+    """A car that drives from x -2 to 2 at y 6."""
+    return Actor(
+        box("Car", (4, 2, 1.5)), Track(times, [[-2, 6, 0], [2, 6, 0]], start_s=0.0, beyond=beyond)
+    )
+
+
+@pytest.mark.parametrize("backend", ["numpy", "embree"])
+@pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])
+def test_an_actor_is_hit_only_while_it_is_there(model, backend):
+    mount = Pose((0, 0, 0), 90 if "livox" in model else 0)
+    survey = Survey(
+        sensors=[Mounted(load_sensor(model), mount)], poses=[(0, 0, 1.0)], steps=72,
+        keep_every=1, columns=COLUMNS,
+    )  # fmt: skip
+    plain = Scene.from_meshes([FLOOR])
+    start = {"times": (0.0, 0.11)}
+    scenes = {
+        "absent": plain.with_actors([passing("absent", **start)]),
+        "held": plain.with_actors([passing("hold", **start)]),
+        "none": plain,
+    }
+    found = {name: made(survey, scene, backend) for name, scene in scenes.items()}
+    there = {name: columns["time"] <= 110_000_000 for name, columns in found.items()}
+    for column in found["none"]:
+        absent, held, none = (found[name][column] for name in ("absent", "held", "none"))
+        assert np.array_equal(absent[there["absent"]], held[there["held"]]), column
+        assert np.array_equal(absent[~there["absent"]], none[~there["none"]]), column
+    cars = {name: columns["object"] == 1 for name, columns in found.items()}
+    assert cars["absent"].sum() > 20 and (cars["held"] & ~there["held"]).sum() > 20
+    # However the scans are cast.
+    rig = Rig(scenes["absent"], survey, backend)
+    whole = cast_between(rig, survey, [0, 72])
+    assert cast_between(rig, survey, [0, 1, 37, 38, 40, 72]) == whole
+
+
+def test_an_actor_is_refused_held_or_absent_beyond_its_trajectory():
+    times = np.array([-1e9, 0.02e9, 1e9])
+    with pytest.raises(LidarpoolError, match="outside"):
+        passing("refuse").trajectory.poses(0, times)
+    for beyond in ("hold", "absent"):
+        places, _ = passing(beyond).trajectory.poses(0, times)
+        assert places[:, 0].tolist() == pytest.approx([-2, -2, 2])
+    with pytest.raises(LidarpoolError, match="start_s is nan s"):
+        Track([0, 1], [[0, 0, 0], [1, 0, 0]], start_s=np.nan, beyond="absent")
+
+
+@pytest.fixture
+def sweeps_of_three():
+    survey = Survey(load_sensor("velodyne/vlp16"), poses=[(0, 0, 1.0)], steps=108)
+    scene = Scene.from_meshes([FLOOR]).with_actors([passing("absent", (0.05, 0.15))])
+    return Sweeps.of(survey, scene)
+
+
+def test_labels_and_frames_are_of_actors_that_are_there(sweeps_of_three, tmp_path):
+    assert sweeps_of_three.actor_there.tolist() == [[False, True, False]]
+    columns = {"scan": [0, 40, 80], "object": [0] * 3, "channel": [0] * 3, "time": [0, 1e8, 2e8]}
+    columns |= {"intensity": [1.0] * 3, "class": [0] * 3}
+    cloud = Cloud(np.zeros((3, 3)), columns, sweeps=lambda: sweeps_of_three)
+    cloud.save(tmp_path / "nu", format="nuscenes")
+    tables = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("nu/v1.0-*/*")}
+    (row,) = tables["sample_annotation"]
+    assert row["sample_token"] == tables["sample"][1]["token"]
+    assert tables["instance"][0]["nbr_annotations"] == 1
+
+    rosbags = pytest.importorskip("rosbags.highlevel")
+    from rosbags.typesys import Stores, get_typestore
+
+    cloud.save(tmp_path / "a.mcap", layout="velodyne")
+    store = get_typestore(Stores.ROS2_HUMBLE)
+    shown, frames = [], []
+    with rosbags.AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
+        for connection, _, data in bag.messages():
+            message = bag.deserialize(data, connection.msgtype)
+            if connection.topic == "/actors":
+                shown += [marker.action for marker in message.markers]
+            elif connection.topic == "/tf":
+                frames.append([one.child_frame_id for one in message.transforms])
+    assert shown == [2, 0, 2]  # DELETE, ADD, DELETE
+    assert frames == [["base_link"], ["base_link", "Car"], ["base_link"]]
+
+
+# A car that drives east at 10 m/s, and at 2 s is taken out for a step; a person who walks north;
+# a bus that is there at 9 s alone.
+FCD = """<?xml version="1.0" encoding="UTF-8"?>
+<fcd-export>
+  <timestep time="0.00"><vehicle id="a.1" x="10" y="5" angle="90" type="car" slope="0"/></timestep>
+  <timestep time="1.00">
+    <vehicle id="a.1" x="20" y="5" angle="90" type="car" slope="5.0"/>
+    <person id="p" x="0" y="0" z="0.5" angle="0" type="walker" slope="0"/>
+  </timestep>
+  <timestep time="2.00"><person id="p" x="0" y="1" z="0.5" angle="0" type="walker"/></timestep>
+  <timestep time="3.00"><vehicle id="a.1" x="40" y="5" angle="45" type="car"/></timestep>
+  <timestep time="4.00"><vehicle id="a.1" x="50" y="5" angle="45" type="car"/></timestep>
+  <timestep time="9.00"><vehicle id="bus" x="50" y="5" angle="45" type="bus"/></timestep>
+</fcd-export>
+"""
+SHAPES = [
+    {"types": "walk*", "name": "Person", "box": [0.4, 0.5, 1.7], "class": 7},
+    {"types": ["car", "bus"], "box": [4, 2, 1.5], "class": 10},
+]
+
+
+def scenario(folder, text=FCD, traffic=(), **sections):
+    (folder / "fcd.xml").write_text(text)
+    data = {
+        "scene": {"ground": {"margin_m": 60}, "copies": [{"name": "Post", "box": [1, 1, 3],
+                  "at": [[0, 9, 0]]}]},
+        "poses": [[10, 8, 1.5]],
+        "sensor": {"model": "velodyne/vlp16"},
+        "steps": 36 * 50,
+        "traffic": {"file": "fcd.xml", "vehicles": SHAPES, **dict(traffic)},
+        "cloud": {"columns": ["time", "class"], "keep_every": 1},
+    }  # fmt: skip
+    return Scenario.from_data(data | sections, folder=folder)
+
+
+def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
+    read = scenario(tmp_path)
+    scene = read.build_scene()
+    assert [actor.name for actor in scene.actors] == ["car (a.1)", "Person (p)", "car (a.1)"]
+    assert scene.all_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
+    first, person, again = (actor.trajectory for actor in scene.actors)
+    assert [way.presence_ns for way in (first, person, again)] == [
+        (0, 1e9), (1e9, 2e9), (3e9, 4e9)
+    ]  # fmt: skip
+    # The front is where SUMO says: 2 m ahead of the middle.
+    places, turns = first.poses(0, np.array([0.5e9, 1e9]))
+    front = places + turns @ [2, 0, 0]
+    np.testing.assert_allclose(front, [[15, 5, 0], [20, 5, 0]], atol=0.02)
+    np.testing.assert_allclose(turns[1, :, 0], [np.cos(np.radians(5)), 0, np.sin(np.radians(5))])
+    place, turn = person.poses(0, np.array([1.5e9]))
+    np.testing.assert_allclose(place + turn @ [0.2, 0, 0], [[0, 0.5, 0.5]], atol=1e-9)
+    np.testing.assert_allclose(again.poses(0, np.array([3e9]))[1][0, :2, 0], [0.5**0.5] * 2)
+    assert any("3 actors during the survey, of 3 vehicles" in note for note in read.advice(scene))
+
+    job = make_job(read, "embree")
+    found = made(job.survey, job.scene, "embree")
+    for number, semantic_class, (begin, end) in ((2, 10, (0, 1)), (3, 7, (1, 2)), (4, 10, (3, 4))):
+        own = found["object"] == number
+        assert own.any() and set(found["class"][own]) == {semantic_class}
+        times = found["time"][own] / 1e9
+        assert begin <= times.min() and times.max() <= end
+    assert set(found["class"][found["object"] < 2]) == {0}
+
+
+def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_path):
+    traffic = {"offset_s": -3.2, "translation": [100, 0, 7]}
+    # What comes after the survey is not read: here the end of the file is missing.
+    text = FCD.replace("</fcd-export>", f"<!--{'x' * 3_000_000}--><")
+    read = scenario(tmp_path, text, traffic, steps=36)
+    (car,) = read.build_scene().actors
+    assert car.trajectory.presence_ns == pytest.approx((-0.2e9, 0.8e9))
+    assert car.trajectory.positions[0].tolist() == pytest.approx(
+        [140 - 2 * 0.5**0.5, 5 - 2 * 0.5**0.5, 7]
+    )
+
+    (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(FCD.encode()))
+    packed = scenario(tmp_path, traffic={"file": "fcd.xml.gz"})
+    assert len(packed.build_scene().actors) == 3
+
+
+RAMP = "o Ramp\nv 0 0 0\nv 18.5 0 1.85\nv 18.5 9 1.85\nv 0 9 0\nf 1 2 3\nf 1 3 4\n"
+UPHILL = np.array([10, 0, 1]) / 101**0.5
+
+
+def test_traffic_stands_on_surfaces_and_is_absent_beside_them(tmp_path):
+    (tmp_path / "ramp.obj").write_text(RAMP)
+    steps = "".join(
+        f'<timestep time="{k}"><vehicle id="c" x="{2 * k}" y="5" z="9" angle="90" type="car"/>'
+        "</timestep>"
+        for k in range(15)
+    )
+    read = scenario(
+        tmp_path, f"<fcd-export>{steps}</fcd-export>", {"surfaces": "Ramp"},
+        scene={"files": "ramp.obj"}, steps=36 * 140,
+    )  # fmt: skip
+    (car,) = read.build_scene().actors
+    # Its middle is 2 m behind the front, and on the ramp until x is 18.5.
+    np.testing.assert_allclose(car.trajectory.presence_ns, (1e9, 10.25e9), atol=0.26e9)
+    places, turns = car.trajectory.poses(0, np.array([3.1e9]))
+    np.testing.assert_allclose(places, [[4.2, 5, 0.42]], atol=1e-9)
+    np.testing.assert_allclose(turns[0, :, 0], UPHILL, atol=1e-9)
+
+
+def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path):
+    (tmp_path / "ramp.obj").write_text(RAMP)
+    points = [{"time_s": t, "position": [18 - 2 * t, 5, 0.3]} for t in (0, 8)]
+
+    def read(points):
+        return Scenario.from_data(
+            {"scene": "ramp.obj", "trajectory": {"points": points, "surfaces": "Ramp"}},
+            folder=tmp_path,
+        )
+
+    downhill = read(points)
+    scene = downhill.build_scene()
+    path = downhill.survey(scene).path
+    assert path.duration_ns == 8e9
+    places, turns = path.poses(0, np.array([0, 1.3e9, 8e9]))
+    np.testing.assert_allclose(places[:, 2], [2.1, 1.84, 0.5], atol=1e-9)
+    np.testing.assert_allclose(turns[:, :, 0], np.tile(-UPHILL, (3, 1)), atol=1e-9)
+    np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-9)
+    points[1]["position"] = [30, 5, 0]
+    with pytest.raises(LidarpoolError, match=r"leaves its surfaces \(Ramp\)"):
+        read(points).survey(scene)
+
+
+def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_path):
+    read = scenario(tmp_path)
+    scene = read.build_scene()
+    first, _, again = (actor.mesh for actor in scene.actors)
+    assert first.vertices is again.vertices
+    survey = read.survey(scene)
+    result = SimpleNamespace(
+        scene=scene, survey=survey, hit_counts=np.arange(scene.counters), trials=(),
+        sample_rays=np.zeros((0, 2, 3)), planning=None, plan=None,
+    )  # fmt: skip
+    Pictured.of(result).save(tmp_path / "p.npz")
+    back = Pictured.load(tmp_path / "p.npz").scene.actors
+    assert back[0].mesh.vertices is back[2].mesh.vertices
+    assert [actor.name for actor in back] == ["car (a.1)", "Person (p)", "car (a.1)"]
+    assert back[2].trajectory.presence_ns == pytest.approx((3e9, 4e9))
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "no element found"),
+        ("<a/>", "it has no time steps"),
+        (FCD.replace("</fcd-export>", ""), "no element found"),
+        (FCD.replace('time="3.00"', 'time="1.5"'), "the time 1.5 does not come after"),
+        (FCD.replace('time="3.00"', 'time="nan"'), "the time nan does not come after"),
+        (FCD.replace('x="40"', 'x="inf"'), "vehicle 'a.1' has no finite position at 3 s"),
+        (FCD.replace('x="40"', ""), "'x' is missing"),
+        (FCD.replace('x="40"', 'x="east"'), "could not convert string to float: 'east'"),
+        (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares an XML entity"),
+    ],
+)
+def test_unusable_data_is_refused(tmp_path, text, told):
+    with pytest.raises(LidarpoolError, match=rf"fcd\.xml is not usable as floating .*{told}"):
+        scenario(tmp_path, text).build_scene()
+
+
+def test_what_is_wrong_with_traffic_is_told(tmp_path):
+    with pytest.raises(LidarpoolError, match=r"type 'car', but no entry .* add one, such as"):
+        scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}).build_scene()
+    with pytest.raises(LidarpoolError, match="give either file or box"):
+        scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
+    with pytest.raises(LidarpoolError, match=r"no\.xml' does not exist|no\.xml.*No such file"):
+        scenario(tmp_path, traffic={"file": "no.xml"}).build_scene()
+    with pytest.raises(LidarpoolError, match="surfaces names 'Street'"):
+        scenario(tmp_path, traffic={"surfaces": "Street"}).build_scene()
