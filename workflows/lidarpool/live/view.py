@@ -161,7 +161,8 @@ class View:
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, arrays["actor_mesh"] = shapes_of(self._actors)
+        meshes, shapes = shapes_of(self._actors)
+        arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
         for number, mesh in enumerate(meshes):
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
