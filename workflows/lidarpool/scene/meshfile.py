@@ -17,8 +17,9 @@ from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError, prefixed
 from ..base.vocabulary import UNITS_M
-from ..base.words import did_you_mean, printable
+from ..base.words import counted, did_you_mean, printable
 from .cityjson import read_cityjson
+from .colours import told
 from .dae import read_dae
 from .gltf import read_gltf
 from .instances import FARTHEST_M, Instance
@@ -48,10 +49,10 @@ _COLOURED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether 
     ".off": read_off,
     ".dae": read_dae,
     **dict.fromkeys(CITYJSON, read_cityjson),
+    ".3mf": read_3mf,
 }
 _READERS: dict[str, Callable[[bytes, Path], Content]] = {
     ".stl": read_stl,
-    ".3mf": read_3mf,
     **dict.fromkeys(_USD, read_usd),
 }
 SUFFIXES = (
@@ -85,6 +86,7 @@ def load_meshes(
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
     tell_raster: Callable[[Raster], None] | None = None,
+    taken: Callable[[str], object] = lambda _: None,
 ) -> tuple[Mesh | Instance, ...]:
     """Read all objects of a mesh file.
 
@@ -124,7 +126,9 @@ def load_meshes(
         Called with a line on axes that a file did not state, or that were turned; by default this
         module's logger has it, as a warning if the scene seems to lie on its side.
     tell_raster
-        Called with what was taken of a raster; by default this module's logger has it.
+        Called with what was taken of a raster.
+    taken
+        Called with a line on what was read: objects, triangles, unit, axes and colours.
 
     Returns
     -------
@@ -166,12 +170,40 @@ def load_meshes(
         tell(f"{path} scales {names} to zero: left out")
     for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
         tell(f"{path} {note}")
-    if content.raster is not None:
-        told = tell_raster or (lambda raster: _log.info("%s: %s", path, raster.told))
-        told(content.raster)
+    if content.raster is not None and tell_raster is not None:
+        tell_raster(content.raster)
+    taken(
+        _summary(content, meshes, unit, up_axis, colours)
+        if content.raster is None
+        else content.raster.told
+    )
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, meshes, axes)
     return meshes
+
+
+def _summary(
+    content: Content,
+    meshes: Sequence[Mesh | Instance],
+    unit: str | None,
+    up_axis: str | None,
+    colours: bool,
+) -> str:
+    """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
+    shapes = [one.mesh if isinstance(one, Instance) else one for one in meshes]
+    shared = [mesh for one, mesh in zip(meshes, shapes, strict=True) if one is not mesh]
+    words = [counted(len(meshes), "object")]
+    if shared:
+        of = counted(len({id(mesh) for mesh in shared}), "mesh", "meshes")
+        words.append(f"{len(shared):,} of them instances of {of}")
+    size = UNITS_M[unit] if unit else content.unit_m or 1.0
+    names = [name for name, metres in UNITS_M.items() if metres == size]
+    words += [
+        counted(sum(len(mesh.faces) for mesh in shapes), "triangle"),
+        f"in {names[0] if names else f'units of {size:g} m'}",
+        f"{(up_axis or content.up_axis or 'z').upper()}-up",
+    ]
+    return ", ".join([*words, *([told(mesh.colours for mesh in shapes)] if colours else [])])
 
 
 def wrote_it(path: Path) -> bool:

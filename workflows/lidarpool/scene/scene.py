@@ -310,6 +310,19 @@ class Scene:
         return [colours for colours in found if colours is not None]
 
     @property
+    def has_colours(self) -> NDArray[np.bool_]:
+        """Whether each object, actors after the others, has a colour: (objects,)."""
+        found = np.zeros(len(self.all_names), np.bool_)
+        if (own := self.colours) is not None:
+            grey = np.array([image is coloured.GREY for image in own.images])
+            found[self.face_object[~grey[own.image]]] = True
+        if (shared := self.instances) is not None:
+            some = np.array([part.colours is not None for part in shared.parts])
+            found[shared.owner[some[shared.part]]] = True
+        found[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
+        return found
+
+    @property
     def triangles(self) -> int:
         """Number of triangles, including those of instances and actors."""
         shared = self.instances.triangles if self.instances else 0
