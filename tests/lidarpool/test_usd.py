@@ -64,7 +64,7 @@ def test_polygons_places_and_names(tmp_path):
     within = prim("Wall", text=text + "int[] holeIndices = [2]\n" + MOVED.format((1, 0, 0)))
     world = prim("World", "Xform", within + MOVED.format((0, 0, 5)))
     objects, lines = told(write(tmp_path / "m.usda", world, prim("Wall")))
-    assert [one.name for one in objects] == ["Wall", "Wall"]
+    assert [one.name for one in objects] == ["World", "Wall"]
     assert [len(one.faces) for one in objects] == [4, 2] and lines == []
     np.testing.assert_allclose(objects[0].bounds, [[1, 0, 5], [3, 3, 5]])
 

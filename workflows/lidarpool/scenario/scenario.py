@@ -25,7 +25,7 @@ from ..scene.actors import Actor, box, one_mesh
 from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
-from ..scene.meshfile import SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.meshfile import SUFFIXES, UNITLESS, Objects, load_objects, wrote_it
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey
@@ -337,17 +337,24 @@ class Scenario(Section):
         self._colours.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
+        moving: list[Actor] = []
         mistakes = Mistakes()
         for entry in self.scene.files:
             with mistakes.noted():
-                meshes += self._read(entry)
+                found = self._read(entry)
+                meshes += found.standing
+                moving += found.moving
         mistakes.tell()
         if self.scene.copies:
             meshes += self._copies(meshes)
-        scene = Scene.from_meshes(meshes)
+        objects = Objects(tuple(meshes), tuple(moving))
         if self.scene.ground is not None:
-            scene = Scene.from_meshes([*meshes, self._ground(scene)])
-        return replace(scene, actors=self._actors(scene.origin)) if self.actors else scene
+            below = Scene.from_meshes(meshes or objects.still(lambda _: None))
+            objects = objects._replace(standing=(*meshes, self._ground(below)))
+        scene = Scene.of_objects(objects, self._notes.append)
+        if not self.actors:
+            return scene
+        return scene.with_actors([*scene.actors, *self._actors(scene.origin)])
 
     def _copies(self, base: list[Mesh | Instance]) -> list[Instance]:
         """Place the copies; they stand on other objects and on the ground, not on one another."""
@@ -362,7 +369,7 @@ class Scenario(Section):
             shape = entry.file or entry.box
             with mistakes.noted():
                 if entry.file is not None and shape not in meshes:
-                    meshes[shape] = one_mesh(entry.name, self._read(entry.file))
+                    meshes[shape] = one_mesh(entry.name, self._read_still(entry.file))
                 elif entry.box is not None:
                     meshes.setdefault(shape, box(entry.name, entry.box))
                 with prefixed(f"{self._source}: scene.copies[{number}]"):
@@ -395,7 +402,7 @@ class Scenario(Section):
     def _actors(self, origin: np.ndarray[Any, np.dtype[np.float64]]) -> tuple[Actor, ...]:
         """Build the actors; their trajectories begin with that of the survey."""
         meshes = [
-            one_mesh(entry.name, self._read(entry.file))
+            one_mesh(entry.name, self._read_still(entry.file))
             if entry.file is not None
             else box(entry.name, entry.box or (1, 1, 1))
             for entry in self.actors
@@ -494,23 +501,30 @@ class Scenario(Section):
         mount = MountSection() if self.mount is None else self.mount
         return [Mounted(self.sensor.sensor(self._folder), mount.pose())]
 
-    def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
+    def _read_still(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
+        lost = f"{self._path(entry.file)} moves "
+        return self._read(entry).still(lambda line: self._notes.append(lost + line))
+
+    def _read(self, entry: MeshFile) -> Objects:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
-        meshes = load_meshes(
+            assets = None if entry.assets is None else self._path(entry.assets)
+        found = load_objects(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
             transform=transform,
             opacity=entry.opacity,
             colours=self.coloured,
+            assets=assets,
             tell=self._notes.append,
             axes=self._remarks.append,
         )
         if self.coloured:
-            shown = [one.mesh if isinstance(one, Instance) else one for one in meshes]
+            shown = [one.mesh if isinstance(one, Instance) else one for one in found.standing]
+            shown += [actor.mesh for actor in found.moving]
             self._colours[entry.file] = told_colours(mesh.colours for mesh in shown)
-        return meshes
+        return found
 
     @property
     def coloured(self) -> bool:

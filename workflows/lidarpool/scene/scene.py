@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,18 +15,20 @@ from numpy.typing import NDArray
 from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
-from ..sensor import Pose
+from ..sensor import Pose, Track
 from . import colours as coloured
 from .actors import Actor
 from .colours import Colours
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
-from .meshfile import Opacity, load_meshes
+from .meshfile import Objects, Opacity, load_objects
 from .shapes import seed_objects
 from .transform import Transform
 
 # Single precision, which ray casters use, resolves a millimetre up to this distance.
 FAR_FROM_ZERO_M = 10_000.0
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,6 +125,7 @@ class Scene:
         transform: Transform | None = None,
         opacity: Opacity = "mask",
         colours: bool = False,
+        assets: str | Path | None = None,
     ) -> Scene:
         """Read a mesh file: .glb .gltf .obj .stl .ply .off .dae .3mf .usd .usda .usdc .usdz.
 
@@ -140,26 +144,48 @@ class Scene:
             `lidarpool.scene.transform.Transform`.
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
-            .obj). With "ignore", triangles are solid, and no image is read.
+            .obj, .usd). With "ignore", triangles are solid, and no image is read.
         colours
-            Whether to read base colours and their images (.glb, .gltf, .obj, .dae), and colours of
-            vertices (.glb, .gltf, .obj, .ply, .off).
+            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd), and
+            colours of vertices (.glb, .gltf, .obj, .ply, .off, .usd).
+        assets
+            A folder: files that the file names are read from here and below, and from its own
+            folder and below.
+
+        Returns
+        -------
+        Objects of .usd that move are its actors, if others stand.
 
         Raises
         ------
         LidarpoolError
             If the file cannot be read completely, or has no triangles.
         """
-        return cls.from_meshes(
-            load_meshes(
-                path,
-                unit=unit,
-                up_axis=up_axis,
-                transform=transform,
-                opacity=opacity,
-                colours=colours,
-            )
+        found = load_objects(
+            path,
+            unit=unit,
+            up_axis=up_axis,
+            transform=transform,
+            opacity=opacity,
+            colours=colours,
+            assets=assets,
         )
+        return cls.of_objects(found)
+
+    @classmethod
+    def of_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
+        """Make a scene of the objects of mesh files; `tell` is called if none stands."""
+        if not objects.standing:
+            lost = "nothing stands in the scene, and without that nothing moves: "
+            return cls.from_meshes(objects.still(lambda line: tell(lost + line)))
+        scene = cls.from_meshes(objects.standing)
+        local = []
+        for actor in objects.moving:
+            track = actor.trajectory
+            assert isinstance(track, Track)
+            track = replace(track, positions=track.positions - scene.origin)
+            local.append(replace(actor, trajectory=track))
+        return scene.with_actors(local) if local else scene
 
     @classmethod
     @checked

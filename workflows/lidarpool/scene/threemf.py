@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from ..base.allowance import Allowance
 from ..base.xmlfile import refuse_entity
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, instances, settled
+from .nodes import SMALLER, Content, MeshFileError, Node, Wanted, instances, settled
 
 _UNITS_M = {
     "micron": 1e-6,
@@ -66,7 +66,7 @@ class _Placement:
     matrix: NDArray[np.float64]
 
 
-def read_3mf(data: bytes, path: Path) -> Content:
+def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read the build items of a file."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
         package = _Package(archive, Allowance(len(data), SMALLER))
