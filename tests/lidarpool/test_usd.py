@@ -137,7 +137,7 @@ def test_moving_prims_are_taken_at_the_first_time(tmp_path):
     stage = METRES + "\nstartTimeCode = 2\nendTimeCode = 3"
     objects, lines = told(write(tmp_path / "m.usda", camera, car, stage=stage))
     assert bounds(objects)[0, 0] == 5
-    assert lines == ["m.usda moves 1 object: taken at the first time, and still"]
+    assert lines == ["m.usda moves Car: taken where they are at first, and still"]
     objects, _ = told(write(tmp_path / "m.usda", car))
     assert bounds(objects)[0, 0] == 1
 

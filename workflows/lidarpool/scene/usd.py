@@ -247,9 +247,10 @@ def _content(
     content = settled(_named(instances(frame["roots"], node, stem)))
     for number, motion in zip(moving, motions, strict=True):
         # Its mesh has the scale, since actors have none.
-        stretch = matrices[number] = np.eye(4)
+        matrices[number] = np.eye(4)
+        stretch = matrices[number, :3, :3]
         places = motion[:, 1:].reshape(-1, 3, 4)
-        stretch[:3, :3] = scale_of(places[0, :, :3])
+        stretch[:] = scale_of(places[0, :, :3])
         found = settled(instances([number], node, stem))
         content.skipped += found.skipped
         if found.meshes:
@@ -257,7 +258,7 @@ def _content(
             allowance.take(
                 sum(80 * len(mesh.faces) for mesh in shared)
             )  # an actor has no instances
-            turns = places[:, :, :3] @ np.linalg.inv(stretch[:3, :3])
+            turns = places[:, :, :3] @ np.linalg.inv(stretch)
             times = (motion[:, 0] - frame["start"]) / frame["rate_hz"]
             if not (np.abs(times) < _LATEST_S).all():
                 raise ValueError("its times are not finite, or reach over 30 years")

@@ -83,7 +83,9 @@ class Scene:
     def read(self) -> None:
         """Find all nodes, and write their meshes."""
         self._bend()
-        self.roots.append(self._number(self._stage.GetPseudoRoot(), False, False, None))
+        # Where time stands still, usd-core would look for samples for ever.
+        still = not self._stage.GetTimeCodesPerSecond() > 0
+        self.roots.append(self._number(self._stage.GetPseudoRoot(), False, still, None))
         for key in self._todo:  # grows meanwhile
             self.nodes.append(self._node(*key))
 
@@ -163,19 +165,24 @@ class Scene:
         axis, is as near to OpenUSD's as `_MOST_M` and `_MOST_RAD` say.
         """
         place = UsdGeom.Xformable(prim)
-        own = [np.array(place.GetLocalTransformation(code)) for code in place.GetTimeSamples()]
-        if not any(map(_has_surface, _below(prim))) or np.allclose(own, own[0], 1e-9, 1e-9):
+        samples = place.GetTimeSamples()
+        # Also between samples, which a turntable may have at whole turns only.
+        between = [a + _PROBES[0] * (b - a) for a, b in pairwise(samples)]
+        own = [np.array(place.GetLocalTransformation(code)) for code in [*samples, *between]]
+        if not own or not any(map(_has_surface, _below(prim))) or np.allclose(own, own[0]):
             return None
         codes: set[float] = set()
-        while place:
-            codes.update(place.GetTimeSamples())
-            above = None if place.GetResetXformStack() else place.GetPrim().GetParent()
-            place = UsdGeom.Xformable(above) if above else None
+        above = prim
+        while above:
+            place = UsdGeom.Xformable(above)
+            codes.update(place.GetTimeSamples() if place else ())
+            above = None if place and place.GetResetXformStack() else above.GetParent()
         rows = [_Row(prim, code) for code in sorted(codes)]
         linear = np.array([row.place[:3, :3] for row in rows])
         if np.linalg.matrix_rank(linear[0]) == 3:
             turns = linear @ np.linalg.inv(linear[0])
-            if np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max() < _RIGID:
+            off = np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)).max()
+            if off < _RIGID and np.linalg.det(turns).min() > 0:
                 near = _MOST_M / UsdGeom.GetStageMetersPerUnit(self._stage)
                 found = [rows[0]]
                 for one, other in pairwise(rows):
@@ -354,7 +361,7 @@ class Looks:
         what: dict[str, Any] = {}
         if kind not in _SURFACES:
             if self._colours:
-                what["colour"] = {"unread": f"its shader is {kind[:40]!r}"}
+                what["colour"] = {"unread": f"its shader is {kind[:40]}"}
         elif kind == "OmniPBR":
             if self._colours:
                 what["colour"] = self._of_omniverse(shader)
@@ -402,7 +409,7 @@ class Looks:
         if kind.startswith("UsdPrimvarReader_"):
             return {"values": str(_constant(shader.GetInput("varname")) or "")}
         if kind != "UsdUVTexture":
-            return {"unread": f"it is computed by {kind[:40]!r}"}
+            return {"unread": f"it is computed by {kind[:40]}"}
         names = ("file", "scale", "bias", "fallback", "sourceColorSpace", "wrapS", "wrapT")
         image, scale, bias, fallback, space, *wraps = (
             _constant(shader.GetInput(name)) for name in names
@@ -425,8 +432,8 @@ class Looks:
             attributes = UsdShade.Utils.GetValueProducingAttributes(given) if given else ()
             shader = UsdShade.Shader(attributes[0].GetPrim()) if attributes else None
             kind = str(shader.GetIdAttr().Get()) if shader else ""
-            if kind == "UsdPrimvarReader_float2":
-                name = str(_constant(shader.GetInput("varname")) or "")
+            if not shader or kind == "UsdPrimvarReader_float2":
+                name = str(_constant(shader.GetInput("varname")) or "") if shader else ""
                 return {"values": name, "matrix": matrix[:, :2].tolist()}
             if kind != "UsdTransform2d":
                 break

@@ -92,6 +92,8 @@ class Look:
         return Colours(white.images, white.image, corners=colours[corners])
 
     def _at(self, name: str, rows: Int, width: int) -> tuple[NDArray[np.float64], Int]:
+        if not name:  # a texture that is not told where to look has its value at zero everywhere
+            return np.zeros((1, width)), np.zeros((len(rows), 3), np.int64)
         if name not in self._values:
             raise MaskError(f"its mesh has no {name!r}")
         interpolation, number = self._values[name]
