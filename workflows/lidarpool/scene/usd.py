@@ -269,37 +269,34 @@ def _content(
 
 
 def _named(places: list[Place]) -> list[Place]:
-    """Name objects of one name by what they are in.
+    """Name prims of one name by what they are in.
 
-    Of the prims that such an object does not share with others of its name, the nearest whose name
-    is the rarest: a chess set has many «Render» in many «Geom», each in a «King» or «Queen». If
-    there are further objects in that prim, the names are joined, «King/Render».
+    Of the prims that such a prim does not share with others of its name, the nearest whose name is
+    the rarest: a chess set has many «Render» in many «Geom», each in a «King» or «Queen». If there
+    are further meshes in that prim, the names are joined, «King/Render».
     """
-    uses = Counter(place.path[-1:] for place in places)
-    within: Counter[Any] = Counter()  # {prim, or prim and name: objects in it}
-    for place in places:
-        for depth in range(1, len(place.path)):
-            within[place.path[:depth]] += 1
-            within[place.path[:depth], place.name] += 1
-    kinds: list[tuple[Place, list[tuple[str, ...]]]] = []
-    names: Counter[tuple[str, str]] = Counter()
-    for place in places:
-        above = [place.path[:depth] for depth in range(len(place.path) - 1, 0, -1)]
-        own = [prim for prim in above if within[prim, place.name] == 1]
-        kinds.append((place, own))
-        names.update((place.name, prim[-1]) for prim in own)
-    out = []
-    for place, own in kinds:
-        best = min(own, key=lambda prim: names[place.name, prim[-1]], default=None)
-        if (
-            uses[place.path[-1:]] > 1
-            and best
-            and names[place.name, best[-1]] < uses[place.path[-1:]]
-        ):
-            name = best[-1] if within[best] == 1 else f"{best[-1]}/{place.name}"
-            place = place._replace(name=name)
-        out.append(place)
-    return out
+    # Copies have one path.
+    paths = {place.path for place in places if place.path}
+    uses = Counter(path[-1] for path in paths)
+    within: Counter[Any] = Counter()  # {prim, or prim and name: meshes in it}
+    for path in paths:
+        for depth in range(1, len(path)):
+            within.update([path[:depth], (path[:depth], path[-1])])
+    above = {
+        path: [path[:depth] for depth in range(len(path) - 1, 0, -1)]
+        for path in paths
+        if uses[path[-1]] > 1
+    }
+    own = {
+        path: [one for one in found if within[one, path[-1]] == 1] for path, found in above.items()
+    }
+    rarity = Counter((path[-1], one[-1]) for path, found in own.items() for one in found)
+    names = {}
+    for path, found in own.items():
+        best = min(found, key=lambda one: rarity[path[-1], one[-1]], default=None)
+        if best and rarity[path[-1], best[-1]] < uses[path[-1]]:
+            names[path] = best[-1] if within[best] == 1 else f"{best[-1]}/{path[-1]}"
+    return [place._replace(name=names.get(place.path, place.name)) for place in places]
 
 
 def _told(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Content:
@@ -314,6 +311,8 @@ def _told(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Co
         content.unit_note = "states no unit and is taken in centimetres, as OpenUSD asks"
     moving, skinned, smooth = (counts.pop(k, 0) for k in ("moving", "skinned", "subdivided"))
     notes = content.notes
+    if stage["materialx"]:
+        notes.append("has materials in MaterialX files, which usd-core does not read: they are lacking")
     if names := [name[-80:] for name in stage["missing"]]:
         listed = ", ".join(map(repr, names[:3])) + ", …" * (len(names) > 3)
         notes.append(f"refers to what is not there or cannot be read, and lacks it: {listed}")

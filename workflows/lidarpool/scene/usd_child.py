@@ -517,13 +517,13 @@ def _files(stage: Any) -> list[str]:
 
 
 def _missing(stage: Any) -> list[str]:
-    """List what a stage refers to and cannot be found or read, but materials of MaterialX."""
+    """List what a stage refers to and cannot be found or read."""
     folder = os.path.dirname(stage.GetRootLayer().realPath) + "/"  # noqa: PTH120
     found = set()
     for error in map(str, stage.GetCompositionErrors()):
         named = re.search(r"@(.*?)@(<.*?>)?", error)
         found.add((named[1] + (named[2] or "") if named else error).replace(folder, ""))
-    return sorted(name for name in found if not name.endswith(".mtlx"))
+    return sorted(found)
 
 
 def _reason(error: Exception, path: str) -> str:
@@ -552,10 +552,12 @@ def main(path: str, asked: dict[str, Any]) -> None:
     silent = UsdUtils.CoalescingDiagnosticDelegate()
     try:
         stage = Usd.Stage.Open(path)
+        missing = _missing(stage)
         write({
             "what": "stage",
             "files": _files(stage),
-            "missing": _missing(stage),
+            "missing": [name for name in missing if not name.endswith(".mtlx")],
+            "materialx": asked["colours"] and any(name.endswith(".mtlx") for name in missing),
             "unit_m": UsdGeom.GetStageMetersPerUnit(stage),
             "unit_stated": UsdGeom.StageHasAuthoredMetersPerUnit(stage),
             "up_axis": UsdGeom.GetStageUpAxis(stage).lower(),
