@@ -213,9 +213,10 @@ class Texture:
         places[(places > -slack) & (places < 0)] = 0
         places[(places > 1) & (places < 1 + slack)] = 1
         # Triangles wholly beyond an edge are in its last texels, or the first ones beyond.
-        within = (-0.5 if black else 0.5) / size
-        places[places.max(axis=1) <= 0] = within
-        places[places.min(axis=1) >= 1] = 1 - within
+        most, least = places.max(axis=1), places.min(axis=1)
+        places[most <= 0], places[least >= 1] = 0.5 / size, 1 - 0.5 / size
+        if black:
+            places[most < 0], places[least > 1] = -0.5 / size, 1 + 0.5 / size
         before = max(0, int(np.ceil(-places.min() * size)))
         after = max(0, int(np.ceil((places.max() - 1) * size)))
         if not before and not after:
