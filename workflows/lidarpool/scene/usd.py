@@ -312,7 +312,9 @@ def _told(content: Content, stage: dict[str, Any], counts: dict[str, int]) -> Co
     moving, skinned, smooth = (counts.pop(k, 0) for k in ("moving", "skinned", "subdivided"))
     notes = content.notes
     if stage["materialx"]:
-        notes.append("has materials in MaterialX files, which usd-core does not read: they are lacking")
+        notes.append(
+            "has materials in MaterialX files, which usd-core does not read: they are lacking"
+        )
     if names := [name[-80:] for name in stage["missing"]]:
         listed = ", ".join(map(repr, names[:3])) + ", …" * (len(names) > 3)
         notes.append(f"refers to what is not there or cannot be read, and lacks it: {listed}")
