@@ -24,6 +24,7 @@ SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to to
 # A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
 SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
+_NAMES = 16  # of nodes that a place remembers
 MOST_TRIANGLES = np.iinfo(np.int32).max  # of all places
 
 
@@ -90,7 +91,7 @@ class Place(NamedTuple):
     mesh: Mesh
     matrix: NDArray[np.float64]  # (4, 4), to the coordinates of the file
     name: str
-    path: tuple[str, ...] = ()  # names of the nodes that it is in, from the outermost
+    path: tuple[str, ...] = ()  # names of the nodes that it is in, of the innermost few
 
 
 def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[Place]:
@@ -117,7 +118,8 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
                 f"has nodes that contain each other, or copies, more than {MOST_NODES:,} in all: "
                 "export it in parts"
             )
-        matrix, path = above @ node.matrix, (*path, node.name) if node.name else path
+        matrix = above @ node.matrix
+        path = (*path[1 - _NAMES :], node.name) if node.name else path
         places = [matrix] if node.copies is None else matrix @ node.copies
         placed += [
             Place(mesh, place, path[-1] if path else mesh.name or stem, path)
