@@ -298,7 +298,7 @@ def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
     header, body = opaque(**change)
     with caplog.at_level(logging.WARNING):
         found, _, _ = on_card(tmp_path, header, body)
-    assert why in caplog.text and "are grey: Leaf" in caplog.text
+    assert why in caplog.text and "lack them: Leaf" in caplog.text
     assert (found == GREY[0, 0]).all()
 
 

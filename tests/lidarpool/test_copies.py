@@ -189,9 +189,9 @@ def test_materials_and_classes_are_those_of_the_names(build):
 def test_a_file_is_read_once_for_all_entries(build, monkeypatch):
     from lidarpool.scenario import scenario as module
 
-    read, plain = [], module.load_meshes
+    read, plain = [], module.load_objects
     monkeypatch.setattr(
-        module, "load_meshes", lambda path, **more: read.append(path.name) or plain(path, **more)
+        module, "load_objects", lambda path, **more: read.append(path.name) or plain(path, **more)
     )
     _, scene = build(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]})
     assert read == ["land.glb", "tree.stl"] and len(scene.instances.parts) == 1

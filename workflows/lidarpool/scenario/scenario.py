@@ -26,7 +26,7 @@ from ..scene.actors import Actor, box, one_mesh
 from ..scene.cityjson import CLASSES as CITY_CLASSES
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
-from ..scene.meshfile import CITYJSON, SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.meshfile import CITYJSON, SUFFIXES, UNITLESS, Objects, load_objects, wrote_it
 from ..scene.nodes import Raster
 from ..scene.robot import Robot
 from ..scene.scene import Scene
@@ -382,17 +382,22 @@ class Scenario(Section):
         self._robots.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
+        moving: list[Actor] = []
         mistakes = Mistakes()
         for entry in self.scene.files:
             with mistakes.noted():
-                meshes += self._read(entry)
+                found = self._read(entry)
+                meshes += found.standing
+                moving += found.moving
         mistakes.tell()
         self._epsg = self._system()
         if self.scene.copies:
             meshes += self._copies(meshes)
-        scene = Scene.from_meshes(meshes)
+        objects = Objects(tuple(meshes), tuple(moving))
         if self.scene.ground is not None:
-            scene = Scene.from_meshes([*meshes, self._ground(scene)])
+            below = Scene.from_meshes(meshes or objects.still(lambda _: None))
+            objects = objects._replace(standing=(*meshes, self._ground(below)))
+        scene = Scene.of_objects(objects, self._notes.append)
         if not (self.actors or self.traffic):
             return scene
         standing = Standing(scene)
@@ -400,8 +405,8 @@ class Scenario(Section):
             carrier = None if self.trajectory is None else self._track(scene, standing)
         start = 0.0 if carrier is None else carrier.start_s
         assert start is not None  # of every track
-        actors = (*self._actors(standing, carrier), *self._traffic(scene, standing, start))
-        return replace(scene, actors=actors)
+        own, others = self._actors(standing, carrier), self._traffic(scene, standing, start)
+        return scene.with_actors([*scene.actors, *own, *others])
 
     def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
         """Return the trajectory in the coordinates of a scene; it is made once."""
@@ -546,7 +551,7 @@ class Scenario(Section):
         if shape not in made:
             name = entry.name or "vehicle"
             if isinstance(shape, MeshFile):
-                made[shape] = one_mesh(name, self._read(shape))
+                made[shape] = one_mesh(name, self._read_still(shape))
             else:
                 made[shape] = box(name, shape)
         return made[shape]
@@ -679,10 +684,15 @@ class Scenario(Section):
         mount = MountSection() if self.mount is None else self.mount
         return [Mounted(self.sensor.sensor(self._folder), self._mount(mount))]
 
-    def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
+    def _read_still(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
+        lost = f"{self._path(entry.file)} moves "
+        return self._read(entry).still(lambda line: self._notes.append(lost + line))
+
+    def _read(self, entry: MeshFile) -> Objects:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
-        return load_meshes(
+            assets = None if entry.assets is None else self._path(entry.assets)
+        return load_objects(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
@@ -692,6 +702,7 @@ class Scenario(Section):
             step_m=entry.step_m,
             window=entry.window,
             epsg=self.cloud.epsg,
+            assets=assets,
             tell=self._notes.append,
             axes=self._remarks.append,
             tell_raster=lambda raster: self._rasters.append((entry, raster)),

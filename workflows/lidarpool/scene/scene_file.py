@@ -25,7 +25,7 @@ SUFFIXES = (".ply", ".glb", ".obj")
 def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
-        A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colours
+    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colours
     are kept in .glb only: in the others, triangles are solid and grey. Where a triangle has both a
     mask and a texture, its colour is the texture's mean. All store metres; .glb is Y-up, by its
     standard, the others are Z-up. Coordinates are those of the world; .ply and .glb have single

@@ -28,7 +28,7 @@ from ..base.words import counted
 from ..base.xmlfile import refuse_entity
 from .colours import GREY, WHITE, Colours
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, instances, settled
+from .nodes import SMALLER, Content, MeshFileError, Node, Wanted, instances, settled
 
 _UNITS_M = {
     "micron": 1e-6,
@@ -81,10 +81,10 @@ class _Placement:
     matrix: NDArray[np.float64]
 
 
-def read_3mf(data: bytes, path: Path, colours: bool = False) -> Content:
+def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read the build items of a file, and colours of base materials and colour groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        package = _Package(archive, Allowance(len(data), SMALLER), colours)
+        package = _Package(archive, Allowance(len(data), SMALLER), wanted.colours)
         root = package.model(package.start())
 
         def node(place: _Placement) -> Node:
