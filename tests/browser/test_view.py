@@ -88,6 +88,33 @@ def test_view_shows_the_cloud_and_asks_nobody_else(served, new_tab, tmp_path):
     assert tab.errors == []
 
 
+def test_points_in_their_own_colours(new_tab, tmp_path):
+    kinds = [*((axis, "<f4") for axis in "xyz"), *((c, "|u1") for c in ("red", "green", "blue"))]
+    rows = np.zeros(40_000, kinds)
+    rows["x"], rows["y"] = np.random.default_rng(0).uniform(-9, 9, (2, 40_000))
+    rows["red"], rows["blue"] = 255 * (rows["x"] < 0), 255 * (rows["x"] > 0)
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
+    with page_server(result_view(CloudFile(path)).answer, port=0) as page:
+        tab = opened(new_tab, page)
+        tab.tick("shade by depth", on=False)
+        tab.key("t")
+        tab.choose("colour", "rgb")
+        tab.wait_for(lambda text: "z, m" not in text)
+
+        def halves(_):
+            picture = tab.picture(tmp_path / "a.png").astype(int)
+            red = picture[..., 0] - picture[..., 2:].max(axis=2) > 150
+            blue = picture[..., 2] - picture[..., :2].max(axis=2) > 150
+            enough = min(red.sum(), blue.sum()) > 5000
+            return enough and red.nonzero()[1].mean() < blue.nonzero()[1].mean()
+
+        tab.wait_for(halves)
+        other = opened(new_tab, page, "/#colour=rgb")
+        other.wait_for(lambda _: other.value("lidarpool.chosen.colour") == "rgb")
+        assert tab.errors == other.errors == []
+
+
 def test_a_look_at_all_fills_the_picture_and_the_sensor_can_be_seen(served, new_tab):
     tab = opened(new_tab, served)
     tab.wait_for(lambda _: drawn(tab) == COUNT)

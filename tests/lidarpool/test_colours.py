@@ -298,7 +298,7 @@ def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
     header, body = opaque(**change)
     with caplog.at_level(logging.WARNING):
         found, _, _ = on_card(tmp_path, header, body)
-    assert why in caplog.text and "are grey: Leaf" in caplog.text
+    assert why in caplog.text and "lack them: Leaf" in caplog.text
     assert (found == GREY[0, 0]).all()
 
 
@@ -566,6 +566,10 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
             Material("*", **arguments)
     with pytest.raises(LidarpoolError, match=r"\[0\].reflectance: given is 'white'; it must"):
         Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
+    wrong = {"objects": "*", "material": "asphalt, dry", "reflectance": 0.2}
+    scenario = Scenario.from_data({"materials": [{"objects": "*"}, wrong]})
+    with pytest.raises(LidarpoolError, match=r"^scenario: materials\[1\]: give either material or"):
+        scenario.survey(Scene.seed())
     table = reflectances()
     assert len(table) >= 30
     assert all(0 < share < 1 for one in table.values() for share in one.shares)

@@ -91,8 +91,9 @@ def test_a_list_gives_places_turns_and_factors(build):
             {"columns": {"x": "east", "y": "north"}},
         ),
         ("X,Y,Z,Yaw_deg,SCALE\n1,2,3,90,2\n4,5,6,0,1\n", {}),
+        ("x,y,z,Yaw,scale\n1,2,3,90,2\n4,5,6,0,1\n", {"columns": {"yaw_deg": "Yaw"}}),
     ],
-    ids=["commas", "semicolons, remarks, text", "tabs, other names", "capital letters"],
+    ids=["commas", "semicolons, remarks, text", "tabs, other names", "capitals", "no unit"],
 )
 def test_a_table_gives_what_a_list_gives(build, folder, text, more):
     (folder / "trees.csv").write_text(text)
@@ -188,9 +189,9 @@ def test_materials_and_classes_are_those_of_the_names(build):
 def test_a_file_is_read_once_for_all_entries(build, monkeypatch):
     from lidarpool.scenario import scenario as module
 
-    read, plain = [], module.load_meshes
+    read, plain = [], module.load_objects
     monkeypatch.setattr(
-        module, "load_meshes", lambda path, **more: read.append(path.name) or plain(path, **more)
+        module, "load_objects", lambda path, **more: read.append(path.name) or plain(path, **more)
     )
     _, scene = build(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]})
     assert read == ["land.glb", "tree.stl"] and len(scene.instances.parts) == 1
@@ -249,6 +250,10 @@ WRONG = {
         "its column 'z' has '' in line 5: give a number in every line, or leave the column out.",
     ),
     "short row": (TREE | {"table": "short.csv"}, "its column 'yaw_deg' has '' in line 2"),
+    "angle": (
+        TREE | {"table": "yaw.csv"},
+        "column 'yaw' has no unit: call it yaw_deg, in degrees, or give columns: {yaw_deg: yaw}",
+    ),
     "mesh": ({"name": "A", "file": "b.stl", "at": [[0, 0]]}, "b.stl"),
 }  # fmt: skip
 
@@ -258,6 +263,7 @@ def test_what_cannot_be_is_told_in_a_line(build, folder, name):
     entry, says = WRONG[name]
     (folder / "a.csv").write_text("x,z\n1,nan\n")
     (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")
+    (folder / "yaw.csv").write_text("x,y,yaw\n1,2,90\n")
     (folder / "short.csv").write_text("x;y;yaw_deg\n1;2\n")
     with pytest.raises(LidarpoolError) as raised:
         build(entry)

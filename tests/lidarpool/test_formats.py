@@ -317,6 +317,28 @@ def test_the_reader_of_foxglove_takes_a_bag(written, cloud, sweeps):
     assert len(boxes) == len(points) == len(sweeps)
 
 
+@pytest.mark.parametrize(("layout", "step"), [("velodyne", 26), ("autoware", 36), ("ouster", 48)])
+def test_bags_have_colours_as_rviz_and_foxglove_read_them(cloud, sweeps, layout, step, tmp_path):
+    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    rng = np.random.default_rng(6)
+    colours = {name: rng.integers(0, 256, len(cloud)).astype(np.uint8) for name in COLOURS}
+    coloured = Cloud(cloud.positions, {**cloud.columns, **colours}, sweeps=lambda: sweeps)
+    assert not {*COLOURS} & {*coloured.save(tmp_path / "c.mcap", layout=layout)}
+    with (tmp_path / "c.mcap").open("rb") as file:
+        reader = pytest.importorskip("mcap.reader").make_reader(file, decoder_factories=[decoder])
+        topics = [(channel.topic, read) for _, channel, _, read in reader.iter_decoded_messages()]
+    first = next(read for topic, read in topics if topic == "/front/points")
+    assert first.point_step == step
+    (field,) = (field for field in first.fields if field.name == "rgb")
+    assert (field.datatype, field.count) == (7, 1)  # FLOAT32
+    packed = np.frombuffer(first.data, np.uint8).reshape(-1, step)[:, field.offset :][:, :4]
+    wanted = of_sweep(coloured, 0)
+    expected = [wanted[name] for name in ("blue", "green", "red")] + [np.zeros(len(wanted))]
+    np.testing.assert_array_equal(packed, np.stack(expected, axis=1))
+    (before,) = (field.offset for field in first.fields if field.name == "x")
+    assert (before, first.width) == (0, len(wanted))
+
+
 def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     with pye57.E57(str(written("e57"))) as file:
         assert file.scan_count == 9  # of which none is empty
@@ -339,12 +361,17 @@ def test_colours_are_where_readers_look_for_them(cloud, sweeps, tmp_path):
     assert not {*COLOURS} & {*las.point_format.extra_dimension_names}
     with pye57.E57(str(tmp_path / "cloud.e57")) as file:
         found = file.read_scan(0, colors=True, ignore_missing_fields=True)
-    pcd = PointCloud.from_path(tmp_path / "pcd" / "000000.pcd").pc_data
     first = of_sweep(coloured, 0)
+    rgb = np.stack([first[name] for name in COLOURS], axis=1)
+    path = tmp_path / "pcd" / "000000.pcd"
+    pcd = PointCloud.from_path(path)
+    assert pcd.fields.count("rgb") == 1 and not {*COLOURS} & {*pcd.fields}
+    np.testing.assert_array_equal(PointCloud.decode_rgb(pcd.pc_data["rgb"]), rgb)
+    read = load_open3d().t.io.read_point_cloud(str(path)).point
+    np.testing.assert_array_equal(read["colors"].numpy(), rgb)
     for name in COLOURS:
         np.testing.assert_array_equal(las[name], colours[name].astype(int) * 257)
         np.testing.assert_array_equal(found[f"color{name.capitalize()}"], first[name])
-        np.testing.assert_array_equal(pcd[name], first[name])
     # One of them alone is a column like others.
     alone = Cloud(cloud.positions, {**cloud.columns, "red": colours["red"]})
     Format("laz", "velodyne").write(tmp_path / "red.laz", alone, sweeps)

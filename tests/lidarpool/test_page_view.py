@@ -18,6 +18,7 @@ from lidarpool.live.view import range_image
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.colours import Colours
 
 POSES = 25
 NOWHERE = np.zeros((0, 3), np.float32)
@@ -144,6 +145,27 @@ def test_colours_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
     assert (low, high) == ("0.0", "3.0")
 
 
+def test_points_are_shown_in_their_own_colours(tmp_path):
+    rows = np.zeros(300, [*((a, "<f8") for a in "xyz"), *((c, "|u1") for c in ("red", "green"))])
+    rows["x"], rows["red"], rows["green"] = np.arange(300), np.arange(300) % 256, 9
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header(rows.dtype, 300) + rows.tobytes())
+    assert "rgb" not in told(open_result(path), "state")[0]["colours"], "blue is missing"
+    rgb = np.dtype([*rows.dtype.descr, ("blue", "|u1")])
+    more = np.zeros(300, rgb)
+    for name in rows.dtype.names:
+        more[name] = rows[name]
+    more["blue"] = 200
+    path.write_bytes(header(rgb, 300) + more.tobytes())
+    view = open_result(path)
+    state = told(view, "state")[0]
+    assert state["colours"][0] == "z" and state["colours"][-1] == "rgb"
+    assert "rgb" not in [column["name"] for column in state["columns"]], "no column to filter by"
+    answer, arrays = told(view, "points", colour="rgb", most=ALL, filter="x,10,19")
+    assert arrays["colours"].tolist() == [[k, 9, 200, 255] for k in range(10, 20)]
+    assert answer["legend"]["labels"] == []
+
+
 def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
     view = result_view(CloudFile(cloud), pictured)
     grey, arrays = told(view, "surface", colour="grey")
@@ -182,11 +204,13 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     scene = Scene.from_meshes([box("Hall", (8, 8, 8)), box("Table", (2, 2, 2))])
     half = np.sqrt(0.5)
     track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
-    scene = replace(scene, actors=(Actor(box("Cart", (1, 1, 1)), track),))
+    cart = replace(box("Cart", (1, 1, 1)), colours=Colours.plain(np.uint8([[[9, 8, 7]]]), 12))
+    scene = replace(scene, actors=(Actor(cart, track),))
     view = result_view(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
     state, arrays = told(view, "state")
     assert (state["actors"], state["statics"]) == ([{"name": "Cart"}], 2)
     assert len(state["actor_colours"]) == 1
+    assert arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
     assert arrays["actor0_places"][[0, -1]] == pytest.approx(np.array([[1, 1, 0], [5, 1, 0]]))
     assert np.abs(arrays["actor0_turns"][-1]) == pytest.approx([0, 0, half, half])

@@ -10,6 +10,7 @@ from typing import Any
 import click
 import numpy as np
 import pytest
+from PIL import Image
 
 from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.base.storage import Storage
@@ -115,7 +116,7 @@ def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     assert np.allclose(again.scene.solid(5e8).object_bounds[-1], [(7.5, 2, 0), (12.5, 4, 2)])
     assert again.when == "1 sensor on its way and 1 actor, at 0.5 s of 1 s"
     plot(tmp_path / "result", *SMALL)
-    assert {"scene.png", "intensity.png", "cloud.png"} <= names(tmp_path / "result")
+    assert {"scene.png", "hits.png", "cloud.png"} <= names(tmp_path / "result")
 
 
 def changed(data: bytes, **arrays: Any) -> bytes:
@@ -174,6 +175,36 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
         plot(result, "--only", "cloud", "--colour", "wettness")
 
 
+def test_markings_stand_out_in_the_picture_of_intensity_and_in_true_colour(
+    result, tmp_path, monkeypatch
+):
+    """Stripes within one flat object, 1 m wide, which differ in reflectivity and colour alone."""
+    positions = np.random.default_rng(1).uniform((-9, -9, 0.1), (9, 9, 0.1), (200_000, 3))
+    stripe = np.floor(positions[:, 0]) % 2 == 0
+    zeros = np.zeros(len(positions), np.int32)
+    columns = dict.fromkeys(("scan", "channel", "object"), zeros)
+    columns |= {"intensity": zeros, "reflectivity": np.where(stripe, 0.6, 0.1).astype(np.float32)}
+    columns |= {name: np.where(stripe, 200, 40).astype(np.uint8) for name in ("red", "green")}
+    shown = Pictured.load(result / PICTURE_FILE)
+    floor = Scene.from_meshes([box("Floor", (20, 20, 0.2))])
+    hits = np.zeros(floor.triangles, np.int64)
+    shown = replace(shown, scene=floor, hit_counts=hits, sensors=(), planning=None, plan=None)
+    shown.save(result / PICTURE_FILE)
+    Cloud(positions, columns).save(result / "cloud.ply")
+    with pytest.raises(LidarpoolError, match="no column 'rgb'"):
+        plot(result, "--only", "cloud", "--colour", "rgb")
+    Cloud(positions, columns | {"blue": columns["red"]}).save(result / "cloud.ply")
+    plot(result, "--colour", "rgb", "--only", "cloud", "--only", "intensity", "--out", tmp_path)
+    bright, grey = (np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB"), np.float64)
+                    for name in ("intensity", "cloud"))  # fmt: skip
+    part = np.s_[400:600, 650:850]  # of the floor
+    warm = bright[part][..., 0] - bright[part][..., 2]
+    assert ((warm > 50).mean(), (warm < -20).mean()) == pytest.approx((0.5, 0.5), abs=0.1)
+    assert np.ptp(grey[part], axis=2).max() < 30, "no column is on a scale of colours"
+    light = grey[part].mean(axis=2)
+    assert np.corrcoef(light.ravel(), warm.ravel())[0, 1] > 0.8
+
+
 def test_the_cloud_is_needed_for_its_own_picture_only(result):
     (result / "cloud.ply").unlink()
     plot(result, "--only", "path", *SMALL)
@@ -183,11 +214,12 @@ def test_the_cloud_is_needed_for_its_own_picture_only(result):
 
 @pytest.mark.parametrize(
     ("coordinates", "pictures", "left_out"),
-    [("world", {"scene.png", "intensity.png", "cloud.png"}, "path"),
-     ("sensor", {"scene.png", "intensity.png"}, "cloud")],
+    [("world", {"scene.png", "hits.png", "cloud.png"}, "path"),
+     ("world", {"scene.png", "hits.png", "cloud.png"}, "intensity"),
+     ("sensor", {"scene.png", "hits.png"}, "cloud")],
 )  # fmt: skip
 def test_pictures_that_there_are_not(coordinates, pictures, left_out, unplanned, tmp_path):
-    """No path without planning; and points in the axes of their sensors do not fit the scene."""
+    """No path without planning, nor intensity without its column; and some points do not fit."""
     result = make(tmp_path / "result", replace(unplanned, coordinates=coordinates))
     plot(result, *SMALL, "--out", tmp_path / "out")
     assert names(tmp_path / "out") == pictures

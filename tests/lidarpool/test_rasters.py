@@ -325,7 +325,7 @@ def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
     write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056")
     checked = CliRunner().invoke(cli, ["check", "hill.tif"])
     assert checked.exit_code == 0, checked.output
-    assert "raster      hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
+    assert "file        hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
     assert "note: hill.tif has 2 bands: the first is taken for heights\n" in checked.output
     scenario = Scenario.load(tmp_path / "hill.tif")
     scene = scenario.build_scene()

@@ -31,7 +31,7 @@ from poolpart import TaskRecord
 EVIL = (
     "\"'><script>alert(1)</script><img src=//evil.test/x onerror=y>&amp;{{ 7*7 }}\u202e\x00\udc80"
 )
-PICTURES = ["scene", "intensity", "cloud", "path"]
+PICTURES = ["scene", "hits", "intensity", "cloud", "path"]
 SCENARIO = Scenario.from_data({"steps": 35}, source="surveys/hall.yaml")
 PLANNING = Planning((0, 0), (10, 0), [(5, 0)], 2.0, trials=3, particles=20, iterations=30)
 RING = [(10 + 3 * np.cos(a), 3 * np.sin(a)) for a in np.arange(0, 6.28, 0.5)]
@@ -125,7 +125,7 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             }
             | changes
         )
-        drawn = PICTURES if plan else PICTURES[:3]
+        drawn = PICTURES if plan else PICTURES[:4]
         pictures = {name: f'<svg id="{name}"></svg>' for name in drawn}
         files = [*(f"{name}.png" for name in drawn), "report.html", "report.json"]
         numbers = counted(result.points, len(scene.names))
@@ -288,7 +288,7 @@ def test_what_is_unusual_is_told(write, changes, words):
 
 def test_without_planning(write):
     text, _ = write(plan=None, tasks=[task for task in records() if task.stage != TRIAL])
-    assert "The path" not in text and "swarm" not in text and text.count("<figure>") == 3
+    assert "The path" not in text and "swarm" not in text and text.count("<figure>") == 4
 
 
 def test_a_path_far_from_zero_is_told_in_world_coordinates(write):

@@ -499,7 +499,9 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert kinds["Arm/base_link"].semantic_class != 7
     notes = scenario.advice(scene)
     assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
-    assert scenario.robots["Rover"].startswith("14 links, 6,592 triangles; 9 of its joints move")
+    assert scenario.sources["rover.urdf"].startswith(
+        "14 links, 6,592 triangles; 9 of its joints move"
+    )
 
 
 @pytest.mark.parametrize(

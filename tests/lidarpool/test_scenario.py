@@ -185,6 +185,10 @@ BAD = [
     ("sensor: {layers: '40'}", r"sensor\.layers is '40'; input should be a valid integer"),
     ("sensor: {layer: 4}", r"sensor\.layer is not a field\. Did you mean 'layers'\?"),
     ("sensors: {a: {mount: {positon: [0, 0, 0]}}}", "a.mount.positon .* mean 'position'"),
+    (
+        "scene: {files: [{file: a.ply, position: [0, 0, 1]}]}",
+        r"files\[0\]\.position is not a field\. Did you mean 'translation'\?",
+    ),
     ("sensr: {}", r"sensr is not a field\. Did you mean 'sensor'\?"),
     ("sensor: {vertical_fov_deg: .nan}", r"is nan; input should be a finite number"),
     ("sensor: {step_deg: 0.1}", "less than one firing"),

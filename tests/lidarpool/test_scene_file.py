@@ -3,15 +3,23 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from click.testing import CliRunner
 
 from lidarpool import LidarpoolError, Scene
 from lidarpool.cli.scene_commands import scene as command
+from lidarpool.scene.actors import box
 from lidarpool.scene.city import city
+from lidarpool.scene.colours import WHITE, Colours
+from lidarpool.scene.instances import Instance
+from lidarpool.scene.mesh import Cutout
+from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.plants import SPECIES
 from lidarpool.scene.scene_file import write_scene
 
 
@@ -31,6 +39,82 @@ def test_round_trip(tmp_path, suffix):
         np.sort(read.vertices[read.faces].reshape(-1, 9).round(2), axis=0), corners, atol=0.011
     )
     assert [path.name for path in tmp_path.iterdir()] == [f"town{suffix}"]
+
+
+def test_colours_come_back_from_a_glb_file(tmp_path):
+    """A texture, colours of corners, a plain colour, none; instances; and a mask with a colour."""
+    rng = np.random.default_rng(3)
+    cube, faces = box("Cube", (1, 1, 1)), np.zeros(12, np.int32)
+    image = rng.integers(0, 256, (8, 4, 3)).astype(np.uint8)
+    uv = rng.uniform(-1, 2, (12, 3, 2)).astype(np.float32)
+    corners = rng.integers(0, 256, (12, 3, 3)).astype(np.uint8)
+    red = np.uint8([[[200, 10, 3]]])
+    several = Colours((red, image), (np.arange(12) % 2).astype(np.int32), uv)
+    kinds = {
+        "Textured": Colours((image,), faces, uv),
+        "Tinted": Colours((image,), faces, uv, corners),
+        "Corners": Colours((WHITE,), faces, None, corners),
+        "Plain": Colours.plain(red, 12),
+        "Both": several,
+        "Bare": None,
+    }
+    meshes = [replace(cube, name=name, colours=own) for name, own in kinds.items()]
+    mask = rng.random((4, 4)) < 0.5
+    card = replace(cube, name="Card", cutouts=(Cutout(mask, uv),), colours=Colours.plain(red, 12))
+    copies = np.tile(np.eye(4), (3, 1, 1))
+    copies[:, 0, 3] = 5, 9, 13
+    placed = Instance.several(replace(meshes[4], name="Copy"), copies, "Copy")
+    path = write_scene(tmp_path / "all.glb", Scene.from_meshes([*meshes, card, *placed]))
+    wanted = {mesh.name: (mesh, np.zeros(3)) for mesh in [*meshes, card]}
+    names = ("Copy", "Copy.2", "Copy.3")
+    wanted |= {n: (meshes[4], one.matrix[:3, 3]) for n, one in zip(names, placed, strict=True)}
+    read = {}
+    for one in load_meshes(path, colours=True):
+        mesh = one.flat() if isinstance(one, Instance) else one
+        read.setdefault(mesh.name, []).append(mesh)
+    assert {*read} == {*wanted}
+    for name, (mesh, shift) in wanted.items():
+        found = {}
+        for part in read[name]:
+            own = part.colours
+            shades = np.full((len(part.faces), 3), 188) if own is None else own.means()
+            for triangle, shade in zip(part.vertices[part.faces], shades, strict=True):
+                key = tuple(triangle.mean(axis=0).round(3) + 0.0)
+                found[key] = shade.astype(int)
+        expected = np.full((12, 3), 188) if mesh.colours is None else mesh.colours.means()
+        for triangle, shade in zip(mesh.vertices[mesh.faces] + shift, expected, strict=True):
+            key = tuple(triangle.mean(axis=0).round(3) + 0.0)
+            assert np.abs(found[key] - shade.astype(int)).max() <= 1, name
+    assert [len(part.cutouts) for part in read["Card"]] == [1]
+    # trimesh, another reader
+    seen = trimesh.load(path).geometry
+    assert seen["Plain"].visual.material.main_color.tolist() == [147, 1, 0, 255]  # linear
+    texture = np.asarray(seen["Textured"].visual.material.baseColorTexture.convert("RGB"))
+    np.testing.assert_array_equal(texture, image)
+
+
+def test_a_generated_city_has_colours_and_the_triangles_that_it_had(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    arguments = ["city", "a.glb", "--triangles", "20000", "--trees", "9", "--cars", "9"]
+    CliRunner().invoke(command, arguments, catch_exceptions=False)
+    made, read = city(20_000, 0, 9, 9), Scene.load("a.glb", colours=True)
+    assert (read.names, read.triangles) == (made.names, made.triangles)
+
+    def shade(name):
+        own = read.face_object == read.names.index(name)
+        return np.unique(read.colours.take(own).means(), axis=0)
+
+    assert (len(shade("ground")), len(shade("pavement"))) == (1, 1)
+    assert shade("ground").max() < shade("pavement").min()
+    assert len(shade("building-1")) > 1, "a roof has another colour than walls"
+    trees = {species.name for species in SPECIES}
+    for name in {name.partition(".")[0] for name in read.names if "-" not in name} - {
+        "ground",
+        "pavement",
+    }:
+        red, green, blue = shade(name).astype(int).T
+        leaves = (green > np.maximum(red, blue)).any()
+        assert (len(red), leaves) == ((2, True) if name in trees else (1, False)), name
 
 
 @pytest.mark.parametrize(

@@ -20,6 +20,7 @@ MODEL = (
     '</vertices><triangles><triangle v1="0" v2="1" v3="2"/></triangles>{beams}</mesh></object>'
     "{objects}</resources><build>{items}</build></model>"
 )
+VERTICES = '<vertex x="0" y="0" z="0"/><vertex x="1" y="0" z="0"/><vertex x="0" y="1" z="0"/>'
 PARTS = {"doctype": "", "unit": 'unit="meter"', "more": "", "x": "0", "beams": "", "objects": ""}
 
 
@@ -62,6 +63,34 @@ def test_nested_components_and_copies_are_all_there(tmp_path):
     assert len(load(tmp_path, objects=nested, items='<item objectid="3"/>')) == 100
     items = '<item objectid="1" partnumber="A"/>' * 2
     assert [mesh.name for mesh in load(tmp_path, items=items)] == ["A", "A"]
+
+
+def test_colours_of_base_materials_and_colour_groups(tmp_path):
+    """Of triangles, of the object, of corners; and some that are not there."""
+    triangles = "".join(
+        f'<triangle v1="0" v2="1" v3="2" {more}/>'
+        for more in ("", 'pid="8" p1="1"', 'pid="8" p1="0" p2="1" p3="0"', 'p1="0"',
+                     'pid="77" p1="0"', 'pid="8" p1="9"')
+    )  # fmt: skip
+    objects = (
+        '<basematerials id="7"><base name="a" displaycolor="#0A141E"/>'
+        '<base name="b" displaycolor="#FF8000FF"/></basematerials>'
+        '<m:colorgroup id="8"><m:color color="#010203"/><m:color color="#fffefd80"/>'
+        f'</m:colorgroup><object id="2" pid="7" pindex="1"><mesh><vertices>{VERTICES}</vertices>'
+        f"<triangles>{triangles}</triangles></mesh></object>"
+    )
+    path = tmp_path / "m.3mf"
+    path.write_bytes(packed({"3D/3dmodel.model": model('<item objectid="2"/>', objects=objects)}))
+    notes = []
+    (mesh,) = load_meshes(path, colours=True, tell=notes.append)
+    first, last, base = [1, 2, 3], [255, 254, 253], [255, 128, 0]
+    expected = [[base] * 3, [last] * 3, [first, last, first], [[10, 20, 30]] * 3]
+    grey = [[[188] * 3] * 3] * 2
+    assert mesh.colours.corners.tolist() == expected + grey
+    assert notes == [f"{path} has textures or lacks colours, which leaves 2 triangles grey"]
+    assert load_meshes(path)[0].colours is None
+    (leaf,) = load(tmp_path)
+    assert leaf.colours is None
 
 
 @pytest.mark.parametrize(

@@ -12,10 +12,12 @@ from hypothesis import strategies as st
 
 from lidarpool.base import allowance
 from lidarpool.base.errors import LidarpoolError
+from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene import nodes, usd
 from lidarpool.scene.instances import Instance
 from lidarpool.scene.meshfile import load_meshes
 from lidarpool.scene.scene import Scene
+from lidarpool.scene.transform import Transform
 
 with_library = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
 
@@ -64,7 +66,7 @@ def test_polygons_places_and_names(tmp_path):
     within = prim("Wall", text=text + "int[] holeIndices = [2]\n" + MOVED.format((1, 0, 0)))
     world = prim("World", "Xform", within + MOVED.format((0, 0, 5)))
     objects, lines = told(write(tmp_path / "m.usda", world, prim("Wall")))
-    assert [one.name for one in objects] == ["Wall", "Wall"]
+    assert [one.name for one in objects] == ["World", "Wall"]
     assert [len(one.faces) for one in objects] == [4, 2] and lines == []
     np.testing.assert_allclose(objects[0].bounds, [[1, 0, 5], [3, 3, 5]])
 
@@ -129,17 +131,147 @@ def test_what_is_not_shown_is_left_out_and_counted(tmp_path):
     ]
 
 
+def sampled(op, **samples):
+    """An animated xformOp."""
+    times = ", ".join(f"{time[1:]}: {value}" for time, value in samples.items())
+    kind = {"translate": "double3", "rotateZ": "double", "scale": "float3"}[op]
+    return f"{kind} xformOp:{op}.timeSamples = {{{times}}}\n"
+
+
+def order(*ops):
+    return f"uniform token[] xformOpOrder = {['xformOp:' + op for op in ops]}\n".replace("'", '"')
+
+
+DRIVE = sampled("translate", t2="(1, 0, 0)", t6="(9, 0, 0)") + order("translate")
+STAGE = METRES + "\nstartTimeCode = 2\nendTimeCode = 4\ntimeCodesPerSecond = 2"
+
+
+def vertices(path, seconds, **options):
+    """Vertices of the actors at a time, and the lines that were told."""
+    scene = Scene.load(path, **options)
+    assert scene.names == ("Ground",)
+    return {one.name: one.placed(seconds * 1e9).vertices + scene.origin for one in scene.actors}
+
+
 @with_library
-def test_moving_prims_are_taken_at_the_first_time(tmp_path):
-    moving = MOVED.replace(" = {}", ".timeSamples = {{1: (1, 0, 0), 3: (9, 0, 0)}}").format()
-    camera = prim("Rig", "Xform", moving + prim("Camera", "Camera", ""))
-    car = prim("Car", "Xform", moving + prim("Body"))
-    stage = METRES + "\nstartTimeCode = 2\nendTimeCode = 3"
-    objects, lines = told(write(tmp_path / "m.usda", camera, car, stage=stage))
-    assert bounds(objects)[0, 0] == 5
-    assert lines == ["m.usda moves 1 object: taken at the first time, and still"]
-    objects, _ = told(write(tmp_path / "m.usda", car))
+def test_moving_prims_are_actors(tmp_path):
+    quad = np.array([(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)])
+    wheel = prim(
+        "Wheel", "Xform", sampled("rotateZ", t2=0, t6=720) + order("rotateZ") + prim("Rim")
+    )
+    still = "float3 xformOp:scale = (1, -2, 3)\n" + order("scale")
+    car = prim("Car", "Xform", DRIVE + prim("Body", "Xform", prim("A") + prim("B") + still) + wheel)
+    path = write(tmp_path / "m.usda", prim("Ground"), car, stage=STAGE)
+    for time, x, turn in ((0, 1, 0), (0.25, 2, 90), (1, 5, 360), (2, 9, 0), (1e6, 9, 0)):
+        found = vertices(path, time)
+        assert sorted(found) == ["Car", "Wheel"]
+        # One actor of all that moves as one; faces of mirrored meshes stay outward.
+        body = np.sort(found["Car"].round(9), axis=0)
+        want = quad * [1, -2, 3] + [x, 0, 0]
+        np.testing.assert_allclose(body, np.sort(np.concatenate([want, want]), axis=0), atol=1e-6)
+        c, s = np.cos(np.radians(turn)), np.sin(np.radians(turn))
+        turned = quad @ [[c, s, 0], [-s, c, 0], [0, 0, 1]] + [x, 0, 0]
+        np.testing.assert_allclose(found["Wheel"], turned, atol=1e-3)
+    # Its axes and its path follow the placement and the unit.
+    place = Transform.place((0, 0, 7), (0, 0, 90), 2)
+    found = vertices(path, 0.5, unit="ft", transform=place)["Wheel"]
+    local = (turned_about_z(quad, 180) + np.array([3, 0, 0])) * 0.3048
+    expected = turned_about_z(2 * local, 90) + np.array([0, 0, 7])
+    np.testing.assert_allclose(found, expected, atol=1e-3)
+    scenario = Scenario.from_data(
+        {"scene": {"files": ["m.usda"], "ground": {}},
+         "actors": [{"name": "Van", "box": [1, 1, 1], "trajectory": {
+             "points": [{"time_s": t, "position": [0, 0, 0], "yaw_deg": 0} for t in (0, 9)]}}]},
+        folder=tmp_path,
+    )  # fmt: skip
+    scene = scenario.build_scene()
+    assert [actor.name for actor in scene.actors] == ["Car", "Wheel", "Van"]
+
+
+def turned_about_z(points, degrees):
+    c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
+    return points @ [[c, s, 0], [-s, c, 0], [0, 0, 1]]
+
+
+@with_library
+def test_up_axes_turn_paths_too(tmp_path):
+    lift = prim("Lift", text=QUAD + DRIVE.replace(", 0, 0)", ", 5, 0)"))
+    stage = STAGE.replace('"Z"', '"Y"')
+    path = write(tmp_path / "m.usda", prim("Ground"), lift, stage=stage)
+    points = vertices(path, 0)["Lift"]
+    np.testing.assert_allclose(points, [(1, 0, 5), (3, 0, 5), (3, 0, 8), (1, 0, 8)], atol=1e-9)
+
+
+@with_library
+def test_what_moves_in_instances_moves_in_each(tmp_path):
+    write(tmp_path / "car.usda", prim("Top", "Xform", prim("Car", text=QUAD + DRIVE)),
+          stage=STAGE + '\ndefaultPrim = "Top"')  # fmt: skip
+    meta = "references = @./car.usda@\ninstanceable = true"
+    places = [prim(f"I{y}", "Xform", MOVED.format((0, y, 0)), meta) for y in (0, 10)]
+    scene = Scene.load(write(tmp_path / "m.usda", prim("Ground"), *places, stage=STAGE))
+    low = [actor.placed(1e9).bounds[0].tolist() for actor in scene.actors]
+    assert low == [[5, 0, 0], [5, 10, 0]] and len(scene.names) == 1
+
+
+@with_library
+def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
+    grows = sampled("scale", t2="(1, 1, 1)", t6="(2, 1, 1)") + order("scale")
+    camera = prim("Rig", "Xform", DRIVE + prim("Camera", "Camera", ""))
+    path = write(tmp_path / "m.usda", prim("Ground"), prim("Balloon", text=QUAD + grows), camera)
+    _, lines = told(path)
+    assert lines == [
+        "m.usda moves 1 object otherwise than as a whole, or in copies: taken at the first time, "
+        "and still"
+    ]
+    # Copies and actors of a scenario are of meshes that stand, and a scene of what moves only.
+    path = write(tmp_path / "m.usda", prim("Car", text=QUAD + DRIVE), stage=STAGE)
+    objects, lines = told(path)
+    assert lines == ["m.usda moves Car: taken where they are at first, and still"]
     assert bounds(objects)[0, 0] == 1
+    scenario = Scenario.load(path)
+    scene = scenario.build_scene()
+    assert not scene.actors and scene.bounds[0, 0] == 1
+    assert "nothing stands in the scene" in scenario.advice(scene)[0]
+    uneven = Transform.place(scale=(1, 2, 1))
+    with pytest.raises(LidarpoolError, match="'Car' moves, and its placement scales it unevenly"):
+        Scene.load(path, transform=uneven)
+
+
+@with_library
+def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
+    scenes = tmp_path / "scenes"
+    scenes.mkdir()
+    (tmp_path / "assets").mkdir()
+    write(tmp_path / "assets" / "q.usda", prim("Quad"))
+    write(tmp_path / "q.usda", prim("Quad"))
+    own = write(scenes / "own.usda", prim("Own"))
+    outer = prim("A", "", "", "references = @../assets/q.usda@</Quad>")
+    inner = prim("B", "", "", f"references = @./{own.name}@</Own>")
+    write(scenes / "m.usda", outer, inner)
+
+    def names(**more):
+        files = [{"file": "scenes/m.usda"} | more]
+        return Scenario.from_data({"scene": {"files": files}}, folder=tmp_path).build_scene().names
+
+    with pytest.raises(LidarpoolError, match=r"name a folder .* by assets in scene\.files"):
+        names()
+    assert names(assets="assets") == names(assets=".") == ("A", "B")
+    write(scenes / "m.usda", outer, prim("C", "", "", "references = @../q.usda@</Quad>"))
+    with pytest.raises(LidarpoolError, match=r"'\.\./q\.usda', but only files"):
+        names(assets="assets")
+
+
+@with_library
+def test_prims_of_one_name_are_named_by_what_they_are_in(tmp_path):
+    def piece(name, *meshes):
+        return prim(name, "Xform", prim("Geom", "Xform", "".join(map(prim, meshes))))
+
+    kinds = "".join(piece(name, "Render") for name in ("King", "Queen"))
+    sets = [prim(side, "Xform", kinds) for side in ("Black", "White")]
+    path = write(tmp_path / "m.usda", *sets, piece("Board", "Render", "Frame"), prim("Table"))
+    assert Scene.load(path).names == (
+        "King", "Queen", "King.2", "Queen.2", "Board/Render", "Frame", "Table"
+    )  # fmt: skip
 
 
 @with_library

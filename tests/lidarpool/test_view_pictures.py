@@ -10,7 +10,7 @@ from PIL import Image
 
 from lidarpool import Cloud, LidarpoolError
 from lidarpool.plan import Planning, best, run_trial
-from lidarpool.render.pictures import draw_cloud, draw_intensity, draw_scene
+from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene
 from lidarpool.render.shot import take_shot
 from lidarpool.render.theme import object_colours
 from lidarpool.report.path_picture import draw_path
@@ -61,12 +61,12 @@ def test_the_scene_shows_every_object_in_its_colour(pixels, shot):
         assert alike[:, LEFT].sum() > 8
 
 
-def test_intensity_colours_what_was_hit_and_only_that(pixels, scene):
+def test_hits_colour_what_was_hit_and_only_that(pixels, scene):
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     hits = np.zeros(len(scene.faces), np.int64)
-    assert colourful(pixels(draw_intensity, shot, hits, NOWHERE, NONE)[:, LEFT]) < 10
+    assert colourful(pixels(draw_hits, shot, hits, NOWHERE, NONE)[:, LEFT]) < 10
     hits[scene.face_object == 0] = 50
-    plot = pixels(draw_intensity, shot, hits, NOWHERE, NONE)[:, LEFT]
+    plot = pixels(draw_hits, shot, hits, NOWHERE, NONE)[:, LEFT]
     right = shot.camera.project(scene.object_bounds[0])[0][:, 0].max()
     assert colourful(plot) > 30
     assert colourful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay grey"
@@ -77,7 +77,7 @@ def test_shares_of_hits_are_counted_whole(scene):
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     hits = np.zeros(len(scene.faces))
     hits[:3] = 1 / 3 - 1e-12
-    texts = [text.get_text() for text in draw_intensity(shot, hits, NOWHERE, NONE).figure.texts]
+    texts = [text.get_text() for text in draw_hits(shot, hits, NOWHERE, NONE).figure.texts]
     assert any(text.startswith("1 hit ") for text in texts)
 
 
@@ -87,7 +87,7 @@ def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
     scene = Scene.from_meshes([Mesh("Floor", corners, np.array([[0, 1, 2], [0, 2, 3]]))])
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     points = np.random.default_rng(0).uniform((0, 0, 0), (4, 4, 0), (2000, 3))
-    image = pixels(draw_intensity, shot, np.array([1000, 3000]), points, NONE)
+    image = pixels(draw_hits, shot, np.array([1000, 3000]), points, NONE)
     across = np.linspace(0.3, 7.7, 30)
     for y in (0.5, 2, 3.5):
         places = np.column_stack([across, np.full(30, y), np.zeros(30)])
@@ -131,7 +131,7 @@ def test_a_picture_within_a_page_takes_its_ink_from_there(shot):
 def test_sample_rays_are_drawn(pixels, scene, shot):
     hits = np.zeros(len(scene.faces), np.int64)
     rays = np.array([[[0, 0, 2], [20, -20, 2]], [[0, 0, 2], [-9, 9, 2]]], np.float32)
-    plain, drawn = (pixels(draw_intensity, shot, hits, NOWHERE, some) for some in (NONE, rays))
+    plain, drawn = (pixels(draw_hits, shot, hits, NOWHERE, some) for some in (NONE, rays))
     changed = np.abs(plain - drawn).max(axis=2) > 20
     column, line = shot.camera.project([[10, -10, 2]])[0][0].astype(int)
     assert changed[line - 2 : line + 3, column - 2 : column + 3].any()
@@ -162,7 +162,7 @@ def test_any_scene_and_poses_can_be_drawn(pixels, corners, poses):
     scene = Scene.from_meshes([Mesh("T", np.array(corners, float), np.array([[0, 1, 2]]))])
     shot = take_shot(scene, poses, size=SIZE, backend="numpy")
     assert colourful(pixels(draw_scene, shot, 9)) > 100
-    assert colourful(pixels(draw_intensity, shot, np.array([7]), scene.vertices, NONE)) > 100
+    assert colourful(pixels(draw_hits, shot, np.array([7]), scene.vertices, NONE)) > 100
     for points in (scene.vertices, scene.vertices[[0] * 500], np.array([[0, 0, 0], [1e7, 0, 0]])):
         pixels(draw_cloud, shot, Cloud(points, {}), 3)
 

@@ -261,7 +261,7 @@ class BlankPage:
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the drawing out, which takes longer than a small survey."""
     monkeypatch.setattr(lidarpool.report.pictures, "take_shot", lambda *_, **__: None)
-    for name in ("draw_scene", "draw_intensity", "draw_cloud", "draw_path"):
+    for name in ("draw_scene", "draw_hits", "draw_cloud", "draw_path"):
         monkeypatch.setattr(lidarpool.report.pictures, name, lambda *_, **__: BlankPage())
 
 

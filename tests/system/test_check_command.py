@@ -24,6 +24,7 @@ from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.job import make_job
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scenario.sections import PoolSection
+from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Cutout, Mesh
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
@@ -97,17 +98,33 @@ def test_json_is_all_that_is_printed(check):
     assert said["memory"]["needed"] > 200e6
 
 
-def test_colours_are_counted_by_file_where_they_are_read(check, tmp_path):
+def test_each_file_has_a_line_that_says_what_it_gave(check, tmp_path):
     road = Path(__file__).parents[2] / "examples" / "road.glb"
     shutil.copy(road, tmp_path)
     (tmp_path / "m.ply").write_text(PLY)
     scenario = SHORT | {"scene": ["road.glb", "m.ply"], "poses": [[0, 0, 2]]}
+    scenario["scene"] = {"files": ["road.glb", {"file": "m.ply", "unit": "cm"}]}
+    scenario["scene"]["copies"] = [
+        {"name": "P", "file": "p.ply", "at": [[k, 0, 5] for k in range(4)]}
+    ]
+    write_scene(tmp_path / "p.ply", Scene.from_meshes([box("Post", (1, 1, 2))]))
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    lines = [line[12:] for line in told.splitlines() if line.startswith("file  ")]
+    assert lines == [
+        "road.glb: 4 objects, 38 triangles, in m, Y-up",
+        "m.ply: 1 object, 2 triangles, in cm, Z-up",
+        "p.ply: 1 object, 12 triangles, in m, Z-up, 4 copies",
+    ]
     scenario["cloud"] = {"columns": ["red"]}
     told = check("--no-plan", text=json.dumps(scenario)).out
-    assert "colours     road.glb: 1 texture, 2 plain colours\n" in told
-    assert "colours     m.ply: no colours\n" in told
-    del scenario["cloud"]
-    assert "\ncolours" not in check("--no-plan", text=json.dumps(scenario)).out
+    assert "38 triangles, in m, Y-up, 1 texture, 2 plain colours\n" in told
+    assert "in cm, Z-up, no colours\n" in told and "are grey" not in told
+    scenario["materials"] = [
+        {"objects": "*", "reflectance": "texture"}, {"objects": "m", "reflectance": 0.5}
+    ]  # fmt: skip
+    told = check("--no-plan", text=json.dumps(scenario)).out
+    assert "note: 4 of 8 objects with reflectance: texture have no colours and are grey: " in told
+    assert "grey: P, P.2, P.3, …\n" in told
 
 
 def test_objects_with_masks_are_named(check, tmp_path):

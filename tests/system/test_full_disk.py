@@ -124,4 +124,4 @@ def test_the_disk_of_the_result_is_full(
     done = lidarpool(*command)
     assert (done.code, done.err) == (0, "")
     assert (out / "cloud.ply").read_bytes() == expected
-    assert {path.name for path in out.iterdir()} == set(FILES)
+    assert {path.name for path in out.iterdir()} == {*FILES} - {"intensity.png"}

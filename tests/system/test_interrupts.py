@@ -161,7 +161,7 @@ def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypat
         "lidarpool: interrupted; everything was stopped. The result in out is complete."
     )
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {*FILES} - {"path.png"}
+    assert names == {*FILES} - {"path.png", "intensity.png"}
 
 
 BLOCKED = """

@@ -49,7 +49,7 @@ class BlankPage:
     def __init__(self, *_, **__): pass
     def save(self, path): path.write_bytes(b"x")
     def svg(self): return "<svg></svg>"
-pictures.draw_scene = pictures.draw_intensity = BlankPage
+pictures.draw_scene = pictures.draw_hits = BlankPage
 pictures.draw_cloud = pictures.draw_path = BlankPage
 lidarpool.pipeline.policies.scans_per_batch = lambda *_: 10
 

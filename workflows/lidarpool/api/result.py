@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 # In a notebook: what is drawn of a result, and how large in pixels; scaled down by much, their
 # letters could not be read.
-_SHOWN, _SIZE = ("intensity", "cloud"), (800, 500)
+_SHOWN, _SIZE = ("hits", "cloud"), (800, 500)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -96,11 +96,11 @@ class Result(RunResult):
         folder
             Their folder; made if it does not exist.
         only
-            Which: scene, intensity, cloud, path; by default all.
+            Which: scene, hits, intensity, cloud, path; by default all there are.
         size
             Width and height in pixels.
         colour
-            Column to colour the points of the cloud by.
+            Column to colour the points of the cloud by; "rgb" for red, green and blue.
 
         Returns
         -------

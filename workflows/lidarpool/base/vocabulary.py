@@ -6,7 +6,7 @@ Help and completion of the command import no other module.
 from __future__ import annotations
 
 BACKENDS = ("auto", "cuda", "embree", "numpy")
-PICTURES = ("scene", "intensity", "cloud", "path")  # drawn pictures
+PICTURES = ("scene", "hits", "intensity", "cloud", "path")  # drawn pictures
 
 # Metres in one of each unit.
 UNITS_M = {

@@ -67,7 +67,7 @@ def check(
         with running as client, shown_status("casting some rays", as_json):
             found = forecast(job, read.pool, out, client, formats_of(read), file)
         found["notes"] += read.advice(job.scene)
-        found |= {"colours": read.colours, "rasters": read.rasters, "robots": read.robots}
+        found["sources"] = read.sources
     except LidarpoolError as error:
         if as_json:
             found = {"can_run": False, "reasons": [str(error)], "notes": []}
@@ -99,6 +99,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     if sensor.period is not None and sensor.cycle != "frame":
         turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
     yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
+    for file, taken in found["sources"].items():
+        yield f"file        {file}: {taken}"
     sides = list(zip("xyz", *found["bounds"], strict=True))
     spans = ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
     yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
@@ -106,12 +108,6 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
         have = "object has masks" if len(masked) == 1 else "objects have masks"
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
         yield f"masks       {len(masked):,} {have}: {shown}"
-    for words in found["rasters"]:
-        yield f"raster      {words}"
-    for name, words in found["robots"].items():
-        yield f"robot       {name}: {words}"
-    for file, colours in found["colours"].items():
-        yield f"colours     {file}: {colours}"
     drive = found["drive"]
     where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
     several = len(job.survey.carried) > 1

@@ -47,7 +47,7 @@ def _size(ctx: click.Context, param: click.Parameter, value: Any) -> tuple[int, 
     metavar="COLUMN",
     default="z",
     show_default=True,
-    help="Column to colour the points of the cloud by.",
+    help="Column to colour the points of the cloud by; rgb for red, green and blue.",
 )
 def plot(
     result: Path | Storage,

@@ -104,12 +104,15 @@ def points(cloud: Path, out: Path, voxel_m: float | None, size: float, overwrite
 def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     from ..base.errors import LidarpoolError
     from ..base.words import counted
+    from ..scene.paint import painted
     from ..scene.scene_file import check_target, write_scene
 
     check_target(out)
     if out.exists() and not overwrite:
         raise LidarpoolError(f"{out} exists: give another name, or --overwrite.")
     made = make()
+    if out.suffix.lower() == ".glb":  # others keep no colours
+        made = painted(made)
     if made.instances and out.suffix.lower() != ".glb" and made.triangles > MOST_COPIED:
         raise LidarpoolError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "

@@ -8,11 +8,13 @@ import numpy as np
 from pypcd4.pypcd4 import Encoding, PointCloud
 
 from ..columns.cloud import Cloud
+from ..columns.table import COLOURS
+from ..scene.colours import as_float
 from . import pieces
 
 
 class Pieces(pieces.Pieces):
-    """One file for each sweep, with all columns.
+    """One file for each sweep, with all columns; red, green and blue are one field `rgb`.
 
     Points are in the sensor's axes as they were when the sweep began; VIEWPOINT says where those
     were in the world. Times are seconds since the sweep began, as float32.
@@ -23,7 +25,13 @@ class Pieces(pieces.Pieces):
         sweeps = self.sweeps
         inside = sweeps.in_sensor(number, points.positions)
         names, arrays = ["x", "y", "z"], list(inside.T.astype(np.float32))
+        coloured = {*COLOURS} <= {*points.columns}
+        if coloured:
+            names.append("rgb")
+            arrays.append(as_float(*(points[name] for name in COLOURS)))
         for column in self.cloud.table:
+            if coloured and column.name in COLOURS:
+                continue
             values = points[column.name]
             if column.name == "time":
                 values = ((values - sweeps.begins_ns[number]) / 1e9).astype(np.float32)

@@ -21,6 +21,8 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
 from ..columns.cloud import Cloud, CloudLike
+from ..columns.table import COLOURS
+from ..scene.colours import as_float
 from .boxes import Boxes
 from .sweeps import Placed, Sweeps, plain_names
 
@@ -77,7 +79,8 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
-    intensity and reflectivity are 255 and 65,535 at 1 and above.
+    intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
+    blue, a field `rgb` follows, which makes points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -92,7 +95,8 @@ def _messages(
     cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any
 ) -> Iterator[tuple[str, Any, int]]:
     """Topics, messages and times in nanoseconds, sweep by sweep."""
-    row, field = _LAYOUTS[layout], types["sensor_msgs/msg/PointField"]
+    coloured = {*COLOURS} <= {column.name for column in cloud.table}
+    row, field = _row(layout, coloured), types["sensor_msgs/msg/PointField"]
     fields = [
         field(name, offset, _KINDS[kind.str[1:]], 1)
         for name, (kind, offset, *_) in (row.fields or {}).items()
@@ -112,7 +116,7 @@ def _messages(
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
         frame = frames[sweeps.sensor[sweep]]
         topic = f"/{frame}/points" if sweeps.sensors[sweeps.sensor[sweep]] else "/points"
-        rows = _rows(layout, points, sweeps, sweep)
+        rows = _rows(layout, row, points, sweeps, sweep)
         in_world = [
             (WORLD, name, placed, sweep)
             for (name, placed), there in zip(
@@ -132,8 +136,23 @@ def _messages(
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
 
 
-def _rows(layout: str, points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.void]:
-    """Points of a sweep in a layout."""
+def _row(layout: str, coloured: bool) -> np.dtype[np.void]:
+    """Type of a point in a layout, with or without colours."""
+    row = _LAYOUTS[layout]
+    if not coloured:
+        return row
+    kinds = {name: (kind, offset) for name, (kind, offset, *_) in (row.fields or {}).items()}
+    end = max(offset + kind.itemsize for kind, offset in kinds.values())
+    kinds["rgb"] = np.dtype("<f4"), end
+    formats, offsets = map(list, zip(*kinds.values(), strict=True))
+    size = max(row.itemsize, end + 4)
+    return np.dtype({"names": [*kinds], "formats": formats, "offsets": offsets, "itemsize": size})
+
+
+def _rows(
+    layout: str, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
+) -> NDArray[np.void]:
+    """Points of a sweep in a layout, of the type of `_row`."""
     there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
     light = np.clip(there["intensity"], 0, 1)
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
@@ -157,7 +176,9 @@ def _rows(layout: str, points: Cloud, sweeps: Sweeps, sweep: int) -> NDArray[np.
             "ring": there["channel"],
             "range": np.round(there["range"] * 1000),
         }
-    rows = np.zeros(len(points), _LAYOUTS[layout])
+    if "rgb" in (row.names or ()):
+        values["rgb"] = as_float(*(there[name] for name in COLOURS))
+    rows = np.zeros(len(points), row)
     for name, column in values.items():
         rows[name] = column
     return rows

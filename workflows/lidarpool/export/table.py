@@ -34,11 +34,12 @@ LAYOUTS = {
     "autoware": ("intensity", "time", "azimuth", "elevation", "range"),
     "ouster": ("intensity", "time", "reflectivity", "range"),
 }
-_E57 = ("intensity", "red", "green", "blue")
+_COLOURS = ("red", "green", "blue")
+_E57 = ("intensity", *_COLOURS)
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
 _RINGS = ("channel", "intensity")
-_BAG = (False, ("rosbags",), ("scan", "object", "channel"), ("channel",), LAYOUTS)
+_BAG = (False, ("rosbags",), ("scan", "object", "channel"), ("channel", *_COLOURS), LAYOUTS)
 
 FORMATS = {
     "ply": FormatRow("cloud.ply", "ply"),

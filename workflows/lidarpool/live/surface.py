@@ -93,6 +93,6 @@ class Surface:
 
 def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:
     """List the ways to colour a scene, with or without known reflectance, and its own colours."""
-    own = ("colour",) if scene.colours is not None else ()
+    own = ("colour",) if scene.coloured else ()
     more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
     return ("grey", "hits", "object", *more, *own)

@@ -20,7 +20,7 @@ from ..columns.table import AXES as POSITION
 from ..columns.table import Column, X, Y, Z
 from ..export.sweeps import Sweeps
 from ..render.closeup import around_ways, floor_and_cut
-from ..render.colouring import MOST_ENTRIES, Colouring, colours_of
+from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import Pictured, SensorWay, ways_of
 from ..scene.actors import Actor, shapes_of
@@ -68,6 +68,7 @@ class View:
         self.origin, self._bounds = self._around()
         rest = {column.name: column for column in self.points.table if column not in POSITION}
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
+        self._coloured = with_rgb(self.columns)
         self._lock = threading.Lock()
         self._surface: Surface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
@@ -160,9 +161,12 @@ class View:
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
-        meshes, arrays["actor_mesh"] = shapes_of(self._actors)
+        meshes, shapes = shapes_of(self._actors)
+        arrays["actor_mesh"] = shapes.astype(np.int32)  # browsers have no arrays of int64
         for number, mesh in enumerate(meshes):
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
+            if mesh.colours is not None:  # at the corners
+                arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
         for number, actor in enumerate(self._actors):
             arrays |= _actor_arrays(f"actor{number}", actor, self._duration_ns)
         if self.sweeps is not None:
@@ -178,6 +182,7 @@ class View:
                 {"name": name, "unit": "s" if column.unit == "ns" else column.unit,
                  "meaning": column.meaning} for name, column in self.columns.items()
             ],
+            "colours": [*self._coloured],
             "origin": self.origin.tolist(),
             "box": box.tolist(),
             "bounds": self._bounds.tolist(),
@@ -229,13 +234,13 @@ class View:
         finder, version = self._finder, self.version
         wanted = Filter.read(asked.get("filter", ""), list(self.columns))
         name = asked["colour"]
-        column = self.columns[name]
+        column = self._coloured[name]
         eye = Eye.read(asked["eye"]) if "eye" in asked else None
         scans = _scans(asked["scans"]) if "scans" in asked else None
         most = max(1, min(int(asked["most"]), MOST_POINTS))
         rows, count = finder.find(most, wanted, scans, eye, abandoned)
         colouring = self._colouring(finder, name, wanted, abandoned)
-        values = finder.points.values(name, rows)
+        values = values_of(column, lambda one: finder.points.values(one, rows))
         colours = np.full((len(rows), 4), 255, np.uint8)
         colours[:, :3] = as_bytes(colouring.paint(values))
         legend: Legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
@@ -254,8 +259,9 @@ class View:
         known = self._colourings
         if (name, wanted) not in known:
             rows, _ = finder.find(_SAMPLE, wanted, None, None, abandoned)
-            values = finder.points.values(name, rows)
-            known[name, wanted] = colours_of(values, self.columns[name], self._names(name))
+            column = self._coloured[name]
+            values = values_of(column, lambda one: finder.points.values(one, rows))
+            known[name, wanted] = colours_of(values, column, self._names(name))
         return known[name, wanted]
 
     def _sample(self, name: str) -> NDArray[Any]:

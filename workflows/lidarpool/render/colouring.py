@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from ..columns.table import Column
+from ..columns.table import COLOURS, Column
+from ..scene.colours import packed, unpacked
 from .theme import mapped, object_colours
 
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
 MOST_ENTRIES = 12  # most labels without names that have a colour each
 MOST_COLOURS = 1 << 16  # of labels
 
+RGB = Column("rgb", "uint32", "", "colours of the surfaces")  # see `values_of`
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
 _SKEWED = 0.1  # a median this low in its range: the scale is logarithmic
@@ -38,6 +40,19 @@ class Colouring:
     values: tuple[int, ...] = ()  # of the column, that the labels stand for
 
 
+def with_rgb(columns: Mapping[str, Column]) -> dict[str, Column]:
+    """Add `RGB` to columns that have red, green and blue, for points in their own colours."""
+    made = {*COLOURS} <= {*columns} and RGB.name not in columns
+    return {**columns, **({RGB.name: RGB} if made else {})}
+
+
+def values_of(column: Column, read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
+    """Values of a column, by a function that reads those of a name; of `RGB` packed colours."""
+    if column is RGB:
+        return packed(np.stack([read(name) for name in COLOURS], axis=1))
+    return read(column.name)
+
+
 def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
     """Choose colours for the values (n,) of a column; `names` are those of its values 0, 1, 2, ….
 
@@ -45,6 +60,8 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
     scale like numbers. Numbers that are mostly small with a few large ones, such as intensities,
     have a logarithmic scale. NaN is grey.
     """
+    if column is RGB:
+        return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
     spread = _SPREAD
     if column.kind == "label" and values.dtype.kind in "iu":
         values = values.astype(np.int64)

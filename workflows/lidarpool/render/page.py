@@ -242,7 +242,9 @@ class Page:
         axes = self.figure.add_axes((0.862, 0.27, 0.014, 0.46))
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
-        bar.set_label(title, fontsize=7.6 * self.unit, color=theme.INK, family=FONT)
+        bar.set_label(
+            title, fontsize=7.6 * self.unit, color=theme.INK, family=FONT, parse_math=False
+        )
         axes.tick_params(
             which="both", labelsize=6.6 * self.unit, color=theme.MUTED, width=0.6 * self.unit,
             labelcolor=theme.MUTED, labelfontfamily=FONT, length=2.5 * self.unit,

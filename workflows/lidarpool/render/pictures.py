@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from textwrap import fill
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from ..columns.cloud import Cloud
 from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
-from .colouring import TURBO, colours_of
+from .colouring import TURBO, colours_of, values_of
 from .hits import hit_colours
 from .page import LEGEND_ROWS, Page, whole_of, without_common_prefix
 from .shot import Shot
@@ -23,6 +24,7 @@ Floats = NDArray[np.float64]
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
 MOST_HITS, MOST_PIECES = 200_000, 100_000  # to count, and to colour
+SOLID = 5.0  # half pixels that a point covers at least where gaps are closed
 MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one trajectory would hide the surfaces
 # An object that covers this much of the ground is a floor or a hall.
 SURROUNDING = 0.6
@@ -61,7 +63,7 @@ def draw_scene(shot: Shot, triangles: int) -> Page:
     return page
 
 
-def draw_intensity(
+def draw_hits(
     shot: Shot, hit_counts: NDArray[Any], points: Floats, sample_rays: NDArray[np.floating]
 ) -> Page:
     """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
@@ -90,36 +92,39 @@ def draw_intensity(
     rays = np.linspace(0, len(sample_rays) - 1, most).astype(int)
     page.lines(axes, shot, sample_rays[rays].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(*limits), "hits per square metre; grey: none")
-    page.title(
-        "Ray intensity", f"{counted(round(hit_counts.sum()), 'hit')} · {shot.when}", shot.models
-    )
+    page.title("Hits", f"{counted(round(hit_counts.sum()), 'hit')} · {shot.when}", shot.models)
     return page
 
 
 def draw_cloud(
-    shot: Shot, cloud: Cloud, count: int, column: Column = Z, names: Sequence[str] = ()
+    shot: Shot,
+    cloud: Cloud,
+    count: int,
+    column: Column = Z,
+    names: Sequence[str] = (),
+    solid: bool = False,
 ) -> Page:
     """Draw points of a cloud coloured by a column, over the scene drawn pale.
 
     They are a sample of `count` points; hidden ones are left out. `names` are those of the values
-    0, 1, 2, … of the column, if it is a label.
+    0, 1, 2, … of the column, if it is a label. `solid` closes gaps between points.
     """
     image = shot.paint(np.tile(theme.rgb(theme.CLAY), (len(shot.scene.faces), 1)), 0.55)
     page = Page(shot.camera.size)
     if len(cloud):
-        values = cloud.positions[:, 2] if column is Z else cloud[column.name]
+        values = cloud.positions[:, 2] if column is Z else values_of(column, cloud.__getitem__)
         coloured = colours_of(values, column, names)
         image = with_points(
-            image, shot, cloud.positions - shot.scene.origin, coloured.paint(values)
+            image, shot, cloud.positions - shot.scene.origin, coloured.paint(values), solid
         )
         if coloured.limits is None:
             page.legend(coloured.labels)
         else:
-            unit = f" ({coloured.unit})" if coloured.unit else ""
+            unit = f" ({coloured.unit})" if coloured.unit else f"\n{fill(coloured.meaning, 42)}"
             low, high = coloured.limits
             scale = LogNorm if coloured.logarithmic else Normalize
             page.colour_bar(
-                TURBO, scale(low, high if high > low else low + 1), coloured.name + unit
+                TURBO, scale(low, high if high > low else low + 1), (coloured.name + unit).rstrip()
             )
     page.show(shot, image)
     by = "height" if column is Z else column.name.replace("_", " ")
@@ -163,9 +168,9 @@ def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
 
 
 def with_points(
-    image: NDArray[np.float32], shot: Shot, points: Floats, colours: Floats
+    image: NDArray[np.float32], shot: Shot, points: Floats, colours: Floats, solid: bool = False
 ) -> NDArray[np.float32]:
-    """Draw points (n, 3) as discs over an image, nearer ones over farther ones.
+    """Draw points (n, 3) as discs over an image; `solid` makes them close the gaps between them.
 
     Only points on the surface of their pixel are drawn: others are hidden, or on a wall that was
     removed. They have the light of that surface.
@@ -188,23 +193,32 @@ def with_points(
     # Discs are drawn at twice the resolution and averaged down, so that their edges are smooth.
     width, height = shot.camera.size
     radius = max(min(320 / np.sqrt(len(points) + 1), 5.2) * width / 1600, 1.5)
+    if solid:
+        radius = max(radius, SOLID * width / 1600)
     reach = int(radius)
     margin = reach + 2  # for discs of points beside the edge
     wide = 2 * (width + margin)
     fine = np.zeros((2 * (height + margin), wide), np.uint32)
     inner = fine[margin : margin + 2 * height, margin : margin + 2 * width]
     inner[:] = _packed(image).repeat(2, axis=0).repeat(2, axis=1)
+    column, row = (2 * pixels.T).astype(np.int64) + margin
+    middle, colour = row * wide + column, _packed(shaded)
     disc = [
-        dy * wide + dx
+        (dx * dx + dy * dy, dy * wide + dx)
         for dy in range(-reach, reach + 1)
         for dx in range(-reach, reach + 1)
         if dx * dx + dy * dy <= radius * radius
     ]
-    column, row = (2 * pixels.T).astype(np.int64) + margin
-    # The last of several colours for one pixel, which is nearest, stays.
-    fine.ravel()[(row * wide + column)[:, None] + disc] = _packed(shaded)[:, None]
+    # The last of several colours for one pixel stays: of the point whose middle is nearest there,
+    # of two alike of that in front.
+    for _, offset in sorted(disc, reverse=True):
+        fine.ravel()[middle + offset] = colour
     out = np.ascontiguousarray(inner).view(np.uint8).reshape(height, 2, width, 2, 4)
-    return out.mean(axis=(1, 3), dtype=np.float32) / 255
+    drawn = out.mean(axis=(1, 3), dtype=np.float32) / 255
+    if solid:  # surfaces keep their outlines
+        bare = shot.whole.triangle.reshape(height, width) < 0
+        drawn[bare] = image[bare]
+    return drawn
 
 
 def _packed(colours: NDArray[np.floating]) -> NDArray[np.uint32]:

@@ -28,7 +28,7 @@ from .report import make_report
 ROOM_BYTES = 32 << 20  # room for pictures and report
 
 CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
-_OF_CLOUD = ("intensity", "cloud")  # are drawn from the cloud's file
+_OF_CLOUD = ("hits", "intensity", "cloud")  # are drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
@@ -199,7 +199,8 @@ class _Pictures:
 
         self._staged, self._thread = staged, ThreadPoolExecutor(1, "pictures")
         self._pictured = Pictured.of(result)
-        self._makers = picture_makers(self._pictured, staged / CLOUD)
+        columns = [column.name for column in result.survey.stored_columns]
+        self._makers = picture_makers(self._pictured, staged / CLOUD, columns)
         self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
         self._drawn = {n: self._begun(n) for n in self._makers if n not in _OF_CLOUD}
 

@@ -77,10 +77,16 @@ def _of_table(path: Path, columns: dict[str, str]) -> tuple[Float, Float, Float]
         text = path.read_text("utf-8-sig")
         if not text.strip():
             raise ValueError("it is empty")
-        known = (*_PLACE, *_ANGLES, "scale", *_SCALES)
+        short = [name.removesuffix("_deg") for name in _ANGLES]  # as people write them
+        known = (*_PLACE, *_ANGLES, "scale", *_SCALES, *short)
         at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
         if "scale" in at and any(name in at for name in _SCALES):
             raise ValueError("it has both scale and scales of axes: leave one out in columns")
+        if unread := [name for name in short if name in at and f"{name}_deg" not in at]:
+            raise ValueError(
+                f"its column {unread[0]!r} has no unit: call it {unread[0]}_deg, in degrees, or "
+                f"give columns: {{{unread[0]}_deg: {unread[0]}}}"
+            )
     except (OSError, ValueError, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
     count = len(at["x"])

@@ -7,6 +7,7 @@ from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
+from functools import partial
 from glob import escape
 from pathlib import Path
 from typing import Annotated, Any
@@ -23,17 +24,16 @@ from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.cityjson import CLASSES as CITY_CLASSES
-from ..scene.colours import told as told_colours
 from ..scene.instances import Instance
 from ..scene.mesh import Mesh
-from ..scene.meshfile import CITYJSON, SUFFIXES, UNITLESS, load_meshes, wrote_it
+from ..scene.meshfile import CITYJSON, SUFFIXES, UNITLESS, Objects, load_objects, wrote_it
 from ..scene.nodes import Raster
 from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
-from ..sensor.materials import rows_named, with_classes
+from ..sensor.materials import MaterialTable, rows_named, with_classes
 from ..sensor.survey import SENSORS_MOST, Steps
 from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
@@ -184,7 +184,7 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
     _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
-    _colours: dict[str, str] = PrivateAttr(default_factory=dict)  # {mesh file: its colours}
+    _sources: dict[str, str] = PrivateAttr(default_factory=dict)  # {file: what it gave}
     _robots: dict[MeshFile, Robot] = PrivateAttr(default_factory=dict)  # {their file: robot}
     # Triangles of a scene, and the trajectory there.
     _way: tuple[Any, Track] | None = PrivateAttr(default=None)
@@ -311,30 +311,26 @@ class Scenario(Section):
         return [*notes, *filter(None, (self._of_size(scene), poses, self._of_colours(scene)))]
 
     @property
-    def colours(self) -> dict[str, str]:
-        """Colours that `build_scene` found: {mesh file: what it has}; empty if it read none."""
-        return dict(self._colours)
-
-    @property
-    def rasters(self) -> list[str]:
-        """Rasters that `build_scene` read, and what it took of them."""
-        return [f"{entry.file}: {raster.told}" for entry, raster in self._rasters]
-
-    @property
-    def robots(self) -> dict[str, str]:
-        """Robots that `build_scene` read: {name of the actor: what it has}."""
-        return {
-            entry.name: self._robots[entry.file].summary
-            for entry in self.actors
-            if entry.file in self._robots
-        }
+    def sources(self) -> dict[str, str]:
+        """What `build_scene` read: {file: a line on what it gave}."""
+        return dict(self._sources)
 
     def _of_colours(self, scene: Scene) -> str:
-        if scene.coloured or not self.coloured:
+        if not self.coloured:
             return ""
+        if not scene.coloured:
+            return (
+                "a column or reflectance: texture needs colours, but nothing in the scene has any, "
+                "so that all is grey"
+            )
+        names = scene.all_names
+        textured = MaterialTable.of(self._materials(scene), names).scale > 0
+        if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):
+            return ""
+        shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)
         return (
-            "a column or reflectance: texture needs colours, but nothing in the scene has any, so "
-            "that all is grey"
+            f"{len(grey):,} of {counted(int(textured.sum()), 'object')} with reflectance: texture "
+            f"have no colours and are grey: {shown}"
         )
 
     def _of_size(self, scene: Scene) -> str:
@@ -381,22 +377,27 @@ class Scenario(Section):
         """
         self._notes.clear()
         self._remarks.clear()
-        self._colours.clear()
+        self._sources.clear()
         self._rasters.clear()
         self._robots.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
+        moving: list[Actor] = []
         mistakes = Mistakes()
         for entry in self.scene.files:
             with mistakes.noted():
-                meshes += self._read(entry)
+                found = self._read(entry)
+                meshes += found.standing
+                moving += found.moving
         mistakes.tell()
         self._epsg = self._system()
         if self.scene.copies:
             meshes += self._copies(meshes)
-        scene = Scene.from_meshes(meshes)
+        objects = Objects(tuple(meshes), tuple(moving))
         if self.scene.ground is not None:
-            scene = Scene.from_meshes([*meshes, self._ground(scene)])
+            below = Scene.from_meshes(meshes or objects.still(lambda _: None))
+            objects = objects._replace(standing=(*meshes, self._ground(below)))
+        scene = Scene.of_objects(objects, self._notes.append)
         if not (self.actors or self.traffic):
             return scene
         standing = Standing(scene)
@@ -404,8 +405,8 @@ class Scenario(Section):
             carrier = None if self.trajectory is None else self._track(scene, standing)
         start = 0.0 if carrier is None else carrier.start_s
         assert start is not None  # of every track
-        actors = (*self._actors(standing, carrier), *self._traffic(scene, standing, start))
-        return scene.with_actors(actors)
+        own, others = self._actors(standing, carrier), self._traffic(scene, standing, start)
+        return scene.with_actors([*scene.actors, *own, *others])
 
     def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
         """Return the trajectory in the coordinates of a scene; it is made once."""
@@ -441,7 +442,11 @@ class Scenario(Section):
                 mesh = self._shape(entry, shapes)
                 with prefixed(f"{self._source}: scene.copies[{number}]"):
                     table = self._path(entry.table.file) if entry.table else None
-                    out += copies_of(entry, mesh, standing, table)
+                    made = copies_of(entry, mesh, standing, table)
+                if entry.file is not None:
+                    words = f", {counted(len(made), 'copy', 'copies')}"
+                    self._sources[entry.file.file] += words
+                out += made
         mistakes.tell()
         return out
 
@@ -504,6 +509,7 @@ class Scenario(Section):
             self._robots[file] = load_robot(
                 path, opacity=file.opacity, colours=self.coloured, tell=self._notes.append
             )
+            self._sources[file.file] = self._robots[file].summary
         return self._robots[file]
 
     def _joints(self, entry: ActorSection) -> Path | None:
@@ -545,7 +551,7 @@ class Scenario(Section):
         if shape not in made:
             name = entry.name or "vehicle"
             if isinstance(shape, MeshFile):
-                made[shape] = one_mesh(name, self._read(shape))
+                made[shape] = one_mesh(name, self._read_still(shape))
             else:
                 made[shape] = box(name, shape)
         return made[shape]
@@ -564,15 +570,18 @@ class Scenario(Section):
             actors = actors_of(
                 section, passages, lambda entry: self._shape(entry, shapes), standing, start_s
             )
-        self._notes.append(
-            f"{section.file}: {counted(len(actors), 'actor')} during the survey, of "
-            f"{counted(count, 'vehicle')} and persons until its end"
+        self._sources[section.file] = (
+            f"{counted(len(actors), 'actor')} during the survey, of {counted(count, 'vehicle')} "
+            "and persons until its end"
         )
         return actors
 
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, with the classes of actors and copies, and of city objects."""
-        made = [Material(**dict(entry)) for entry in self.materials]
+        made = []
+        for number, given in enumerate(self.materials):
+            with prefixed(f"materials[{number}]"):
+                made.append(Material(**dict(given)))
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
         for entry in placed:
@@ -675,10 +684,15 @@ class Scenario(Section):
         mount = MountSection() if self.mount is None else self.mount
         return [Mounted(self.sensor.sensor(self._folder), self._mount(mount))]
 
-    def _read(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
+    def _read_still(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
+        lost = f"{self._path(entry.file)} moves "
+        return self._read(entry).still(lambda line: self._notes.append(lost + line))
+
+    def _read(self, entry: MeshFile) -> Objects:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
-        meshes = load_meshes(
+            assets = None if entry.assets is None else self._path(entry.assets)
+        return load_objects(
             path,
             unit=entry.unit,
             up_axis=entry.up_axis,
@@ -688,14 +702,12 @@ class Scenario(Section):
             step_m=entry.step_m,
             window=entry.window,
             epsg=self.cloud.epsg,
+            assets=assets,
             tell=self._notes.append,
             axes=self._remarks.append,
             tell_raster=lambda raster: self._rasters.append((entry, raster)),
+            taken=partial(self._sources.setdefault, entry.file),
         )
-        if self.coloured:
-            shown = [one.mesh if isinstance(one, Instance) else one for one in meshes]
-            self._colours[entry.file] = told_colours(mesh.colours for mesh in shown)
-        return meshes
 
     @property
     def coloured(self) -> bool:

@@ -112,6 +112,13 @@ class MeshFile(Section):
         Opacity,
         told("mask: light passes where the image of a material is transparent; ignore: nowhere"),
     ] = "mask"
+    assets: Annotated[
+        Text | None,
+        told(
+            "a folder besides its own from which it may take files, from the scenario's folder",
+            "..",
+        ),
+    ] = None
 
     @model_validator(mode="after")
     def _one_placement(self) -> MeshFile:

@@ -12,6 +12,7 @@ from pydantic_core import ErrorDetails
 
 from ..base.words import counted, did_you_mean
 
+_ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
 _GIVEN_LETTERS = 160  # letters of the value given
 
 
@@ -41,7 +42,10 @@ def _line(detail: ErrorDetails, model: type[BaseModel]) -> str:
         return f"{place}: {message}" if place else message
     if kind in ("extra_forbidden", "invalid_key"):
         *section, name = detail["loc"]
-        return f"{place} is not a field.{did_you_mean(str(name), _fields(model, section))}"
+        fields = _fields(model, section)
+        if (other := _ALIKE.get(str(name), "")) in fields:
+            return f"{place} is not a field. Did you mean {other!r}?"
+        return f"{place} is not a field.{did_you_mean(str(name), fields)}"
     if kind == "missing":
         return f"{place} is missing; it must be given."
     given = detail["input"]

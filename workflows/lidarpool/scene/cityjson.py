@@ -20,7 +20,7 @@ from ..base.allowance import Allowance
 from ..base.words import counted
 from .colours import Colours, as_bytes
 from .mesh import Mesh
-from .nodes import Content, MeshFileError, Piece, Place, joined, settled
+from .nodes import Content, MeshFileError, Piece, Place, Wanted, joined, settled
 from .polygons import check_corners, triangulated, with_holes
 
 # {class of ASPRS LAS 1.4: names of city objects, which begin with their types}; 1 is for what LAS
@@ -55,7 +55,7 @@ _PARTS = "convert it to CityJSONSeq (.jsonl), which is read line by line, or exp
 _Json = dict[str, Any]
 
 
-def read_cityjson(data: bytes, path: Path, colours: bool) -> Content:
+def read_cityjson(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read the highest level of detail of each city object; a .jsonl line by line."""
     allowance = Allowance(len(data), _PARTS)
 
@@ -74,7 +74,7 @@ def read_cityjson(data: bytes, path: Path, colours: bool) -> Content:
                     'is JSON, but not CityJSON: it does not begin with "type": "CityJSON" (a '
                     "scenario has the ending .yaml)"
                 )
-            city = _City(document, allowance, colours)
+            city = _City(document, allowance, wanted.colours)
         elif kind != "CityJSONFeature":
             raise ValueError(f"a line is of the type {str(kind)[:40]!r}, not CityJSONFeature")
         city.add(document)
@@ -253,7 +253,7 @@ class _City:
         """All objects, in metres."""
         found = re.search(r"EPSG\b.*?(\d+)$", str(self._reference()))
         epsg = int(found[1]) if found else None
-        ends = [np.zeros((1, 3)), *(mesh.bounds + at[:3, 3] for mesh, at, _ in self._placed)]
+        ends = [np.zeros((1, 3)), *(one.mesh.bounds + one.matrix[:3, 3] for one in self._placed)]
         corners = np.concatenate(ends)[bool(self._placed) :]
         width, depth, height = np.ptp(corners, axis=0)
         near = np.abs(corners[:, :2]).max() <= 360

@@ -254,6 +254,11 @@ def unpacked(colours: NDArray[np.uint32]) -> Bytes:
     return np.ascontiguousarray(colours, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
+def as_float(red: Bytes, green: Bytes, blue: Bytes) -> NDArray[np.float32]:
+    """Colours (n,) as PCL and ROS have them in a field `rgb`: the bits 0x00RRGGBB as a float."""
+    return packed(np.column_stack([blue, green, red])).view("<f4")
+
+
 def luminance(colours: NDArray[np.uint32]) -> NDArray[np.float64]:
     """Luminance (n,) of packed colours in linear light, 0 to 1."""
     red, green, blue = map(np.take, _SHARES, unpacked(colours).T)

@@ -26,7 +26,17 @@ from .beside import file_beside, spellings
 from .colours import Colours, as_bytes
 from .masks import Colour, MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, Piece, instances, joined, settled
+from .nodes import (
+    SMALLER,
+    Content,
+    MeshFileError,
+    Node,
+    Piece,
+    Wanted,
+    instances,
+    joined,
+    settled,
+)
 from .polygons import check_corners, fanned, triangulated, unrolled, with_holes
 from .transform import rotation_about
 
@@ -37,15 +47,15 @@ _WRAPS: dict[str, Wrap] = {"CLAMP": "clamp", "BORDER": "clamp", "MIRROR": "mirro
 _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
 
 
-def read_dae(data: bytes, path: Path, colours: bool = False) -> Content:
-    """Read the visual scene of a file; `colours` are those of its materials."""
+def read_dae(data: bytes, path: Path, wanted: Wanted) -> Content:
+    """Read the visual scene of a file; colours are those of its materials."""
     root = xml_root(data)
     for element in root.iter():
         element.tag = element.tag.rpartition("}")[2]
     if root.tag != "COLLADA":
         raise MeshFileError(f"is XML, but not COLLADA: it begins with <{root.tag[:40]}>")
     allowance = Allowance(len(data), SMALLER)
-    paint = _Effects(path, allowance) if colours else None
+    paint = _Effects(path, wanted, allowance) if wanted.colours else None
     document = _Document(root, allowance, paint)
     content = settled(instances(document.roots(), document.node, path.stem))
     content.notes = paint.notes.lines() if paint else []
@@ -231,9 +241,9 @@ class _Document:
 class _Effects:
     """Diffuse colours of effects, each read once."""
 
-    def __init__(self, path: Path, allowance: Allowance) -> None:
+    def __init__(self, path: Path, wanted: Wanted, allowance: Allowance) -> None:
         self.notes = MaskNotes()
-        self._path, self._allowance = path, allowance
+        self._path, self._wanted, self._allowance = path, wanted, allowance
         self._texture = remembered(self._read_texture)
         self._made: dict[Element, Texture | Colour | None] = {}
 
@@ -278,7 +288,7 @@ class _Effects:
         found = None
         for one in (*spellings(name.removeprefix("file://")), last):
             with suppress(MeshFileError, OSError, ValueError):
-                found = found or file_beside(self._path, [one])
+                found = found or file_beside(self._path, [one], self._wanted)
         if found is None:
             raise MaskError(f"its image {name[-80:]!r} is not there")
         self._allowance.grow(found.stat().st_size)

@@ -1,4 +1,4 @@
-"""Scenes as .glb files: an object is a node, and its masks are textures.
+"""Scenes as .glb files: an object is a node, and its masks and colours are materials.
 
 This is not trimesh, which writes one material for a mesh.
 """
@@ -16,8 +16,9 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from ..base.errors import LidarpoolError
+from .colours import LINEAR
 from .instances import Instance
-from .mesh import Cutout, Mesh
+from .mesh import Mesh
 from .meshfile import GENERATOR
 from .scene import Scene
 from .transform import UP_AXES
@@ -56,7 +57,7 @@ class _Writer:
         self._pieces: list[bytes] = []
         self._size = 0
         self._meshes: dict[tuple[int, ...], int] = {}  # {ids of parts: number of the mesh}
-        self._materials: dict[int, int] = {}  # {id of a mask: number of the material}
+        self._materials: dict[int, int] = {}  # {id of a mask or image: number of the material}
         self._kept: list[Any] = []  # what has these ids
         self._tree: dict[str, Any] = {
             "asset": {"version": "2.0", "generator": GENERATOR},
@@ -92,27 +93,58 @@ class _Writer:
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: Mesh) -> list[dict[str, Any]]:
-        """Return opaque triangles, then those of each mask."""
+        """Return opaque triangles by their images, then those of each mask."""
         first = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
-        out = []
-        if first:
-            points = self._array((mesh.vertices @ UP_AXES["y"]).astype("<f4"), "VEC3", 34962)
-            faces = self._array(mesh.faces[:first].astype("<u4").reshape(-1, 1), "SCALAR", 34963)
-            out.append({"attributes": {"POSITION": points}, "indices": faces})
+        colours, out = mesh.colours, []
+        image = np.full(first, -1) if colours is None else colours.image[:first]
+        points: int | None = None
+        for number in np.unique(image).tolist():
+            rows = np.flatnonzero(image == number)
+            one = uv = tints = None
+            if colours is not None:
+                shown, one = colours.take(rows), colours.images[number]
+                uv = None if one.size == 3 else shown.uv
+                if shown.corners is not None and (shown.corners < 255).any():
+                    tints = shown.corners
+            if uv is None and tints is None:
+                if points is None:
+                    points = self._array((mesh.vertices @ UP_AXES["y"]).astype("<f4"), "VEC3")
+                faces = self._array(mesh.faces[rows].astype("<u4").reshape(-1, 1), "SCALAR")
+                primitive: dict[str, Any] = {"attributes": {"POSITION": points}, "indices": faces}
+            else:
+                primitive = {"attributes": self._corners(mesh, rows, uv, tints)}
+            if one is not None:
+                primitive["material"] = self._material(one)
+            out.append(primitive)
         for cut in mesh.cutouts:
-            # Corners have texture coordinates of their own.
-            corners = mesh.vertices[mesh.faces[first : first + len(cut.uv)]].reshape(-1, 3)
-            attributes = {
-                "POSITION": self._array((corners @ UP_AXES["y"]).astype("<f4"), "VEC3", 34962),
-                "TEXCOORD_0": self._array(cut.uv.reshape(-1, 2).astype("<f4"), "VEC2", 34962),
-            }
-            out.append({"attributes": attributes, "material": self._material(cut)})
+            rows = np.arange(first, first + len(cut.uv))
+            # A texture has no room beside a mask, which has coordinates of its own.
+            tints = None if colours is None else colours.take(rows).means()[:, None].repeat(3, 1)
+            attributes = self._corners(mesh, rows, cut.uv, tints)
+            out.append({"attributes": attributes, "material": self._material(cut.mask)})
             first += len(cut.uv)
         return out
 
-    def _array(self, rows: NDArray[Any], kind: str, target: int) -> int:
-        """Add an accessor; its number."""
-        view = self._view(rows.tobytes(), target=target)
+    def _corners(
+        self,
+        mesh: Mesh,
+        rows: NDArray[np.intp],
+        uv: NDArray[Any] | None,
+        tints: NDArray[np.uint8] | None,
+    ) -> dict[str, int]:
+        """Attributes of some triangles (k,), whose corners have their own (k, 3, …)."""
+        corners = mesh.vertices[mesh.faces[rows]].reshape(-1, 3) @ UP_AXES["y"]
+        attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
+        if uv is not None:
+            attributes["TEXCOORD_0"] = self._array(uv.reshape(-1, 2).astype("<f4"), "VEC2")
+        if tints is not None:
+            light = LINEAR[tints].reshape(-1, 3).astype("<f4")
+            attributes["COLOR_0"] = self._array(light, "VEC3")
+        return attributes
+
+    def _array(self, rows: NDArray[Any], kind: str) -> int:
+        """Add an accessor of attributes, or of indices (scalars); its number."""
+        view = self._view(rows.tobytes(), target=34963 if kind == "SCALAR" else 34962)
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
         return self._put(
             "accessors",
@@ -127,28 +159,33 @@ class _Writer:
         self._size += len(data)
         return self._put("bufferViews", view)
 
-    def _material(self, cut: Cutout) -> int:
-        """Return the number of a mask's material."""
-        key = id(cut.mask)
+    def _material(self, image: NDArray[Any]) -> int:
+        """Return the number of the material of a mask, bool (h, w), or of an image or colour."""
+        key = id(image)
         if key not in self._materials:
-            self._kept.append(cut.mask)
-            alpha = Image.fromarray(cut.mask.astype(np.uint8) * 255)
-            png = io.BytesIO()
-            Image.merge("LA", [Image.new("L", alpha.size, 255), alpha]).save(png, "png")
-            view = self._view(png.getvalue())
-            image = self._put("images", {"bufferView": view, "mimeType": "image/png"})
-            if "samplers" not in self._tree:
-                self._put("samplers", {"magFilter": _NEAREST, "minFilter": _NEAREST})
-            texture = self._put("textures", {"source": image, "sampler": 0})
-            self._materials[key] = self._put(
-                "materials",
-                {
-                    "alphaMode": "MASK",
-                    "doubleSided": True,
-                    "pbrMetallicRoughness": {"baseColorTexture": {"index": texture}},
-                },
-            )
+            self._kept.append(image)
+            matt: dict[str, Any] = {"metallicFactor": 0, "roughnessFactor": 1}
+            material: dict[str, Any] = {"pbrMetallicRoughness": matt}
+            if image.size == 3 and image.ndim == 3:
+                matt["baseColorFactor"] = [*LINEAR[image.ravel()].round(6).tolist(), 1]
+            elif image.ndim == 3:
+                matt["baseColorTexture"] = {"index": self._texture(Image.fromarray(image))}
+            else:
+                alpha = Image.fromarray(image.astype(np.uint8) * 255)
+                white = Image.merge("LA", [Image.new("L", alpha.size, 255), alpha])
+                matt["baseColorTexture"] = {"index": self._texture(white)}
+                material |= {"alphaMode": "MASK", "doubleSided": True}
+            self._materials[key] = self._put("materials", material)
         return self._materials[key]
+
+    def _texture(self, image: Image.Image) -> int:
+        png = io.BytesIO()
+        image.save(png, "png")
+        view = self._view(png.getvalue())
+        source = self._put("images", {"bufferView": view, "mimeType": "image/png"})
+        if "samplers" not in self._tree:
+            self._put("samplers", {"magFilter": _NEAREST, "minFilter": _NEAREST})
+        return self._put("textures", {"source": source, "sampler": 0})
 
     def data(self) -> bytes:
         """Content of the file."""

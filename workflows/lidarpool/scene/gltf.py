@@ -45,6 +45,7 @@ from .nodes import (
     MeshFileError,
     Node,
     Piece,
+    Wanted,
     instances,
     joined,
     settled,
@@ -66,15 +67,14 @@ V = TypeVar("V")
 _WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
 
 
-def read_gltf(data: bytes, path: Path, masks: bool = True, colours: bool = False) -> Content:
+def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read the default scene of a file, or all nodes if it has no scenes.
 
-    Files that it names are read only from the folder of `path` and below. Without `masks`,
-    triangles are solid; without both, no image is read.
+    Without masks, triangles are solid; without these and colours, no image is read.
     """
     header, body = _chunks(data)
     _check(header)
-    reader = _Reader(header, body, path, len(data), masks, colours)
+    reader = _Reader(header, body, path, len(data), wanted)
     content = settled(instances(_roots(header), reader.node, path.stem))
     content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
     content.notes = [*reader.notes.lines(), *reader.still()]
@@ -137,11 +137,10 @@ class _Reader:
         body: bytes,
         path: Path,
         size: int,
-        masks: bool,
-        colours: bool,
+        wanted: Wanted,
     ) -> None:
         self._header, self._body, self._path = header, body, path
-        self._masks, self._colours = masks, colours
+        self._wanted = wanted
         self._allowance = Allowance(size, SMALLER)
         self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
         nodes = header.get("nodes", ())
@@ -307,7 +306,7 @@ class _Reader:
 
     def _dressed(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
         """Return a piece with mask and colours; `mesh` is unpacked by Draco."""
-        if self._colours and len(piece.faces):
+        if self._wanted.colours and len(piece.faces):
             with self.notes.without_colour(self._material_name(primitive.get("material"))):
                 piece = piece._replace(colours=self._coloured(primitive, piece.faces, mesh))
         return self._cut(piece, primitive, mesh)
@@ -363,7 +362,7 @@ class _Reader:
     def _cut(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
         """Return a piece with the mask of its material."""
         number = primitive.get("material")
-        if number is None or not self._masks or not len(piece.faces):
+        if number is None or not self._wanted.masks or not len(piece.faces):
             return piece
         with self.notes.instead(self._material_name(number)):
             found = self._texture(number)
@@ -428,7 +427,7 @@ class _Reader:
         if uri.startswith("data:"):
             return read(_inline(uri), self._allowance)
         try:
-            file = file_beside(self._path, spellings(uri))
+            file = file_beside(self._path, spellings(uri), self._wanted)
         except MeshFileError as error:
             raise MaskError(str(error)) from error
         if file is None:
@@ -531,10 +530,7 @@ class _Reader:
 
     def _read_beside(self, uri: str) -> bytes:
         """Read a buffer file."""
-        try:
-            target = file_beside(self._path, spellings(uri))
-        except MeshFileError as error:
-            raise MeshFileError(f"{error}: export it as .glb, in one file") from error
+        target = file_beside(self._path, spellings(uri), self._wanted)
         if target is None:
             raise MeshFileError(
                 f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "

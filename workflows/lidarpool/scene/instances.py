@@ -204,7 +204,7 @@ class Instances:
         transforms = self.transforms.copy()
         turn = np.eye(3) if rotation is None else rotation
         for row in rows:
-            transforms[row] = np.column_stack([turn @ _stretch(transforms[row, :, :3]), position])
+            transforms[row] = np.column_stack([turn @ scale_of(transforms[row, :, :3]), position])
         made = copy(self)
         object.__setattr__(made, "transforms", transforms)
         if "bounds" in vars(self):  # those of all take long
@@ -214,8 +214,8 @@ class Instances:
         return made
 
 
-def _stretch(matrix: Float) -> Float:
-    """Take the rotation off a matrix (3, 3), by polar decomposition.
+def scale_of(matrix: Float) -> Float:
+    """Take the rotation off a matrix (3, 3), by polar decomposition: what it scales and mirrors.
 
     It is rounded to 12 digits: a factor of 1.4 stays one however often something is moved.
     """

@@ -28,7 +28,7 @@ SIDE_MOST = 4096  # pixels of an image of colours; larger ones are made smaller
 
 Mask = NDArray[np.bool_]
 Colour = NDArray[np.uint8]
-Wrap = Literal["repeat", "mirror", "clamp"]
+Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
 
@@ -197,18 +197,26 @@ class Texture:
         for column, wrap in enumerate(self._wraps):
             if wrap == "mirror":
                 uv[..., column] /= 2
-            elif wrap == "clamp":
-                image = self._continued(image, uv[..., column], 1 - column)
+            elif wrap != "repeat":
+                image = self._continued(image, uv[..., column], 1 - column, wrap == "black")
         return image, uv.astype(np.float32)
 
     def _continued(
-        self, image: NDArray[Any], places: NDArray[np.float64], axis: int
+        self, image: NDArray[Any], places: NDArray[np.float64], axis: int, black: bool
     ) -> NDArray[Any]:
-        """Repeat the edges of an image as far as `places` (k, 3), which are changed, ask for it."""
+        """Continue an image as far as `places` (k, 3), which are changed, ask for it.
+
+        By its edges, or black. A hundredth of a texel is the rounding of a program.
+        """
         size = image.shape[axis]
-        # Triangles wholly beyond an edge are in its last texels.
-        places[places.max(axis=1) <= 0] = 0.5 / size
-        places[places.min(axis=1) >= 1] = 1 - 0.5 / size
+        slack = 0.01 / size
+        places[(places > -slack) & (places < 0)] = 0
+        places[(places > 1) & (places < 1 + slack)] = 1
+        # Triangles wholly beyond an edge are in its last texels, or the first ones beyond.
+        most, least = places.max(axis=1), places.min(axis=1)
+        places[most <= 0], places[least >= 1] = 0.5 / size, 1 - 0.5 / size
+        if black:
+            places[most < 0], places[least > 1] = -0.5 / size, 1 + 0.5 / size
         before = max(0, int(np.ceil(-places.min() * size)))
         after = max(0, int(np.ceil((places.max() - 1) * size)))
         if not before and not after:
@@ -219,7 +227,7 @@ class Texture:
         widths[axis] = before, after
         places *= size / whole
         places += before / whole
-        return np.pad(image, widths, mode="edge")
+        return np.pad(image, widths, mode="constant" if black else "edge")
 
 
 def _take(allowance: Allowance, count: int) -> None:
@@ -252,7 +260,7 @@ class MaskNotes:
         if self.gone:
             out.append(f"names materials in {_some(self.gone)}, which cannot be read: all is solid")
         for found, what, so in (
-            (self.unread, "masks", "are solid"), (self.grey, "colours", "are grey")
+            (self.unread, "masks", "are solid"), (self.grey, "colours", "lack them")
         ):  # fmt: skip
             if found:
                 shown = _some([f"{name} ({why})" for name, why in found.items()])

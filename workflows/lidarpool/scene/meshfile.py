@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,13 +17,17 @@ from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError, prefixed
 from ..base.vocabulary import UNITS_M
-from ..base.words import did_you_mean, printable
+from ..base.words import counted, did_you_mean, printable
+from ..sensor import Track
+from ..sensor.trajectory import quaternions_of
+from .actors import Actor, one_mesh
 from .cityjson import read_cityjson
+from .colours import told
 from .dae import read_dae
 from .gltf import read_gltf
 from .instances import FARTHEST_M, Instance
 from .mesh import Mesh
-from .nodes import Content, MeshFileError, Raster
+from .nodes import Content, MeshFileError, Moving, Raster, Wanted
 from .polygon_files import read_obj, read_off, read_ply_mesh, read_stl
 from .rasters import SUFFIXES as RASTERS
 from .rasters import Window, read_raster
@@ -31,38 +35,30 @@ from .threemf import read_3mf
 from .transform import UP_AXES, Transform
 from .usd import read_usd
 
-_USD = (".usd", ".usda", ".usdc", ".usdz")
 CITYJSON = (".json", ".cityjson", ".jsonl")
 
-# A reader gets the content of a file and its path; read_raster gets the path alone. It raises
-# MeshFileError for unsupported content, and any error for a broken file. All but read_usd and
-# read_raster are our own; their modules say why no library is used.
-_MASKED: dict[str, Callable[[bytes, Path, bool, bool], Content]] = {
-    # And whether to read masks, and colours.
+# A reader gets the content of a file, its path, and what is wanted; read_raster gets the path and
+# options of its own. It raises MeshFileError for unsupported content, and any error for a broken
+# file. All but read_usd and read_raster are our own; their modules say why no library is used.
+_READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
     ".glb": read_gltf,
     ".gltf": read_gltf,
     ".obj": read_obj,
-}
-_COLOURED: dict[str, Callable[[bytes, Path, bool], Content]] = {  # and whether to read colours
+    ".stl": read_stl,
     ".ply": read_ply_mesh,
     ".off": read_off,
     ".dae": read_dae,
+    ".3mf": read_3mf,
+    **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
     **dict.fromkeys(CITYJSON, read_cityjson),
 }
-_READERS: dict[str, Callable[[bytes, Path], Content]] = {
-    ".stl": read_stl,
-    ".3mf": read_3mf,
-    **dict.fromkeys(_USD, read_usd),
-}
-SUFFIXES = (
-    *(".glb", ".gltf", ".obj", ".stl", ".ply", ".off", ".dae", ".3mf"),
-    *(*_USD, *CITYJSON, *RASTERS),
-)
+SUFFIXES = (*_READERS, *RASTERS)
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
 OWN = "lidarpool: metres, Z-up"  # comment that files of our own without such a name begin with
 
+_EVEN = 1e-6  # how much the square of a scale may differ between axes
 _HEAD = 200  # bytes of a file that such a comment is in
 
 Opacity = Literal["mask", "ignore"]
@@ -70,8 +66,23 @@ Opacity = Literal["mask", "ignore"]
 _log = logging.getLogger(__name__)
 
 
+class Objects(NamedTuple):
+    """Objects of a mesh file, in world coordinates."""
+
+    standing: tuple[Mesh | Instance, ...]
+    moving: tuple[Actor, ...] = ()  # each along a `Track`
+
+    def still(self, tell: Callable[[str], None]) -> tuple[Mesh | Instance, ...]:
+        """Return all of them where they are at first; `tell` is called if that is a loss."""
+        if self.moving:
+            names = ", ".join(actor.name for actor in self.moving[:3])
+            names += ", …" * (len(self.moving) > 3)
+            tell(f"{names}: taken where they are at first, and still")
+        return (*self.standing, *map(_at_first, self.moving))
+
+
 @checked
-def load_meshes(
+def load_objects(
     path: str | Path,
     *,
     unit: Literal[tuple(UNITS_M)] | None = None,  # type: ignore[valid-type]
@@ -82,10 +93,12 @@ def load_meshes(
     step_m: float | None = None,
     window: Window | None = None,
     epsg: int | None = None,
+    assets: str | Path | None = None,
     tell: Callable[[str], None] = _log.warning,
     axes: Callable[[str], None] | None = None,
     tell_raster: Callable[[Raster], None] | None = None,
-) -> tuple[Mesh | Instance, ...]:
+    taken: Callable[[str], object] = lambda _: None,
+) -> Objects:
     """Read all objects of a mesh file.
 
     Every place of a mesh in a scene graph is an object, named by its node; large meshes with many
@@ -105,8 +118,8 @@ def load_meshes(
     transform
         Placement in the world, in metres, after unit and up axis.
     opacity
-        With "mask", light passes where the image of a material is transparent (.glb, .gltf, .obj).
-        With "ignore", triangles are solid, and no image is read for it.
+        With "mask", light passes where the image of a material is transparent (.glb, .gltf, .obj,
+        .usd). With "ignore", triangles are solid, and no image is read for it.
     colours
         Whether to read colours: base colours and their images, and those of vertices.
     step_m
@@ -117,6 +130,9 @@ def load_meshes(
     epsg
         Code of the coordinate system that a raster is brought to, one in metres. None keeps its
         own if it is in metres, else takes the UTM zone of its middle.
+    assets
+        A folder: files that the file names are read from here and below, and from its own folder
+        and below.
     tell
         Called with a line on objects left out, on images that cannot be read, on materials that
         may be glass, or on a reference system; by default this module's logger warns.
@@ -124,12 +140,14 @@ def load_meshes(
         Called with a line on axes that a file did not state, or that were turned; by default this
         module's logger has it, as a warning if the scene seems to lie on its side.
     tell_raster
-        Called with what was taken of a raster; by default this module's logger has it.
+        Called with what was taken of a raster.
+    taken
+        Called with a line on what was read: objects, triangles, unit, axes and colours.
 
     Returns
     -------
-    Objects in world coordinates. All arithmetic is in double precision; .glb, .gltf and binary .stl
-    store single precision.
+    Objects that stand and, of .usd, that move, in world coordinates. All arithmetic is in double
+    precision; .glb, .gltf and binary .stl store single precision.
 
     Raises
     ------
@@ -150,28 +168,70 @@ def load_meshes(
             f"{path} is no raster: leave out {' and '.join(given)}, or give a raster "
             f"({' '.join(RASTERS)})."
         )
+    folders = tuple(Path(one).resolve() for one in (path.parent, assets) if one is not None)
+    wanted = Wanted(opacity == "mask", colours, folders)
     # Of broken numbers in files: infinite and NaN values are refused.
     with np.errstate(all="ignore"):
         try:
-            content = _read_whole(path, data, opacity, colours, raster)
+            content = _read_whole(path, data, wanted, raster)
         except LidarpoolError as error:
             raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
         upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
+        placed = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
         places = [upright] if transform is None else [upright, transform]
         with prefixed(path):
-            meshes = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
+            standing = tuple(_placed(mesh, path.stem, places) for mesh in content.meshes)
+            moving = tuple(_actor(one, path.stem, upright, placed) for one in content.moving)
+    objects = Objects(standing, moving)
     if content.skipped:
         names = ", ".join(content.skipped[:3]) + ", …" * (len(content.skipped) > 3)
         tell(f"{path} scales {names} to zero: left out")
     for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
         tell(f"{path} {note}")
-    if content.raster is not None:
-        told = tell_raster or (lambda raster: _log.info("%s: %s", path, raster.told))
-        told(content.raster)
+    if content.raster is not None and tell_raster is not None:
+        tell_raster(content.raster)
+    all_of_it = objects.still(lambda _: None)
+    taken(
+        _summary(content, all_of_it, unit, up_axis, colours)
+        if content.raster is None
+        else content.raster.told
+    )
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
-        _tell_axes(path, content, meshes, axes)
-    return meshes
+        _tell_axes(path, content, all_of_it, axes)
+    return objects
+
+
+def load_meshes(
+    path: str | Path, *, tell: Callable[[str], None] = _log.warning, **options: Any
+) -> tuple[Mesh | Instance, ...]:
+    """Read all objects of a mesh file, as `load_objects`, and let them stand."""
+    found = load_objects(path, tell=tell, **options)
+    return found.still(lambda line: tell(f"{path} moves {line}"))
+
+
+def _summary(
+    content: Content,
+    meshes: Sequence[Mesh | Instance],
+    unit: str | None,
+    up_axis: str | None,
+    colours: bool,
+) -> str:
+    """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
+    shapes = [one.mesh if isinstance(one, Instance) else one for one in meshes]
+    shared = [mesh for one, mesh in zip(meshes, shapes, strict=True) if one is not mesh]
+    words = [counted(len(meshes), "object")]
+    if shared:
+        of = counted(len({id(mesh) for mesh in shared}), "mesh", "meshes")
+        words.append(f"{len(shared):,} of them instances of {of}")
+    size = UNITS_M[unit] if unit else content.unit_m or 1.0
+    names = [name for name, metres in UNITS_M.items() if metres == size]
+    words += [
+        counted(sum(len(mesh.faces) for mesh in shapes), "triangle"),
+        f"in {names[0] if names else f'units of {size:g} m'}",
+        f"{(up_axis or content.up_axis or 'z').upper()}-up",
+    ]
+    return ", ".join([*words, *([told(mesh.colours for mesh in shapes)] if colours else [])])
 
 
 def wrote_it(path: Path) -> bool:
@@ -210,24 +270,16 @@ def _lies(content: Content, meshes: Sequence[Mesh | Instance]) -> str:
     return ""
 
 
-def _read_whole(
-    path: Path, data: bytes, opacity: Opacity, colours: bool, raster: dict[str, Any]
-) -> Content:
-    """Read any file, a raster with these options: at least one mesh, or LidarpoolError."""
+def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any]) -> Content:
+    """Read any file, a raster with these options: at least one object, or LidarpoolError."""
     try:
         for beginning, what in _FOREIGN.items():
             if re.match(beginning, data):
                 raise MeshFileError(what)
         suffix = path.suffix.lower()
-        if suffix in _MASKED:
-            content = _MASKED[suffix](data, path, opacity == "mask", colours)
-        elif suffix in _COLOURED:
-            content = _COLOURED[suffix](data, path, colours)
-        elif suffix in RASTERS:
-            content = read_raster(path, **raster)
-        else:
-            content = _READERS[suffix](data, path)
-        if not content.meshes:
+        is_raster = suffix in RASTERS
+        content = read_raster(path, **raster) if is_raster else _READERS[suffix](data, path, wanted)
+        if not (content.meshes or content.moving):
             if content.skipped:
                 raise MeshFileError("has no triangles that are not scaled to zero")
             raise MeshFileError(
@@ -320,6 +372,35 @@ def _placed(one: Mesh | Instance, stem: str, places: Sequence[Transform]) -> Mes
             "on Earth: check its unit and placement."
         )
     return one
+
+
+def _actor(one: Moving, stem: str, upright: Transform, placed: Transform) -> Actor:
+    """Return what moves as an actor, with its axes turned as those of the file are.
+
+    Its mesh has all scales, since a trajectory turns and moves only.
+    """
+    name = printable(one.name) or printable(stem)
+    unit_m, scale = (np.cbrt(np.linalg.det(place.linear)) for place in (upright, placed))
+    axes, turn = upright.linear / unit_m, placed.linear / scale
+    if np.abs(turn @ turn.T - np.eye(3)).max() > _EVEN:
+        raise LidarpoolError(
+            f"Object {name!r} moves, and its placement scales it unevenly: give one factor."
+        )
+    objects = [part.moved(name, scale * upright.linear, np.zeros(3)) for part in one.objects]
+    positions = one.positions @ (placed.linear @ upright.linear).T + placed.offset
+    if not np.abs(positions).max() <= FARTHEST_M:
+        raise LidarpoolError(
+            f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
+        )
+    turns = quaternions_of(turn @ axes @ one.rotations @ axes.T)
+    track = Track(one.times_s, positions, turns, start_s=0.0, beyond="hold")
+    return Actor(one_mesh(name, objects), track)
+
+
+def _at_first(actor: Actor) -> Mesh:
+    positions, rotations = actor.trajectory.poses(0, np.zeros(1))
+    turn = np.eye(3) if rotations is None else rotations[0]
+    return actor.mesh.moved(actor.name, turn, positions[0])
 
 
 def _corners(one: Mesh | Instance) -> NDArray[np.float64]:

@@ -28,7 +28,7 @@ from .masks import (
     remembered,
 )
 from .mesh import Cutout
-from .nodes import SMALLER, MeshFileError
+from .nodes import SMALLER, MeshFileError, Wanted
 
 # Options of images: how many words follow each; -o, -s and -t have one to three numbers.
 _OPTIONS = {
@@ -113,8 +113,16 @@ class Materials:
     counts for nothing, since some programs write black there.
     """
 
-    def __init__(self, mesh: Path, size: int, notes: MaskNotes, libraries: Sequence[bytes]) -> None:
-        self._mesh, self._notes, self._allowance = mesh, notes, Allowance(size, SMALLER)
+    def __init__(
+        self,
+        mesh: Path,
+        size: int,
+        notes: MaskNotes,
+        libraries: Sequence[bytes],
+        wanted: Wanted,
+    ) -> None:
+        self._mesh, self._notes, self._wanted = mesh, notes, wanted
+        self._allowance = Allowance(size, SMALLER)
         self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
         self._image = remembered(self._read_image)
         self._entries: dict[bytes, _Entry] = {}
@@ -167,7 +175,7 @@ class Materials:
         paths = PureWindowsPath(name)
         for one in (name, paths.as_posix(), paths.name):
             with suppress(MeshFileError, OSError, ValueError, RuntimeError):
-                if one and (found := file_beside(self._mesh, [one])):
+                if one and (found := file_beside(self._mesh, [one], self._wanted)):
                     return found
         return None
 

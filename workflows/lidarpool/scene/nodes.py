@@ -7,6 +7,7 @@ from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from itertools import chain
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,6 +24,7 @@ SMALLER = "export it in parts, or as .ply"  # what helps if a file unpacks to to
 # A mesh becomes one of instances if that saves so many triangles; single triangles are cast faster.
 SHARED_TRIANGLES = 100_000
 MOST_NODES = 200_000  # most nodes of a scene, counting every instance
+_NAMES = 16  # of nodes that a place remembers
 MOST_TRIANGLES = np.iinfo(np.int32).max  # of all places
 
 
@@ -39,14 +41,38 @@ class MeshFileError(Exception):
     """An error of a mesh file, as a clause that follows its name."""
 
 
+class Wanted(NamedTuple):
+    """What to read of a mesh file, besides triangles."""
+
+    masks: bool
+    colours: bool
+    folders: tuple[Path, ...]  # resolved; files that it names are read only from these and below
+
+    def allows(self, file: Path) -> bool:
+        """Whether a file that is named may be read."""
+        return any(file.resolve().is_relative_to(folder) for folder in self.folders)
+
+
+class Moving(NamedTuple):
+    """Objects that move as one, and how: turned, then moved."""
+
+    name: str
+    objects: Sequence[Mesh | Instance]
+    times_s: NDArray[np.float64]  # (k,), ascending, since the survey's start; before and after
+    # them it stands
+    positions: NDArray[np.float64]  # (k, 3)
+    rotations: NDArray[np.float64]  # (k, 3, 3), perhaps rounded or scaled
+
+
 @dataclass
 class Content:
     """Content of a mesh file.
 
-    `meshes` are in the file's unit and axes.
+    `meshes` and `moving` are in the file's unit and axes.
     """
 
     meshes: Sequence[Mesh | Instance]
+    moving: list[Moving] = field(default_factory=list)
     unit_m: float | None = None  # metres in its unit; None if unknown
     up_axis: str | None = None  # 'x', 'y' or 'z'; None if neither it nor its format states one
     generator: str = ""  # the program that wrote it, if known
@@ -75,6 +101,7 @@ class Place(NamedTuple):
     mesh: Mesh
     matrix: NDArray[np.float64]  # (4, 4), to the coordinates of the file
     name: str
+    path: tuple[str, ...] = ()  # names of the nodes that it is in, of the innermost few
 
 
 def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -> list[Place]:
@@ -90,9 +117,9 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
     """
     node_of = cache(node_of)
     placed, begun = [], 0
-    stack = [(key, np.eye(4), "") for key in reversed(list(roots))]
+    stack: list[Any] = [(key, np.eye(4), ()) for key in reversed(list(roots))]
     while stack:
-        key, above, name = stack.pop()
+        key, above, path = stack.pop()
         node = node_of(key)
         begun += 1 if node.copies is None else 1 + len(node.copies)
         # A few lines can make any number of nodes.
@@ -101,14 +128,15 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
                 f"has nodes that contain each other, or copies, more than {MOST_NODES:,} in all: "
                 "export it in parts"
             )
-        matrix, name = above @ node.matrix, node.name or name
+        matrix = above @ node.matrix
+        path = (*path[1 - _NAMES :], node.name) if node.name else path
         places = [matrix] if node.copies is None else matrix @ node.copies
         placed += [
-            Place(mesh, place, name or mesh.name or stem)
+            Place(mesh, place, path[-1] if path else mesh.name or stem, path)
             for place in places
             for mesh in node.meshes
         ]
-        stack += [(child, matrix, name) for child in reversed(list(node.children))]
+        stack += [(child, matrix, path) for child in reversed(list(node.children))]
     return placed
 
 
@@ -124,13 +152,13 @@ def settled(placed: Sequence[Place]) -> Content:
     """
     objects: list[Mesh | Instance] = []
     content = Content(objects)
-    uses = Counter(mesh for mesh, _, _ in placed)
+    uses = Counter(mesh for mesh, *_ in placed)
     shared = {
         mesh
         for mesh, n in uses.items()
         if (n - 1) * len(mesh.faces) >= (1 if mesh.cutouts else SHARED_TRIANGLES)
     }
-    own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, _, _ in placed if mesh not in shared]
+    own = [mesh.vertices.nbytes + mesh.faces.nbytes for mesh, *_ in placed if mesh not in shared]
     if sum(own) > memory_share():
         raise MeshFileError(
             f"places {len(own):,} objects, which would take {bytes_of(sum(own))}, of at most "
@@ -142,15 +170,15 @@ def settled(placed: Sequence[Place]) -> Content:
             f"places {len(placed):,} objects of {triangles:,} triangles in all, of at most "
             f"{MOST_TRIANGLES:,}: {SMALLER}"
         )
-    matrices = np.array([matrix for _, matrix, _ in placed]).reshape(-1, 4, 4)
+    matrices = np.array([place.matrix for place in placed]).reshape(-1, 4, 4)
     good = np.isfinite(matrices).all(axis=(1, 2)) & (matrices[:, 3] == [0, 0, 0, 1]).all(axis=1)
     if not good.all():
-        _, matrix, name = placed[int(good.argmin())]
+        _, matrix, name, _ = placed[int(good.argmin())]
         raise MeshFileError(
             f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
         )
     ranks = np.linalg.matrix_rank(matrices[:, :3, :3])
-    for (mesh, matrix, name), rank in zip(placed, ranks.tolist(), strict=True):
+    for (mesh, matrix, name, _), rank in zip(placed, ranks.tolist(), strict=True):
         if rank < 2:
             content.skipped.append(name)
         elif mesh in shared and rank == 3:

@@ -24,7 +24,7 @@ from .colours import WHITE, Colours, as_bytes, joined
 from .masks import Colour, MaskNotes
 from .mesh import Cutout, Mesh
 from .mtl import Materials, ObjTexture
-from .nodes import Content, MeshFileError
+from .nodes import Content, MeshFileError, Wanted
 from .polygons import check_corners, triangulated
 
 Float = NDArray[np.float64]
@@ -102,12 +102,13 @@ class _Object(_Placed):
     masked: dict[bytes, _Placed] = field(default_factory=dict)  # {material: polygons}
 
 
-def read_obj(data: bytes, path: Path, masks: bool = True, colours: bool = False) -> Content:
+def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read a Wavefront file: an object for each name after 'o', or 'g' without any 'o'.
 
-    Objects are in order of their first face; materials do not divide them. Without `masks`,
-    triangles are solid; without both, neither materials nor images are read.
+    Objects are in order of their first face; materials do not divide them. Without masks,
+    triangles are solid; without these and colours, neither materials nor images are read.
     """
+    masks, colours, _ = wanted
     text = data.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     text = text.replace(b"\\\n", b" ").replace(b"\t", b" ")
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
@@ -117,7 +118,7 @@ def read_obj(data: bytes, path: Path, masks: bool = True, colours: bool = False)
     used = _obj_names(b"usemtl", text) if masks or colours else []
     kinds = {name: kind for kind, name in enumerate(dict.fromkeys([b"", *used]))}
     if (masks or colours) and (libraries := _obj_names(b"mtllib", text)):
-        materials = Materials(path, len(data), notes, libraries)
+        materials = Materials(path, len(data), notes, libraries, wanted)
         textures = materials.masks(used) if masks else {}
         paint.shades = materials.colours(used) if colours else {}
     numbers, coordinates, tints = array("d"), array("d"), array("d")
@@ -251,8 +252,8 @@ def _shown(line: bytes) -> str:
 _OFF = re.compile(rb"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
 
 
-def read_off(data: bytes, path: Path, colours: bool = False) -> Content:
-    """Read an Object File Format file: one mesh; `colours` are those of vertices (COFF)."""
+def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
+    """Read an Object File Format file: one mesh; colours are those of vertices (COFF)."""
     text = re.sub(rb"#[^\r\n]*", b"", data).lstrip()
     found = _OFF.match(text)
     text = text[found.end() if found else 0 :]
@@ -269,7 +270,7 @@ def read_off(data: bytes, path: Path, colours: bool = False) -> Content:
             f"{len(lines):,} lines there"
         )
     numbers, tints, polygon = array("d"), array("d"), _Polygons()
-    coloured = colours and found is not None and found[0].upper() == b"COFF"
+    coloured = wanted.colours and found is not None and found[0].upper() == b"COFF"
     for line in lines[:points]:
         if len(line) < 3:
             raise ValueError(f"a vertex has {len(line)} numbers")
@@ -301,7 +302,7 @@ def _tinted(shares: Float, faces: Int) -> Colours:
 # -- .stl ----------------------------------------------------------------------------------------
 
 
-def read_stl(data: bytes, path: Path) -> Content:
+def read_stl(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read a stereolithography file: one mesh if binary, one for each solid if text."""
     announced = int.from_bytes(data[80:84], "little")
     # A few more bytes may follow; in a text file the number does not fit.
@@ -356,10 +357,10 @@ class _Element:
     properties: dict[str, tuple[str, str]] = field(default_factory=dict)
 
 
-def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
+def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
     """Read a Stanford polygon file: text or binary, faces of any mixture.
 
-    `colours` are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
+    Colours are red, green and blue of its vertices: integers, or real numbers from 0 to 1 or 255.
     """
     elements, order, body = _ply_header(data)
     counts = {element.name: element.count for element in elements}
@@ -386,7 +387,7 @@ def read_ply_mesh(data: bytes, path: Path, colours: bool = False) -> Content:
     if not np.array_equal(corners, numbers):
         raise ValueError("vertex indices of faces are not whole numbers")
     faces, shown = triangulated(vertices, corners, sizes), None
-    if colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
+    if wanted.colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
         given = np.stack([rows["vertex"][name][0] for name in _PLY_COLOURS], axis=1)
         given, kind = given.astype(np.float64), np.dtype(kinds["red"])
         # Integers of four bytes hold 0 to 255, too.

@@ -105,7 +105,8 @@ def read_raster(
             f"has heights from {low:,.6g} to {high:,.6g} m: if one of them stands for no data, say "
             "so in the file (rio edit-info --nodata VALUE FILE)"
         )
-    return Content([mesh], 1.0, "z", notes=notes, raster=Raster(*_key(grid.target), told))
+    raster = Raster(*_key(grid.target), told)
+    return Content([mesh], unit_m=1.0, up_axis="z", notes=notes, raster=raster)
 
 
 @contextmanager

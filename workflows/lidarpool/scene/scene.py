@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import logging
+from collections.abc import Callable, Iterable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -14,19 +15,21 @@ from numpy.typing import NDArray
 from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.errors import LidarpoolError
 from ..base.words import counted
-from ..sensor import Pose
+from ..sensor import Pose, Track
 from . import colours as coloured
 from .actors import Actor
 from .colours import Colours
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
-from .meshfile import Opacity, load_meshes
+from .meshfile import Objects, Opacity, load_objects
 from .rasters import Window
 from .shapes import seed_objects
 from .transform import Transform
 
 # Single precision, which ray casters use, resolves a millimetre up to this distance.
 FAR_FROM_ZERO_M = 10_000.0
+
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,6 +129,7 @@ class Scene:
         step_m: float | None = None,
         window: Window | None = None,
         epsg: int | None = None,
+        assets: str | Path | None = None,
     ) -> Scene:
         """Read a scene file, such as .glb, .obj, .usd, CityJSON, or a raster of heights (.tif).
 
@@ -144,31 +148,53 @@ class Scene:
             `lidarpool.scene.transform.Transform`.
         opacity
             With "mask", light passes where the image of a material is transparent (.glb, .gltf,
-            .obj). With "ignore", triangles are solid, and no image is read.
+            .obj, .usd). With "ignore", triangles are solid, and no image is read.
         colours
-            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, CityJSON without
-            images), and colours of vertices (.glb, .gltf, .obj, .ply, .off).
+            Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON
+            without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off, .usd).
         step_m, window, epsg
-            Of a raster: see `lidarpool.scene.meshfile.load_meshes`.
+            Of a raster: see `lidarpool.scene.meshfile.load_objects`.
+        assets
+            A folder: files that the file names are read from here and below, and from its own
+            folder and below.
+
+        Returns
+        -------
+        Objects of .usd that move are its actors, if others stand.
 
         Raises
         ------
         LidarpoolError
             If the file cannot be read completely, or has no triangles.
         """
-        return cls.from_meshes(
-            load_meshes(
-                path,
-                unit=unit,
-                up_axis=up_axis,
-                transform=transform,
-                opacity=opacity,
-                colours=colours,
-                step_m=step_m,
-                window=window,
-                epsg=epsg,
-            )
+        found = load_objects(
+            path,
+            unit=unit,
+            up_axis=up_axis,
+            transform=transform,
+            opacity=opacity,
+            colours=colours,
+            step_m=step_m,
+            window=window,
+            epsg=epsg,
+            assets=assets,
         )
+        return cls.of_objects(found)
+
+    @classmethod
+    def of_objects(cls, objects: Objects, tell: Callable[[str], None] = _log.warning) -> Scene:
+        """Make a scene of the objects of mesh files; `tell` is called if none stands."""
+        if not objects.standing:
+            lost = "nothing stands in the scene, and without that nothing moves: "
+            return cls.from_meshes(objects.still(lambda line: tell(lost + line)))
+        scene = cls.from_meshes(objects.standing)
+        local = []
+        for actor in objects.moving:
+            track = actor.trajectory
+            assert isinstance(track, Track)
+            track = replace(track, positions=track.positions - scene.origin)
+            local.append(replace(actor, trajectory=track))
+        return scene.with_actors(local) if local else scene
 
     @classmethod
     @checked
@@ -308,6 +334,19 @@ class Scene:
         found = [self.colours, *(part.colours for part in parts)]
         found += [actor.mesh.colours for actor in self.actors]
         return [colours for colours in found if colours is not None]
+
+    @property
+    def has_colours(self) -> NDArray[np.bool_]:
+        """Whether each object, actors after the others, has a colour: (objects,)."""
+        found = np.zeros(len(self.all_names), np.bool_)
+        if (own := self.colours) is not None:
+            grey = np.array([image is coloured.GREY for image in own.images])
+            found[self.face_object[~grey[own.image]]] = True
+        if (shared := self.instances) is not None:
+            some = np.array([part.colours is not None for part in shared.parts])
+            found[shared.owner[some[shared.part]]] = True
+        found[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
+        return found
 
     @property
     def triangles(self) -> int:

@@ -25,11 +25,12 @@ SUFFIXES = (".ply", ".glb", ".obj")
 def write_scene(path: str | Path, scene: Scene) -> Path:
     """Write a scene to a mesh file that `Scene.load` can read.
 
-    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks are kept in
-    .glb only: in the others, triangles are solid. All store metres; .glb is Y-up, by its standard,
-    the others are Z-up. Coordinates are those of the world; .ply and .glb have single precision,
-    .glb from the scene's origin. A comment, or the generator of .glb, tells `load_meshes` who wrote
-    it. An existing file is replaced only by a complete one.
+    A .ply holds one object without a name; .glb and .obj keep objects and names. Masks and colours
+    are kept in .glb only: in the others, triangles are solid and grey. Where a triangle has both a
+    mask and a texture, its colour is the texture's mean. All store metres; .glb is Y-up, by its
+    standard, the others are Z-up. Coordinates are those of the world; .ply and .glb have single
+    precision, .glb from the scene's origin. A comment, or the generator of .glb, tells
+    `load_meshes` who wrote it. An existing file is replaced only by a complete one.
 
     Raises
     ------

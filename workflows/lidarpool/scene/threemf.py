@@ -1,4 +1,6 @@
-"""3MF files, after its core specification and production extension by the 3MF Consortium (2018).
+"""3MF files, after its core specification and its production and materials extensions.
+
+By the 3MF Consortium (2018).
 
 This is not trimesh, which follows nested components only to some depth and confuses parts of inner
 files; nor assimp 5.4, which reads no parts of inner files, ignores required extensions, and ends
@@ -12,7 +14,7 @@ import re
 import zipfile
 from array import array
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -22,9 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.words import counted
 from ..base.xmlfile import refuse_entity
+from .colours import GREY, WHITE, Colours
 from .mesh import Mesh
-from .nodes import SMALLER, Content, MeshFileError, Node, instances, settled
+from .nodes import SMALLER, Content, MeshFileError, Node, Wanted, instances, settled
 
 _UNITS_M = {
     "micron": 1e-6,
@@ -40,6 +44,8 @@ _READ = re.compile(r"/(material|production|securecontent)/")
 _PIECE = 1 << 20
 _OBJECT_BYTES = 1000  # of an object or its placement, which a few letters make
 
+_COLOUR = re.compile(r"#([0-9A-Fa-f]{6})([0-9A-Fa-f]{2})?")  # sRGB, and an alpha that is not read
+
 _Key = tuple[str, str]  # inner file and number of an object
 
 
@@ -49,6 +55,11 @@ class _Object:
     vertices: array[float] = field(default_factory=lambda: array("d"))
     faces: array[int] = field(default_factory=lambda: array("q"))
     components: list[_Placement] = field(default_factory=list)
+    # Group of colours, and number in it, of triangles that name none.
+    usual: tuple[str, str] = ("", "0")
+    shades: array[int] = field(
+        default_factory=lambda: array("B")
+    )  # of corners, where they are read
 
     @cached_property
     def meshes(self) -> list[Mesh]:
@@ -56,7 +67,11 @@ class _Object:
         if not self.faces:
             return []
         vertices = np.frombuffer(self.vertices, np.float64).reshape(-1, 3)
-        return [Mesh(self.name, vertices, np.frombuffer(self.faces, np.int64).reshape(-1, 3))]
+        faces, colours = np.frombuffer(self.faces, np.int64).reshape(-1, 3), None
+        corners = np.frombuffer(self.shades, np.uint8).reshape(-1, 3, 3)
+        if (corners != GREY).any():
+            colours = replace(Colours.plain(WHITE, len(faces)), corners=corners)
+        return [Mesh(self.name, vertices, faces, colours=colours)]
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,10 +81,10 @@ class _Placement:
     matrix: NDArray[np.float64]
 
 
-def read_3mf(data: bytes, path: Path) -> Content:
-    """Read the build items of a file."""
+def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:
+    """Read the build items of a file, and colours of base materials and colour groups."""
     with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        package = _Package(archive, Allowance(len(data), SMALLER))
+        package = _Package(archive, Allowance(len(data), SMALLER), wanted.colours)
         root = package.model(package.start())
 
         def node(place: _Placement) -> Node:
@@ -78,15 +93,18 @@ def read_3mf(data: bytes, path: Path) -> Content:
 
         content = settled(instances(root.items, node, path.stem))
     content.unit_m, content.up_axis = _UNITS_M[root.unit], "z"
+    if bare := sum(model.bare for model in package.models.values()):
+        words = counted(bare, "triangle")
+        content.notes.append(f"has textures or lacks colours, which leaves {words} grey")
     return content
 
 
 class _Package:
     """The inner files of an archive, each read when an object of it is placed."""
 
-    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance) -> None:
-        self._archive, self._allowance = archive, allowance
-        self._models: dict[str, _Model] = {}
+    def __init__(self, archive: zipfile.ZipFile, allowance: Allowance, colours: bool) -> None:
+        self._archive, self._allowance, self._colours = archive, allowance, colours
+        self.models: dict[str, _Model] = {}
 
     def start(self) -> str:
         """Inner file of the model that is to be built."""
@@ -105,9 +123,10 @@ class _Package:
 
     def model(self, name: str) -> _Model:
         name = name.lstrip("/")
-        if name not in self._models:
-            self._models[name] = _Model(name, self._pieces(name), self._allowance)
-        return self._models[name]
+        if name not in self.models:
+            pieces = self._pieces(name)
+            self.models[name] = _Model(name, pieces, self._allowance, self._colours)
+        return self.models[name]
 
     def _pieces(self, name: str) -> Iterator[bytes]:
         """Content of an inner file, which is never longer than announced."""
@@ -132,8 +151,14 @@ class _Model:
     The parser makes no tree, which would take ten times the file's size.
     """
 
-    def __init__(self, name: str, text: Iterable[bytes], allowance: Allowance) -> None:
+    def __init__(
+        self, name: str, text: Iterable[bytes], allowance: Allowance, colours: bool
+    ) -> None:
         self.unit = "millimeter"
+        self.bare = 0  # triangles whose colours are not here
+        self._colours = colours
+        self._groups: dict[str, list[bytes]] = {}  # {number of a group: its colours}
+        self._group: list[bytes] = []
         self.objects: dict[str, _Object] = {}
         self.items: list[_Placement] = []
         self._name, self._allowance = name, allowance
@@ -152,9 +177,17 @@ class _Model:
             self._object.vertices.extend([float(attributes[axis]) for axis in "xyz"])
         elif tag == "triangle":
             self._object.faces.extend([int(attributes[corner]) for corner in ("v1", "v2", "v3")])
+            if self._colours:
+                self._shade(attributes)
+        elif tag in ("basematerials", "colorgroup"):
+            self._group = self._groups.setdefault(attributes["id"], [])
+        elif tag in ("base", "color"):
+            found = _COLOUR.fullmatch(attributes.get("displaycolor", attributes.get("color", "")))
+            self._group.append(bytes.fromhex(found[1]) if found else GREY.tobytes())
         elif tag == "object":
             self._allowance.take(_OBJECT_BYTES)
             self._object = _Object(attributes.get("name", ""))
+            self._object.usual = attributes.get("pid", ""), attributes.get("pindex", "0")
             self.objects[attributes["id"]] = self._object
         elif tag == "component":
             self._object.components.append(self._placement(attributes))
@@ -168,6 +201,17 @@ class _Model:
                     raise MeshFileError(f"needs {extension[:80]}, which is not supported")
         elif tag in ("beamlattice", "booleanshape", "levelset"):
             raise MeshFileError(f"has a <{tag}>, which is not supported: export it as triangles")
+
+    def _shade(self, attributes: dict[str, str]) -> None:
+        """Add the colours of a triangle's corners, grey if it has none."""
+        group, number = self._object.usual
+        group, first = attributes.get("pid", group), attributes.get("p1", number)
+        places = [int(attributes.get(name, first)) for name in ("p1", "p2", "p3")]
+        colours = self._groups.get(group, [])
+        known = all(0 <= place < len(colours) for place in places)
+        self.bare += bool(group) and not known
+        for place in places:
+            self._object.shades.frombytes(colours[place] if known else GREY.tobytes())
 
     def _placement(self, attributes: dict[str, Any]) -> _Placement:
         self._allowance.take(_OBJECT_BYTES)

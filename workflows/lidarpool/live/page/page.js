@@ -326,7 +326,7 @@ function buildPanel() {
   );
   panel.legend = element("div");
   const points = section("Points", true,
-    (panel.colour = menu("colour", [...columns, HIDDEN], chosen.colour, (value) => { chosen.colour = value; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
+    (panel.colour = menu("colour", [...state.colours, HIDDEN], chosen.colour, (value) => { chosen.colour = value; legendText = ""; refresh(); if (value === HIDDEN) showLegend(null); })),
     panel.legend,
     slider("size", -1, 1, 0.05, Math.log10(chosen.size), (value) => `${(10 ** value).toFixed(1)}×`, (value) => {
       chosen.size = picture.pointScale = 10 ** value;
@@ -406,7 +406,7 @@ async function loadSurface() {
   if (!state.scene) return;
   const hidden = chosen.scene === HIDDEN;
   picture.actorsHidden = hidden;
-  picture.colourActors(chosen.scene === "object");
+  picture.colourActors(chosen.scene);
   const told = hidden ? null : await ask("surface", { colour: chosen.scene });
   if (hidden !== (chosen.scene === HIDDEN)) return;
   picture.setSurface(told);
@@ -675,7 +675,7 @@ async function copyLink() {
 function readLink() {
   const words = new URLSearchParams(location.hash.slice(1));
   const columns = state.columns.map((column) => column.name), get = (name) => words.get(name) ?? "";
-  if ([...columns, HIDDEN].includes(get("colour"))) chosen.colour = get("colour");
+  if ([...state.colours, HIDDEN].includes(get("colour"))) chosen.colour = get("colour");
   if ([...(state.scene ?? []), HIDDEN].includes(get("scene"))) chosen.scene = get("scene");
   if (SHOWS.some(([value]) => `${value}` === get("show"))) { chosen.show = get("show"); clock.own = true; }
   if (get("size")) chosen.size = picture.pointScale = Math.min(10, Math.max(0.1, +get("size") || 1));
@@ -726,7 +726,8 @@ function takeState(told) {
   }
   picture.setSensors(own);
   picture.setActors(state.actors.map((actor, k) => ({
-    ...actor, object: state.statics + k, colour: state.actor_colours[k], corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`],
+    ...actor, object: state.statics + k, colour: state.actor_colours[k],
+    corners: arrays[`mesh${arrays.actor_mesh[k]}_corners`], own: arrays[`mesh${arrays.actor_mesh[k]}_colours`],
     times: arrays[`actor${k}_times`], places: arrays[`actor${k}_places`], turns: arrays[`actor${k}_turns`],
     there: arrays[`actor${k}_there`],
   })));

@@ -308,6 +308,7 @@ export class Picture {
       made.set(actor.corners, geometry);
       actor.shown = !this.actorsHidden;
       geometry.setAttribute("position", new THREE.BufferAttribute(actor.corners, 3));
+      if (actor.own) geometry.setAttribute("color", new THREE.BufferAttribute(actor.own, 3, true));
       const material = new THREE.MeshLambertMaterial({ flatShading: true, side: THREE.DoubleSide, clippingPlanes: this.planes });
       actor.mesh = new THREE.Mesh(geometry, material);
       actor.mesh.frustumCulled = false;
@@ -317,11 +318,16 @@ export class Picture {
     }
   }
 
-  colourActors(coloured) {
+  // by: "object" for a colour each, "colour" for those of their files
+  colourActors(by) {
     for (const actor of this.actors) {
-      actor.coloured = coloured;
-      if (coloured) actor.mesh.material.color.setRGB(...actor.colour.map((byte) => byte / 255));
-      else actor.mesh.material.color.set(THEMES[this.theme].surface);
+      const { material } = actor.mesh, own = by === "colour" && actor.own;
+      actor.coloured = by === "object" || own;
+      material.vertexColors = Boolean(own);
+      if (own) material.color.set(0xffffff);
+      else if (by === "object") material.color.setRGB(...actor.colour.map((byte) => byte / 255));
+      else material.color.set(THEMES[this.theme].surface);
+      material.needsUpdate = true;
     }
     this.dirty = true;
   }

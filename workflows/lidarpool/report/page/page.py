@@ -208,7 +208,8 @@ def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[tuple[Marku
     captions = {
         "scene": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
         f"{poses} in red{halfway}.",
-        "intensity": f"The {counted(report['hits'], 'hit')} per square metre, and some rays.",
+        "hits": f"The {counted(report['hits'], 'hit')} per square metre, and some rays.",
+        "intensity": "The light that came back, of each point; gaps between points are closed.",
         "cloud": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
         f"{parameters['precision_m']:g} m.",
         "path": "The planned path and those of the other trials, from above.",
