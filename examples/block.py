@@ -23,7 +23,7 @@ from lidarpool.scene.plants import SPECIES, tree
 Array = NDArray[np.float64]
 
 EAST, NORTH = 691_000.0, 5_334_000.0  # middle of the block, EPSG:25832
-HALF, CORNER, WIDTH = 60.0, 14.0, 8.0  # of the street around the block, metres
+HALF, CORNER, WIDTH = 100.0, 14.0, 8.0  # of the street around the block, metres
 LIFT = 0.04  # of the street above the hills
 TREES, CARS, SECONDS = 500, 100, 12
 STREET_AT = 0.5  # of the file's steps, seconds
@@ -69,7 +69,7 @@ def traffic(path: Path) -> None:
     cars = np.arange(CARS)
     ahead = cars % 2 == 0
     begin = (cars // 2) * LENGTH / (CARS / 2)
-    speed = np.where(ahead, 6.0, -5.0)
+    speed = np.where(ahead, 1.5, -1.2)  # it is dense
     for time in np.arange(0, SECONDS + STREET_AT, STREET_AT):
         lines.append(f'  <timestep time="{time:.2f}">')
         # On the right: outside, if it goes counter-clockwise.
@@ -220,8 +220,8 @@ def block(path: Path) -> None:
         made.texture(crossing, crossing_image(), "block-crossing.png")
     rng = np.random.default_rng(3)
     taken = []
-    for number, (x, y) in enumerate((x, y) for x in (-42, -18, 24) for y in (-42, -14, 14)):
-        size = np.array([*(3 * rng.integers(4, 7, 2)), 3 * rng.integers(3, 8)], np.float64)
+    for number, (x, y) in enumerate((x, y) for x in (-84, -40, 4, 56) for y in (-84, -48, 16, 60)):
+        size = np.array([*(3 * rng.integers(5, 9, 2)), 3 * rng.integers(3, 7)], np.float64)
         low = np.array([x, y, float(height(np.array(x), np.array(y)))])
         points, corners, uv = building(low, size)
         house = made.mesh(f"House_{number + 1}", points, corners, uv)
@@ -250,8 +250,8 @@ def trees(made: Block, rng: np.random.Generator, taken: list[tuple[float, ...]])
     leaves = len(shape.faces) - 13 * 10 * 40
     brown, green = (0.10, 0.06, 0.04), (0.09, 0.22, 0.04)
     made.colour(maple, [brown] * leaves + [green] * (len(shape.faces) - leaves))
-    along = np.arange(0, LENGTH, LENGTH / 60)
-    avenue = [ring(along, side)[:2] for side in (WIDTH / 2 + 3, -WIDTH / 2 - 3)]
+    along = np.arange(0, LENGTH, LENGTH / 80)
+    avenue = [ring(along, side)[:2] for side in (WIDTH / 2 + 3.5, -WIDTH / 2 - 3.5)]
     x, y = (np.concatenate(axis) for axis in zip(*avenue, strict=True))
     places = list(zip(x.tolist(), y.tolist(), strict=True))
     while len(places) < TREES:
@@ -259,7 +259,7 @@ def trees(made: Block, rng: np.random.Generator, taken: list[tuple[float, ...]])
         inside = max(abs(x), abs(y)) < HALF - 14
         outside = max(abs(x), abs(y)) > HALF + 45
         free = not any(a < x < c and b < y < d for a, b, c, d in taken)
-        if (outside or (inside and free and y > -6)) and len(places) < TREES:
+        if (outside or (inside and free and abs(y) < 14)) and len(places) < TREES:
             places.append((x, y))
     x, y = np.array(places).T
     points = np.column_stack([x, y, height(x, y)]).astype(np.float32)
