@@ -30,6 +30,7 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
+    load_robot,
     load_sensor,
     load_trajectory,
     read_cloud,
@@ -125,6 +126,7 @@ WRONG = {
         ("Car", None, "pose is None"),
         ("Car", AT[0], "no actor or instance 'Car'"),
     ],
+    load_robot: [(3, "path is 3"), (["a.urdf"], "text or a path"), (None, "None; it must")],
     Scene.load: [(3, "path is 3"), (["a.glb"], "text or a path"), (None, "None; it must")],
     Sensor: [
         ("vlp16", "beams"),
@@ -190,8 +192,8 @@ def test_options_of_a_survey_are_checked_too():
 
 
 def test_nothing_public_is_left_out():
-    """But for what only runs make."""
-    made = {"Frame", "Plan", "Result", "ScanSpec", "LidarpoolError", "__version__"}
+    """But for what only runs make, or a reader of files."""
+    made = {"Frame", "Plan", "Result", "Robot", "ScanSpec", "LidarpoolError", "__version__"}
     public = {getattr(lidarpool, name) for name in {*lidarpool.__all__} - made}
     assert public <= {*WRONG}
     assert all(len(calls) >= 3 for calls in WRONG.values())

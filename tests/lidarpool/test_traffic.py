@@ -217,13 +217,16 @@ def test_traffic_stands_on_surfaces_and_is_absent_beside_them(tmp_path):
     np.testing.assert_allclose(turns[0, :, 0], UPHILL, atol=1e-9)
 
 
-def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path):
+@pytest.mark.parametrize("far", [(0, 0, 0), (690_000, 5_330_000, 4_000)])
+def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     (tmp_path / "ramp.obj").write_text(RAMP)
-    points = [{"time_s": t, "position": [18 - 2 * t, 5, 0.3]} for t in (0, 8)]
+    x, y, z = far
+    points = [{"time_s": t, "position": [x + 18 - 2 * t, y + 5, 0.3]} for t in (0, 8)]
 
     def read(points):
+        scene = {"files": {"file": "ramp.obj", "translation": far}}
         return Scenario.from_data(
-            {"scene": "ramp.obj", "trajectory": {"points": points, "surfaces": "Ramp"}},
+            {"scene": scene, "trajectory": {"points": points, "surfaces": "Ramp"}},
             folder=tmp_path,
         )
 
@@ -232,10 +235,10 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path):
     path = downhill.survey(scene).path
     assert path.duration_ns == 8e9
     places, turns = path.poses(0, np.array([0, 1.3e9, 8e9]))
-    np.testing.assert_allclose(places[:, 2], [2.1, 1.84, 0.5], atol=1e-9)
-    np.testing.assert_allclose(turns[:, :, 0], np.tile(-UPHILL, (3, 1)), atol=1e-9)
-    np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-9)
-    points[1]["position"] = [30, 5, 0]
+    np.testing.assert_allclose(places[:, 2] + scene.origin[2] - z, [2.1, 1.84, 0.5], atol=1e-6)
+    np.testing.assert_allclose(turns[:, :, 0], np.tile(-UPHILL, (3, 1)), atol=1e-6)
+    np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-6)
+    points[1]["position"] = [x + 30, y + 5, 0]
     with pytest.raises(LidarpoolError, match=r"leaves its surfaces \(Ramp\)"):
         read(points).survey(scene)
 

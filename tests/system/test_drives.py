@@ -33,11 +33,11 @@ BAD = [
     ("trajectory: {points: [{position: [0, 0, 0]}]}", "", "time_s is missing"),
     ("trajectory: t.txt\nposes: [[0, 0, 1]]", LINE, "either poses or a trajectory"),
     ("sensors: {a: {}}\nmount: {yaw_deg: 3}", "", "either sensor and mount, or sensors"),
-    (CAR % "", "", r"actors\[0\].trajectory is missing"),
+    (CAR % "", "", "actor 'Car' has no trajectory: give it one, or give the survey"),
     (CAR % ", trajectory: t.txt", LINE, "actor 'Car': .* start_s is 0 s, 1 s outside"),
     (CAR % ", trajectory: {file: t.txt, start_s: 1}", LINE, "give offset_s"),
     (CAR % (", trajectory: {points: [" + POINTS + "]}") + "\nsteps: 150", "", "0.25 s outside"),
-    ("actors: [{name: Car, file: no.stl, trajectory: t.txt}]", LINE, "no.stl does not exist"),
+    ("actors: [{name: Car, file: no.stl, trajectory: t.txt}]", "0 " + LINE[2:], "no.stl does not"),
 ]
 
 

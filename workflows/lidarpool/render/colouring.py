@@ -20,7 +20,9 @@ MOST_COLOURS = 1 << 16  # of labels
 RGB = Column("rgb", "uint32", "", "colours of the surfaces")  # see `values_of`
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
-_SKEWED = 0.1  # a median this low in its range: the scale is logarithmic
+# The scale is logarithmic if the median is this low in its range, or if numbers without a unit,
+# such as intensities, differ by such a factor.
+_SKEWED, _MANIFOLD = 0.1, 30.0
 _TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 
@@ -57,8 +59,8 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
     """Choose colours for the values (n,) of a column; `names` are those of its values 0, 1, 2, ….
 
     Labels have a colour each; labels without names and with too many values for a legend are on a
-    scale like numbers. Numbers that are mostly small with a few large ones, such as intensities,
-    have a logarithmic scale. NaN is grey.
+    scale like numbers. Numbers that are mostly small with a few large ones, and intensities of a
+    wide range, have a logarithmic scale. NaN is grey.
     """
     if column is RGB:
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
@@ -92,7 +94,8 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
         span = high - low
         unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
         low, middle, high = low / size, middle / size, high / size
-    logarithmic = bool(low > 0 and middle - low < _SKEWED * (high - low))
+    skewed = middle - low < _SKEWED * (high - low)
+    logarithmic = bool(low > 0 and (skewed or (not unit and high > _MANIFOLD * low)))
     ends = np.log([low, high]) if logarithmic else (low, high)
 
     def shade(values: NDArray[Any]) -> NDArray[np.float64]:

@@ -70,7 +70,9 @@ class Standing:
     def _tops(self) -> tuple[Float, NDArray[np.int32]]:
         """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
         assert self._scene is not None
-        drawn = Drawn.of(self._scene).scene
+        drawn, shared = self._scene, self._scene.instances
+        if shared and (self._objects is None or np.isin(shared.owner, self._objects).any()):
+            drawn = Drawn.of(drawn).scene
         corners, owner = drawn.vertices[drawn.faces], drawn.face_object
         if self._objects is not None:
             own = np.isin(owner, self._objects)
@@ -150,14 +152,14 @@ def following(track: Track, standing: Standing) -> list[Track]:
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     probes = [places[:, :2] + STEP_M * way for way in (0 * ahead, ahead, -ahead, left, -left)]
     origin = standing.origin
-    heights = [standing.under(probe + origin[:2])[0] - origin[2] for probe in probes]
+    heights = [standing.under(probe + origin[:2])[0] for probe in probes]
     middle, front, back, port, starboard = (np.where(np.isnan(h), heights[0], h) for h in heights)
     x = np.column_stack([2 * STEP_M * ahead, front - back])
     y = np.column_stack([2 * STEP_M * left, port - starboard])
     x /= np.linalg.norm(x, axis=1)[:, None]
     z = np.cross(x, y)
     z /= np.linalg.norm(z, axis=1)[:, None]
-    places[:, 2] += middle
+    places[:, 2] += middle  # of the world: what it is added to is less the origin
     axes = np.stack([x, np.cross(z, x), z], axis=2)
     edges = np.flatnonzero(np.diff(np.isfinite(middle), prepend=False, append=False))
     runs = [slice(*ends) for ends in edges.reshape(-1, 2).tolist() if ends[1] - ends[0] > 1]

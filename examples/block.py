@@ -1,0 +1,279 @@
+"""Makes the files of block.yaml: a city block in OpenUSD, hills as GeoTIFF, and a hundred cars.
+
+    python block.py [FOLDER]
+
+It needs the extras [usd] and [geo].
+"""
+
+from __future__ import annotations
+
+import gzip
+import sys
+from pathlib import Path
+
+import numpy as np
+import rasterio
+from numpy.typing import NDArray
+from PIL import Image
+from pxr import Gf, Sdf, Usd, UsdGeom, UsdShade, Vt
+from rasterio.transform import from_origin
+
+from lidarpool.scene.plants import SPECIES, tree
+
+Array = NDArray[np.float64]
+
+EAST, NORTH = 691_000.0, 5_334_000.0  # middle of the block, EPSG:25832
+HALF, CORNER, WIDTH = 100.0, 14.0, 8.0  # of the street around the block, metres
+LIFT = 0.04  # of the street above the hills
+TREES, CARS, SECONDS = 500, 100, 12
+STREET_AT = 0.5  # of the file's steps, seconds
+
+
+def height(x: Array, y: Array) -> Array:
+    """Height of the hills."""
+    return np.asarray(512 + 1.6 * np.sin(x / 47) + 1.1 * np.cos(y / 39))
+
+
+def ring(way: Array, aside: Array | float = 0.0) -> tuple[Array, Array, Array]:
+    """Points on the street's middle line, counter-clockwise: x, y, and the direction of travel."""
+    straight, arc = 2 * (HALF - CORNER), np.pi / 2 * CORNER
+    side, rest = np.divmod(way % (4 * (straight + arc)), straight + arc)
+    turn = np.clip((rest - straight) / CORNER, 0, np.pi / 2)
+    along = np.minimum(rest, straight) - straight / 2
+    x = along + (CORNER + aside) * np.sin(turn)
+    y = -HALF + CORNER - (CORNER + aside) * np.cos(turn)
+    # Each side is the first one, turned.
+    angle = side * np.pi / 2
+    c, s = np.cos(angle), np.sin(angle)
+    return c * x - s * y, s * x + c * y, angle + turn
+
+
+LENGTH = 4 * (2 * (HALF - CORNER) + np.pi / 2 * CORNER)
+
+
+def raster(path: Path) -> None:
+    """Write the hills, 200 x 200 pixels of 2 m."""
+    at = np.arange(-199.0, 200, 2)
+    heights = height(at[None, :], at[::-1, None])
+    place = from_origin(EAST - 200, NORTH + 200, 2, 2)
+    with rasterio.open(
+        path, "w", driver="GTiff", width=200, height=200, count=1, dtype="float32",
+        crs="EPSG:25832", transform=place, compress="deflate", predictor=3,
+    ) as file:  # fmt: skip
+        file.write(heights.astype("float32"), 1)
+
+
+def traffic(path: Path) -> None:
+    """Write floating car data, as SUMO does: two lanes against each other, without accidents."""
+    lines = ['<?xml version="1.0" encoding="UTF-8"?>', "<fcd-export>"]
+    cars = np.arange(CARS)
+    ahead = cars % 2 == 0
+    begin = (cars // 2) * LENGTH / (CARS / 2)
+    speed = np.where(ahead, 1.5, -1.2)  # it is dense
+    for time in np.arange(0, SECONDS + STREET_AT, STREET_AT):
+        lines.append(f'  <timestep time="{time:.2f}">')
+        # On the right: outside, if it goes counter-clockwise.
+        x, y, yaw = ring(begin + speed * time, np.where(ahead, WIDTH / 4, -WIDTH / 4))
+        yaw = np.where(ahead, yaw, yaw + np.pi)
+        for car in cars:
+            kind = "van" if car % 9 == 4 else "car"
+            angle = (90 - np.degrees(yaw[car])) % 360
+            lines.append(
+                f'    <vehicle id="{kind}.{car}" x="{x[car] + EAST:.2f}" '
+                f'y="{y[car] + NORTH:.2f}" angle="{angle:.2f}" type="{kind}" slope="0"/>'
+            )
+        lines.append("  </timestep>")
+    lines.append("</fcd-export>\n")
+    path.write_bytes(gzip.compress("\n".join(lines).encode(), mtime=0))
+
+
+def street_image() -> Image.Image:
+    """Paint 12 m of the street, 2 cm a pixel: asphalt, edge lines, and a dashed middle line."""
+    image = np.random.default_rng(1).choice([78.0, 86.0, 94.0], (400, 600), p=[0.1, 0.8, 0.1])
+    for edge in (14, 380):
+        image[edge : edge + 6] = 235
+    image[196:204, :200] = 235
+    return Image.fromarray(image.astype(np.uint8))
+
+
+def crossing_image() -> Image.Image:
+    """Paint a crossing: half-metre bars."""
+    image = np.full((400, 200), 84, np.uint8)
+    for begin in range(20, 380, 50):
+        image[begin : begin + 25, 15:185] = 238
+    return Image.fromarray(image)
+
+
+def facade_image() -> Image.Image:
+    """Paint a window and the wall around it, 3 x 3 m."""
+    rng = np.random.default_rng(2)
+    image = (
+        np.array([176, 128, 100]) + rng.choice([-14, 0, 10], (150, 150, 1), p=[0.15, 0.7, 0.15])
+    ).clip(0, 255)
+    image[::8] = image[::8] * 0.8
+    image[40:110, 45:105] = (205, 205, 200)
+    image[46:104, 51:99] = (52, 66, 84)
+    return Image.fromarray(image.astype(np.uint8))
+
+
+class Block:
+    """A stage with meshes, textures and point instancers, in metres and Z-up."""
+
+    def __init__(self, path: Path) -> None:
+        self.stage = Usd.Stage.CreateInMemory()
+        self.path = path
+        UsdGeom.SetStageMetersPerUnit(self.stage, 1)
+        UsdGeom.SetStageUpAxis(self.stage, UsdGeom.Tokens.z)
+        self.stage.SetDefaultPrim(UsdGeom.Xform.Define(self.stage, "/Block").GetPrim())
+
+    def mesh(self, name: str, points: Array, corners: Array, uv: Array | None = None) -> Usd.Prim:
+        """Add polygons (n, k) of points (p, 3), perhaps with texture coordinates (p, 2)."""
+        mesh = UsdGeom.Mesh.Define(self.stage, f"/Block/{name}")
+        mesh.CreatePointsAttr(Vt.Vec3fArray.FromNumpy(points.astype(np.float32)))
+        mesh.CreateFaceVertexIndicesAttr(corners.ravel().tolist())
+        mesh.CreateFaceVertexCountsAttr([corners.shape[1]] * len(corners))
+        mesh.CreateSubdivisionSchemeAttr("none")
+        if uv is not None:
+            st = UsdGeom.PrimvarsAPI(mesh).CreatePrimvar(
+                "st", Sdf.ValueTypeNames.TexCoord2fArray, UsdGeom.Tokens.vertex
+            )
+            st.Set(Vt.Vec2fArray.FromNumpy(uv.astype(np.float32)))
+        return mesh.GetPrim()
+
+    def colour(self, prim: Usd.Prim, colours: list[tuple[float, ...]]) -> None:
+        """Give a mesh one colour, or one for each polygon, in linear light."""
+        primvar = UsdGeom.Gprim(prim).CreateDisplayColorPrimvar(
+            UsdGeom.Tokens.uniform if len(colours) > 1 else UsdGeom.Tokens.constant
+        )
+        table = sorted(set(colours))
+        primvar.Set([Gf.Vec3f(*colour) for colour in table])
+        primvar.SetIndices([table.index(colour) for colour in colours])
+
+    def texture(self, prim: Usd.Prim, image: Image.Image, name: str) -> None:
+        """Give a mesh an image, which is written beside the scene."""
+        image.save(self.path.with_name(name), optimize=True)
+        base = f"/Block/Looks/{Path(name).stem.replace('-', '_')}"
+        material = UsdShade.Material.Define(self.stage, base)
+        shaders = {
+            part: UsdShade.Shader.Define(self.stage, f"{base}/{part}")
+            for part in ("surface", "image", "uv")
+        }
+        reads = {"surface": "UsdPreviewSurface", "image": "UsdUVTexture"}
+        for part, shader in shaders.items():
+            shader.CreateIdAttr(reads.get(part, "UsdPrimvarReader_float2"))
+        shaders["uv"].CreateInput("varname", Sdf.ValueTypeNames.String).Set("st")
+        shaders["image"].CreateInput("file", Sdf.ValueTypeNames.Asset).Set(f"./{name}")
+        for side in ("wrapS", "wrapT"):
+            shaders["image"].CreateInput(side, Sdf.ValueTypeNames.Token).Set("repeat")
+        shaders["image"].CreateInput("st", Sdf.ValueTypeNames.Float2).ConnectToSource(
+            shaders["uv"].CreateOutput("result", Sdf.ValueTypeNames.Float2)
+        )
+        shaders["surface"].CreateInput("diffuseColor", Sdf.ValueTypeNames.Color3f).ConnectToSource(
+            shaders["image"].CreateOutput("rgb", Sdf.ValueTypeNames.Float3)
+        )
+        material.CreateSurfaceOutput().ConnectToSource(
+            shaders["surface"].CreateOutput("surface", Sdf.ValueTypeNames.Token)
+        )
+        UsdShade.MaterialBindingAPI.Apply(prim).Bind(material)
+
+    def strip(self, name: str, begin: float, end: float, step: float, lift: float) -> Usd.Prim:
+        """Add a piece of the street; u counts 12 m along it."""
+        along, aside = np.meshgrid(
+            np.arange(begin, end + step / 2, step), np.linspace(-WIDTH / 2, WIDTH / 2, 5),
+            indexing="ij",
+        )  # fmt: skip
+        x, y, _ = ring(along, -aside)
+        points = np.stack([x, y, height(x, y) + lift], axis=-1).reshape(-1, 3)
+        at = np.arange(along.size).reshape(along.shape)
+        corners = np.stack([at[:-1, :-1], at[1:, :-1], at[1:, 1:], at[:-1, 1:]], axis=-1)
+        length = 12.0 if name == "Street" else end - begin
+        uv = np.stack([(along - begin) / length, aside / WIDTH + 0.5], axis=-1).reshape(-1, 2)
+        return self.mesh(name, points, corners.reshape(-1, 4), uv)
+
+
+def building(low: Array, size: Array) -> tuple[Array, Array, Array]:
+    """Walls of a house with a window every 3 m, and a flat roof without: points, corners, uv."""
+    x, y, z = size
+    outline = np.array([[0, 0], [x, 0], [x, y], [0, y], [0, 0]])
+    points, corners, uv = [], [], []
+    for side in range(4):
+        a, b = outline[side], outline[side + 1]
+        wide = round(float(np.linalg.norm(b - a)) / 3)
+        first = len(points)
+        points += [(*a, -4), (*b, -4), (*b, z), (*a, z)]
+        uv += [(0, -4 / 3), (wide, -4 / 3), (wide, z / 3), (0, z / 3)]
+        corners.append(np.arange(first, first + 4))
+    first = len(points)
+    points += [(*p, z) for p in outline[:4]]
+    uv += [(0.02, 0.98)] * 4
+    corners.append(np.arange(first, first + 4))
+    return np.array(points, np.float64) + low, np.array(corners), np.array(uv)
+
+
+def block(path: Path) -> None:
+    """Write the city block, its origin in the middle of the street's square."""
+    made = Block(path)
+    made.texture(made.strip("Street", 0, LENGTH, 1.0, LIFT), street_image(), "block-street.png")
+    for number in range(4):
+        begin = number * LENGTH / 4 + 20
+        crossing = made.strip(f"Crossing_{number + 1}", begin, begin + 4, 1.0, 2 * LIFT)
+        made.texture(crossing, crossing_image(), "block-crossing.png")
+    rng = np.random.default_rng(3)
+    taken = []
+    for number, (x, y) in enumerate((x, y) for x in (-84, -40, 4, 56) for y in (-84, -48, 16, 60)):
+        size = np.array([*(3 * rng.integers(5, 9, 2)), 3 * rng.integers(3, 7)], np.float64)
+        low = np.array([x, y, float(height(np.array(x), np.array(y)))])
+        points, corners, uv = building(low, size)
+        house = made.mesh(f"House_{number + 1}", points, corners, uv)
+        made.texture(house, facade_image(), "block-facade.png")
+        taken.append((x - 4, y - 4, x + size[0] + 4, y + size[1] + 4))
+    for number, (turn, aside) in enumerate([(0, 16), (90, 20), (180, 18), (270, 22)]):
+        # Beyond the street.
+        points, corners, uv = building(np.zeros(3), np.array([90, 12, 9 + 3 * number]))
+        angle = np.radians(turn)
+        x, y = points[:, 0] - 45, points[:, 1] - HALF - aside - 12
+        points[:, 0], points[:, 1] = (
+            np.cos(angle) * x - np.sin(angle) * y, np.sin(angle) * x + np.cos(angle) * y,
+        )  # fmt: skip
+        points[:, 2] += 512
+        house = made.mesh(f"Row_{number + 1}", points, corners, uv)
+        made.texture(house, facade_image(), "block-facade.png")
+    trees(made, rng, taken)
+    made.stage.GetRootLayer().Export(str(path))
+
+
+def trees(made: Block, rng: np.random.Generator, taken: list[tuple[float, ...]]) -> None:
+    """Add an avenue along both sides of the street, and a park between the houses."""
+    shape = tree(next(one for one in SPECIES if one.name == "Maple"), seed=1)
+    trees = UsdGeom.PointInstancer.Define(made.stage, "/Block/Trees")
+    maple = made.mesh("Trees/Maple", shape.vertices, shape.faces)
+    leaves = len(shape.faces) - 13 * 10 * 40
+    brown, green = (0.10, 0.06, 0.04), (0.09, 0.22, 0.04)
+    made.colour(maple, [brown] * leaves + [green] * (len(shape.faces) - leaves))
+    along = np.arange(0, LENGTH, LENGTH / 80)
+    avenue = [ring(along, side)[:2] for side in (WIDTH / 2 + 3.5, -WIDTH / 2 - 3.5)]
+    x, y = (np.concatenate(axis) for axis in zip(*avenue, strict=True))
+    places = list(zip(x.tolist(), y.tolist(), strict=True))
+    while len(places) < TREES:
+        x, y = rng.uniform(-195, 195, 2).tolist()
+        inside = max(abs(x), abs(y)) < HALF - 14
+        outside = max(abs(x), abs(y)) > HALF + 45
+        free = not any(a < x < c and b < y < d for a, b, c, d in taken)
+        if (outside or (inside and free and abs(y) < 14)) and len(places) < TREES:
+            places.append((x, y))
+    x, y = np.array(places).T
+    points = np.column_stack([x, y, height(x, y)]).astype(np.float32)
+    trees.CreatePositionsAttr(Vt.Vec3fArray.FromNumpy(points))
+    trees.CreateProtoIndicesAttr([0] * TREES)
+    turns = rng.uniform(0, np.pi, TREES)
+    trees.CreateOrientationsAttr([Gf.Quath(np.cos(t), 0, 0, np.sin(t)) for t in turns.tolist()])
+    sizes = rng.uniform(0.6, 1.1, TREES).tolist()
+    trees.CreateScalesAttr([Gf.Vec3f(size, size, size) for size in sizes])
+    trees.CreatePrototypesRel().SetTargets([maple.GetPath()])
+
+
+if __name__ == "__main__":
+    folder = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parent
+    raster(folder / "block-hills.tif")
+    traffic(folder / "block-traffic.xml.gz")
+    block(folder / "block.usdc")
