@@ -20,9 +20,9 @@ MOST_COLOURS = 1 << 16  # of labels
 RGB = Column("rgb", "uint32", "", "colours of the surfaces")  # see `values_of`
 _SPREAD = (0.5, 99.5)  # percentiles at the ends of a colour scale
 _GREY = 0.5
-# The scale is logarithmic if the median is this low in its range, or if numbers without a unit,
-# such as intensities, differ by such a factor.
-_SKEWED, _MANIFOLD = 0.1, 30.0
+# The scale is logarithmic if numbers differ by the first factor and the median is this low in their
+# range, or if numbers without a unit, such as intensities, differ by the second factor.
+_WIDE, _SKEWED, _MANIFOLD = 10.0, 0.1, 30.0
 _TIMES = (("s", 1e9), ("ms", 1e6), ("µs", 1e3))  # units for nanoseconds
 
 
@@ -94,7 +94,7 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
         span = high - low
         unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
         low, middle, high = low / size, middle / size, high / size
-    skewed = middle - low < _SKEWED * (high - low)
+    skewed = high > _WIDE * low and middle - low < _SKEWED * (high - low)
     logarithmic = bool(low > 0 and (skewed or (not unit and high > _MANIFOLD * low)))
     ends = np.log([low, high]) if logarithmic else (low, high)
 

@@ -108,7 +108,7 @@ class Colours:
             )
 
     def means(self) -> Bytes:
-        """Mean colour of each face, in linear light, of four places on it, or 100 of few: (f, 3)."""
+        """Mean colour of each face, in linear light, of four places on it, or of 100: (f, 3)."""
         out, steps = np.empty((len(self), 3), np.uint8), 10 if len(self) <= FEW_FACES else 2
         # The middles of the pieces into which lines beside the edges cut it.
         i, j = (n.ravel() for n in np.mgrid[:steps, :steps])
