@@ -8,17 +8,16 @@ from typing import Annotated, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, Strict, model_validator
+from pydantic import Strict, model_validator
 
 from ..base.declared import Text, TextOrTexts, Triple, is_text, short
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
 from ..sensor import Mounted, Pose, Track, load_trajectory
-from ..sensor.materials import SemanticClass
 from ..sensor.survey import Steps
 from ..sensor.trajectory import Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import Lengths, MeshEntry, PoseSection, Section, SensorSection, told
+from .sections import MeshEntry, PoseSection, Section, SensorSection, ShapeSection, told
 from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
@@ -169,17 +168,13 @@ TrajectoryEntry = Annotated[
 ]
 
 
-class ActorSection(Section):
+class ActorSection(ShapeSection):
     """An object or robot that moves through the scene; its axes have x ahead and z up."""
 
     name: Annotated[Text, told("name of the object")]
     file: Annotated[
         MeshEntry | None,
         told("its mesh in its own axes, as in scene.files, or a robot: .urdf", "car.glb"),
-    ] = None
-    box: Annotated[
-        Lengths | None,
-        told("instead of a file: length, width and height of a box, metres"),
     ] = None
     trajectory: Annotated[
         TrajectoryEntry | None,
@@ -195,15 +190,9 @@ class ActorSection(Section):
             "of a robot: a table of time_s and the values of joints, radians or metres", "arm.csv"
         ),
     ] = None
-    semantic_class: Annotated[
-        SemanticClass | None,
-        Field(alias="class", description="class of its points; by default that of its material"),
-    ] = None
 
     @model_validator(mode="after")
-    def _one_shape(self) -> ActorSection:
-        if (self.file is None) == (self.box is None):
-            raise ValueError("give either file or box.")
+    def _of_actor(self) -> ActorSection:
         way = self.trajectory
         if way is not None and (way.start_s is not None or way.duration_s is not None):
             raise ValueError("an actor starts with the survey: give offset_s, not start_s.")

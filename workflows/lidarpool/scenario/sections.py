@@ -218,16 +218,32 @@ class Scatter(Section):
         return self
 
 
-class CopiesSection(Section):
-    """An object that stands in many places, its mesh kept once; each copy is an object."""
+class ShapeSection(Section):
+    """What something looks like, a file or a box, and the class of its points."""
 
-    name: Annotated[Text, told("name of the first; the others are numbered: Tree, Tree.2, …")]
+    name: Annotated[Text | None, told("name of the object")] = None
     file: Annotated[
-        MeshEntry | None, told("its mesh in its own axes, as in scene.files", "tree.glb")
+        MeshEntry | None, told("its mesh in its own axes, as in scene.files", "car.glb")
     ] = None
     box: Annotated[
         Lengths | None, told("instead of a file: length, width and height of a box, metres")
     ] = None
+    semantic_class: Annotated[
+        SemanticClass | None,
+        Field(alias="class", description="class of its points; by default that of its material"),
+    ] = None
+
+    @model_validator(mode="after")
+    def _one_shape(self) -> ShapeSection:
+        if (self.file is None) == (self.box is None):
+            raise ValueError("give either file or box.")
+        return self
+
+
+class CopiesSection(ShapeSection):
+    """An object that stands in many places, its mesh kept once; each copy is an object."""
+
+    name: Annotated[Text, told("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
         tuple[
             Annotated[
@@ -245,15 +261,9 @@ class CopiesSection(Section):
     scatter: Annotated[
         Scatter | None, told("instead of at: so many on surfaces, at random", {"count": 100})
     ] = None
-    semantic_class: Annotated[
-        SemanticClass | None,
-        Field(alias="class", description="class of its points; by default that of its material"),
-    ] = None
 
     @model_validator(mode="after")
     def _one_of_each(self) -> CopiesSection:
-        if (self.file is None) == (self.box is None):
-            raise ValueError("give either file or box.")
         if [bool(self.at), self.table is not None, self.scatter is not None].count(True) != 1:
             raise ValueError("give one of at, table and scatter.")
         return self

@@ -16,7 +16,7 @@ from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field, model_validator
+from pydantic import Field
 
 from ..base.declared import Text, TextOrTexts, Triple
 from ..base.errors import LidarpoolError
@@ -25,10 +25,9 @@ from ..scene.actors import Actor
 from ..scene.mesh import Mesh
 from ..sensor import Track
 from ..sensor.calibrations import said
-from ..sensor.materials import SemanticClass
 from ..sensor.trajectory import quaternions_of, rotations_of
 from ..sensor.trajectory_files import Seconds
-from .sections import Lengths, MeshEntry, Section, told
+from .sections import Section, ShapeSection, told
 from .standing import Standing, following
 
 ACTORS_MOST = 10_000
@@ -39,7 +38,7 @@ _ROW = ("x", "y", "z", "angle", "slope")
 Float = NDArray[np.float64]
 
 
-class VehicleSection(Section):
+class VehicleSection(ShapeSection):
     """What vehicles and persons of some types look like."""
 
     types: Annotated[
@@ -48,22 +47,6 @@ class VehicleSection(Section):
     name: Annotated[
         Text | None, told("of its objects, before the identity in brackets; by default the type")
     ] = None
-    file: Annotated[
-        MeshEntry | None, told("mesh in its own axes, x ahead and z up, as in scene.files")
-    ] = None
-    box: Annotated[
-        Lengths | None, told("instead of a file: length, width and height of a box, metres")
-    ] = None
-    semantic_class: Annotated[
-        SemanticClass | None,
-        Field(alias="class", description="class of its points; by default that of its material"),
-    ] = None
-
-    @model_validator(mode="after")
-    def _one_shape(self) -> VehicleSection:
-        if (self.file is None) == (self.box is None):
-            raise ValueError("give either file or box.")
-        return self
 
 
 class TrafficSection(Section):
