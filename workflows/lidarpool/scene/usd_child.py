@@ -18,6 +18,7 @@ import resource
 import signal
 import sys
 from collections import Counter
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -63,7 +64,9 @@ class Scene:
         looks.time = self._time
         self._numbers: dict[tuple[Any, ...], int] = {}  # {key: number}
         self._todo: list[tuple[Any, ...]] = []
-        self._animated: dict[Any, bool] = {}  # {path of a prototype: whether something moves in it}
+        self._known: dict[
+            Any, bool
+        ] = {}  # {prototype and test: whether a prim passes}
         self._meshes: dict[bytes, int] = {}  # {hash of the content: number}
         self.roots: list[int] = []
         self.nodes: list[Any] = []
@@ -133,7 +136,7 @@ class Scene:
             else:
                 node[1] = self._mesh(prim)
         if prim.IsInstance():
-            moves = not still and self._moves_within(prim.GetPrototype())
+            moves = not still and self._any_below(prim.GetPrototype(), _varies)
             instance = str(prim.GetPath()) if moves else self._looks.inherited(prim)
         for child in prim.GetFilteredChildren(Usd.TraverseInstanceProxies(_SHOWN)):
             place, number = UsdGeom.Xformable(child), self._number(child, unwanted, still, instance)
@@ -141,7 +144,7 @@ class Scene:
             if place and place.TransformMightBeTimeVarying():
                 if not still:
                     motion = self._motion(child)
-                elif any(map(_has_surface, _below(child))):
+                elif self._any_below(child, _has_surface):
                     self.counts["moving"] += 1
             if motion is not None:
                 self._count(1, "moving objects")
@@ -151,12 +154,19 @@ class Scene:
                 (self.roots if place and place.GetResetXformStack() else node[2]).append(number)
         return node
 
-    def _moves_within(self, prototype: Any) -> bool:
-        path = prototype.GetPath()
-        if path not in self._animated:
-            places = map(UsdGeom.Xformable, _below(prototype))
-            self._animated[path] = any(one and one.TransformMightBeTimeVarying() for one in places)
-        return self._animated[path]
+    def _any_below(self, prim: Any, test: Callable[[Any], bool]) -> bool:
+        """Whether a prim, or one below it, passes a test; prototypes are asked once."""
+        for one in Usd.PrimRange(_shared(prim)):
+            if test(one):
+                return True
+            if one.IsInstance():
+                prototype = one.GetPrototype()
+                key = prototype.GetPath(), test
+                if key not in self._known:
+                    self._known[key] = self._any_below(prototype, test)
+                if self._known[key]:
+                    return True
+        return False
 
     def _motion(self, prim: Any) -> NDArray[np.float64] | None:
         """Time codes and places in the world, (k, 13), see `motions`; None if it is to stand.
@@ -169,7 +179,7 @@ class Scene:
         # Also between samples, which a turntable may have at whole turns only.
         between = [a + _PROBES[0] * (b - a) for a, b in pairwise(samples)]
         own = [np.array(place.GetLocalTransformation(code)) for code in [*samples, *between]]
-        if not own or not any(map(_has_surface, _below(prim))) or np.allclose(own, own[0]):
+        if not own or not self._any_below(prim, _has_surface) or np.allclose(own, own[0]):
             return None
         codes: set[float] = set()
         above = prim
@@ -502,8 +512,9 @@ def _shared(prim: Any) -> Any:
     return prim.GetPrimInPrototype() if prim.IsInstanceProxy() else prim
 
 
-def _below(prim: Any) -> Any:
-    return Usd.PrimRange(prim, Usd.TraverseInstanceProxies())
+def _varies(prim: Any) -> bool:
+    place = UsdGeom.Xformable(prim)
+    return bool(place and place.TransformMightBeTimeVarying())
 
 
 def _has_surface(prim: Any) -> bool:
