@@ -18,6 +18,7 @@ from lidarpool.run.picture_file import Pictured
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import Actor, box
 from lidarpool.simulator.rig import Rig
+from lidarpool.simulator.surfaces import Surfaces
 
 FLOOR = box("Floor", (60, 60, 0.01))
 COLUMNS = ["time", "range", "triangle", "intensity", "class"]
@@ -223,10 +224,10 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     x, y, z = far
     points = [{"time_s": t, "position": [x + 18 - 2 * t, y + 5, 0.3]} for t in (0, 8)]
 
-    def read(points):
+    def read(points, **options):
         scene = {"files": {"file": "ramp.obj", "translation": far}}
         return Scenario.from_data(
-            {"scene": scene, "trajectory": {"points": points, "surfaces": "Ramp"}},
+            {"scene": scene, "trajectory": {"points": points, "surfaces": "Ramp", **options}},
             folder=tmp_path,
         )
 
@@ -239,8 +240,12 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     np.testing.assert_allclose(turns[:, :, 0], np.tile(-UPHILL, (3, 1)), atol=1e-6)
     np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-6)
     points[1]["position"] = [x + 30, y + 5, 0]
+    points.insert(1, {"time_s": 4, "position": [x + 10, y + 5, 0.3]})
+    assert read(points, duration_s=3).survey(scene).path.duration_ns == 3e9
     with pytest.raises(LidarpoolError, match=r"leaves its surfaces \(Ramp\)"):
         read(points).survey(scene)
+    with pytest.raises(LidarpoolError, match=r"trajectory\.beyond is for actors"):
+        read(points, beyond="hold")
 
 
 def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_path):
@@ -271,6 +276,7 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         (FCD.replace('x="40"', 'x="inf"'), "vehicle 'a.1' has no finite position at 3 s"),
         (FCD.replace('x="40"', ""), "'x' is missing"),
         (FCD.replace('x="40"', 'x="east"'), "could not convert string to float: 'east'"),
+        (FCD.replace('angle="45"', ""), "'angle' is missing"),
         (FCD.replace("?>", '?><!DOCTYPE a [<!ENTITY b "c">]>', 1), "declares an XML entity"),
     ],
 )
@@ -279,7 +285,41 @@ def test_unusable_data_is_refused(tmp_path, text, told):
         scenario(tmp_path, text).build_scene()
 
 
+def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
+    read = scenario(
+        tmp_path,
+        FCD.replace('id="p"', 'id="a.1"'),
+        {"vehicles": [{"types": "walk*", "box": [1, 1, 1]}, {"box": [4, 2, 1.5], "class": 10}]},
+        scene={"ground": {}, "copies": [{"name": "House (old)", "box": [1, 1, 1], "at": [[0, 9]]}]},
+        materials=[
+            {"objects": "*", "reflectance": 0.3, "class": 2},
+            {"objects": "car (a.1)", "reflectance": 0.1},
+        ],
+    )
+    job = make_job(read, "embree")
+    names = job.scene.all_names
+    assert names[2:] == ("car (a.1)", "walker (a.1)", "car (a.1).2")
+    table = Surfaces(job.scene, tuple(job.survey.materials)).materials
+    assert table.semantic_class.tolist() == [2, 2, 10, 2, 10]
+    np.testing.assert_allclose(table.reflectance, [0.3, 0.3, 0.1, 0.3, 0.3])
+
+
+def test_who_rides_in_a_vehicle_is_no_actor(tmp_path):
+    rows = "".join(
+        f'<timestep time="{k}"><vehicle id="b" x="{k}" y="5" angle="90" type="car"/>'
+        f'<person id="r" x="{k}" y="5" angle="90" type="walker"/>'
+        '<person id="w" x="9" y="9" angle="90" type="walker"/></timestep>'
+        for k in range(3)
+    )
+    actors = scenario(tmp_path, f"<fcd-export>{rows}</fcd-export>").build_scene().actors
+    assert [actor.name for actor in actors] == ["car (b)", "Person (w)"]
+
+
 def test_what_is_wrong_with_traffic_is_told(tmp_path):
+    nobody = scenario(tmp_path, traffic={"offset_s": 300})
+    assert any("no vehicle or person is in the" in n for n in nobody.advice(nobody.build_scene()))
+    with pytest.raises(LidarpoolError, match=r"traffic\.surfaces"):
+        scenario(tmp_path, traffic={"surfaces": []})
     with pytest.raises(LidarpoolError, match=r"type 'car', but no entry .* add one, such as"):
         scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}).build_scene()
     with pytest.raises(LidarpoolError, match="give either file or box"):

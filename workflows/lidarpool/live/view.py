@@ -23,7 +23,7 @@ from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import Pictured, SensorWay, ways_of
-from ..scene.actors import Actor, shapes_of
+from ..scene.actors import Actor, samples_each, shapes_of
 from ..sensor.trajectory import presence_ns
 from .legend import Legend, as_bytes, legend_of
 from .points import Eye, Filter, PointFinder, Points, Scans, positions
@@ -167,8 +167,9 @@ class View:
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
                 arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
+        each = samples_each(self._actors, _ACTOR_PLACES)
         for number, actor in enumerate(self._actors):
-            arrays |= _actor_arrays(f"actor{number}", actor, self._duration_ns)
+            arrays |= _actor_arrays(f"actor{number}", actor, self._duration_ns, each)
         if self.sweeps is not None:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
@@ -419,9 +420,11 @@ def _corners_of(box: Floats) -> Floats:
     return np.array(list(itertools.product(*box.T)))
 
 
-def _actor_arrays(name: str, actor: Actor, duration_ns: float) -> dict[str, NDArray[Any]]:
+def _actor_arrays(
+    name: str, actor: Actor, duration_ns: float, count: int
+) -> dict[str, NDArray[Any]]:
     """Poses of an actor over time."""
-    times, places, turns = actor.samples(duration_ns, _ACTOR_PLACES)
+    times, places, turns = actor.samples(duration_ns, count)
     return {
         f"{name}_times": times / _NS,
         f"{name}_places": places,

@@ -140,7 +140,9 @@ class Page:
         """
         boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
         some = np.arange(len(boxes) - shot.actors, len(boxes))
-        some = some[np.isfinite(boxes[some]).all(axis=(1, 2))]
+        # Absent ones are one point.
+        there = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
+        some = some[there[some]]
         names = [whole_of(shot.scene.names[k]) for k in some]
         some = some[np.sort(np.unique(names, return_index=True)[1])]
         names = list(dict.fromkeys(names))

@@ -16,7 +16,7 @@ from ..base.archives import open_archive
 from ..base.words import counted
 from ..columns.table import TABLE, Column
 from ..plan import Plan, Planning
-from ..scene.actors import Actor, shapes_of
+from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.colours import Colours
 from ..scene.drawn import Drawn, cut
 from ..scene.mesh import Mesh
@@ -76,7 +76,8 @@ class Pictured:
     def of(cls, result: RunResult) -> Pictured:
         """Return what the pictures of a result show."""
         scene, survey = result.scene, result.survey
-        actors = tuple(_sampled(actor, survey.duration_ns) for actor in scene.actors)
+        each = samples_each(scene.actors, PLACES_MOST)
+        actors = tuple(_sampled(actor, survey.duration_ns, each) for actor in scene.actors)
         ways = sensor_ways(survey)
         drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
         return cls(
@@ -265,8 +266,8 @@ def ways_of(
     return [*(way.positions for way in sensors), *ways]
 
 
-def _sampled(actor: Actor, duration_ns: float) -> Actor:
+def _sampled(actor: Actor, duration_ns: float, count: int) -> Actor:
     """Return an actor with poses of a survey, whatever its trajectory is."""
-    times, places, turns = actor.samples(duration_ns, PLACES_MOST)
+    times, places, turns = actor.samples(duration_ns, count)
     beyond: Beyond = "hold" if presence_ns(actor.trajectory) == ALWAYS else "absent"
     return replace(actor, trajectory=Track(times / 1e9, places, turns, start_s=0.0, beyond=beyond))

@@ -22,6 +22,8 @@ from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
 
+_CLOCK_S = 1e-6
+
 
 class MountSection(PoseSection):
     """Position and angles of a sensor on its carrier, in the carrier's axes."""
@@ -100,7 +102,11 @@ class TrajectorySection(Section):
     ] = None
     surfaces: Annotated[
         TextOrTexts | None,
-        told("names of objects to follow, with * and ?; heights are then above them", "Terrain"),
+        told(
+            "names of objects to follow, with * and ?; heights are then above them",
+            "Terrain",
+            min_length=1,
+        ),
     ] = None
     beyond: Annotated[
         Beyond,
@@ -125,8 +131,13 @@ class TrajectorySection(Section):
         if self.surfaces is None:
             return way
         # Pieces may end before the survey does.
-        for piece in following(replace(way, beyond="hold"), standing.only(self.surfaces)):
-            if piece.times_s[[0, -1]].tolist() == way.times_s[[0, -1]].tolist():
+        pieces = following(replace(way, beyond="hold"), standing.only(self.surfaces))
+        if len(pieces) == 1 and self.beyond == "absent":
+            return replace(pieces[0], beyond="absent")
+        assert way.start_s is not None  # of every track
+        begin, end = way.start_s, way.start_s + way.duration_ns / 1e9
+        for piece in pieces:
+            if piece.times_s[0] <= begin + _CLOCK_S and end - _CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=way.beyond)
         raise LidarpoolError(
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."

@@ -33,7 +33,7 @@ from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
-from ..sensor.materials import MaterialTable, rows_named, with_classes
+from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import SENSORS_MOST, Steps
 from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
@@ -186,6 +186,7 @@ class Scenario(Section):
     _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
     _sources: dict[str, str] = PrivateAttr(default_factory=dict)  # {file: what it gave}
     _robots: dict[MeshFile, Robot] = PrivateAttr(default_factory=dict)  # {their file: robot}
+    _vehicles: list[int | None] = PrivateAttr(default_factory=list)  # classes of the last actors
     # Triangles of a scene, and the trajectory there.
     _way: tuple[Any, Track] | None = PrivateAttr(default=None)
     _rasters: list[tuple[MeshFile, Raster]] = PrivateAttr(default_factory=list)
@@ -256,6 +257,8 @@ class Scenario(Section):
             wrong.append("planning is enabled: give planning.start and planning.target.")
         if planning.enabled is None and missing == 1:
             wrong.append("give both planning.start and planning.target, or neither.")
+        if self.trajectory is not None and self.trajectory.beyond != "refuse":
+            wrong.append("trajectory.beyond is for actors; the carrier's has to cover the survey.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
         carried = [entry for entry in self.actors if entry.trajectory is None]
@@ -380,6 +383,7 @@ class Scenario(Section):
         self._sources.clear()
         self._rasters.clear()
         self._robots.clear()
+        self._vehicles.clear()
         self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         moving: list[Actor] = []
@@ -567,8 +571,15 @@ class Scenario(Section):
             begin = start_s - section.offset_s
             passages, count = read_fcd(path, begin, begin + duration)
             shapes: dict[Any, Mesh] = {}
-            actors = actors_of(
+            found = actors_of(
                 section, passages, lambda entry: self._shape(entry, shapes), standing, start_s
+            )
+        self._vehicles = [entry.semantic_class for _, entry in found]
+        actors = [actor for actor, _ in found]
+        if not actors:
+            self._notes.append(
+                f"{section.file}: no vehicle or person is in the scene from {begin:g} to "
+                f"{begin + duration:g} s of the file: check offset_s, translation and surfaces"
             )
         self._sources[section.file] = (
             f"{counted(len(actors), 'actor')} during the survey, of {counted(count, 'vehicle')} "
@@ -595,10 +606,6 @@ class Scenario(Section):
                 own += [(link, [escape(link)], entry.semantic_class) for link in links]
             else:
                 own.append((entry.name, names, entry.semantic_class))
-        for names, semantic_class in self.traffic.classes if self.traffic else ():
-            rows = {name: rows_named(name, scene.all_names) for name in names}
-            if there := [name for name in names if len(rows[name])]:
-                own.append((scene.all_names[rows[there[0]][0]], there, semantic_class))
         if own and not made:
             made = [Material("*")]
         for name, names, semantic_class in own:
@@ -606,6 +613,11 @@ class Scenario(Section):
             after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
             of = made[after] if after >= 0 else Material("*")
             made.insert(after + 1, replace(of, objects=names, semantic_class=semantic_class))
+        vehicles = len(self._vehicles) if scene.actors else 0
+        for semantic_class in sorted({one for one in self._vehicles[:vehicles] if one is not None}):
+            own_rows = [row for row, one in enumerate(self._vehicles) if one == semantic_class]
+            rows = np.array(own_rows) + len(scene.all_names) - vehicles
+            made = with_class(made or [Material("*")], semantic_class, rows, scene.all_names)
         if any(entry.file.lower().endswith(CITYJSON) for entry in self.scene.files):
             made = with_classes(made or [Material("*")], CITY_CLASSES, scene.all_names)
         return made

@@ -6,10 +6,9 @@ import gzip
 import math
 import zlib
 from array import array
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from glob import escape
 from pathlib import Path
 from typing import Annotated, Literal
 from xml.parsers import expat
@@ -33,7 +32,7 @@ from .standing import Standing, following
 ACTORS_MOST = 10_000
 _PIECE = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
-_ROW = ("x", "y", "z", "angle", "slope")
+_ROW = ("x", "y", "angle", "z", "slope")
 
 Float = NDArray[np.float64]
 
@@ -42,7 +41,8 @@ class VehicleSection(ShapeSection):
     """What vehicles and persons of some types look like."""
 
     types: Annotated[
-        TextOrTexts, told("types of SUMO, with * and ?; of several entries the first that fits")
+        TextOrTexts,
+        told("types of SUMO, with * and ?; of several entries the first that fits", min_length=1),
     ] = ("*",)
     name: Annotated[
         Text | None, told("of its objects, before the identity in brackets; by default the type")
@@ -61,19 +61,14 @@ class TrafficSection(Section):
     translation: Annotated[Triple, told("added to all positions, metres")] = (0, 0, 0)
     surfaces: Annotated[
         TextOrTexts | None,
-        told("names of objects to stand on, with * and ?; by default heights are the file's"),
+        told(
+            "names of objects to stand on, with * and ?; by default heights are the file's",
+            min_length=1,
+        ),
     ] = None
     interpolation: Annotated[
         Literal["linear", "smooth"], told("of positions between time steps")
     ] = "linear"
-
-    @property
-    def classes(self) -> Iterator[tuple[list[str], int]]:
-        """Names of objects, with * and ?, and their class; of several that fit the last counts."""
-        for entry in reversed(self.vehicles):
-            if entry.semantic_class is not None:
-                names = [escape(entry.name)] if entry.name else entry.types
-                yield [f"{name} (*" for name in names], entry.semantic_class
 
     def shape_of(self, kind: str) -> VehicleSection:
         """Return the entry of a type; LidarpoolError if there is none."""
@@ -136,6 +131,7 @@ class _Reader:
         self.open: dict[tuple[str, str], tuple[int, Passage]] = {}  # {who: last step, passage}
         self.step, self.done = -1, False
         self._first, self._last, self._time = first_s, last_s, -math.inf
+        self._vehicle: tuple[str, str] | None = None  # place of the last one of the time step
         self.parser = expat.ParserCreate()
         self.parser.EntityDeclHandler = refuse_entity
         self.parser.StartElementHandler = self._begin
@@ -147,8 +143,13 @@ class _Reader:
                 raise ValueError(f"the time {time} does not come after the one before")
             # The first time step after the last time is needed as well.
             self.done = self.done or self._time > self._last
-            self.step, self._time = self.step + 1, time
+            self.step, self._time, self._vehicle = self.step + 1, time, None
         elif tag in _MOVING and self.step >= 0 and not self.done:
+            place = at["x"], at["y"]
+            if tag == "vehicle":
+                self._vehicle = place
+            elif place == self._vehicle:  # SUMO writes who rides in a vehicle after it
+                return
             self._add(tag, at)
 
     def _add(self, tag: str, at: Mapping[str, str]) -> None:
@@ -160,7 +161,7 @@ class _Reader:
         self.open[who] = self.step, passage
         if self._time <= self._first:  # of those before the first time the last is needed
             del passage.times_s[:], passage.rows[:]
-        row = [float(at["x"]), float(at["y"]), *(float(at.get(key) or 0) for key in _ROW[2:])]
+        row = [float(at[key]) for key in _ROW[:3]] + [float(at.get(key) or 0) for key in _ROW[3:]]
         if not all(map(math.isfinite, row)):
             raise ValueError(f"{tag} {at['id']!r} has no finite position at {self._time:g} s")
         passage.times_s.append(self._time)
@@ -173,8 +174,8 @@ def actors_of(
     shape_of: Callable[[VehicleSection], Mesh],
     standing: Standing,
     start_s: float,
-) -> list[Actor]:
-    """Make actors of passages, in a scene's local coordinates.
+) -> list[tuple[Actor, VehicleSection]]:
+    """Make actors of passages, in a scene's local coordinates, each with its entry.
 
     Parameters
     ----------
@@ -191,13 +192,13 @@ def actors_of(
     LidarpoolError
         If a type has no shape, or there are too many.
     """
-    actors: list[Actor] = []
+    actors: list[tuple[Actor, VehicleSection]] = []
     follows = section.surfaces and standing.only(section.surfaces)
     for one in passages:
         entry = section.shape_of(one.kind)
         mesh = shape_of(entry)
         times = np.array(one.times_s) + section.offset_s
-        x, y, z, angle, slope = np.array(one.rows).reshape(-1, len(_ROW)).T
+        x, y, angle, z, slope = np.array(one.rows).reshape(-1, len(_ROW)).T
         fronts = np.column_stack([x, y, z]) + section.translation
         if follows:
             fronts[:, 2], slope = section.translation[2], 0 * slope
@@ -209,7 +210,7 @@ def actors_of(
         way = Track(times, places, quaternions_of(turns), smooth, start_s, beyond="absent")
         ways = following(way, follows) if follows else [way]
         named = replace(mesh, name=f"{entry.name or one.kind} ({one.name})")
-        actors += [Actor(named, way) for way in ways]
+        actors += [(Actor(named, way), entry) for way in ways]
         if len(actors) > ACTORS_MOST:
             raise LidarpoolError(
                 f"{section.file} has more than {ACTORS_MOST:,} vehicles and persons during the "

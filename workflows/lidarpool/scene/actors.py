@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,6 +16,7 @@ from .colours import joined
 from .instances import Instance
 from .mesh import Cutout, Mesh, stacked
 
+SAMPLES_MOST = 200_000  # poses of all actors
 _AT_ZERO = Stations((CENTRE,))
 
 
@@ -74,6 +75,11 @@ class Actor:
                 f"Actor {self.name!r}: {words}: let its trajectory begin before the first scan and "
                 "end after the last."
             ) from error
+
+
+def samples_each(actors: Sequence[Actor], most: int) -> int:
+    """Return how many poses of each actor a drawing keeps: `most` of each, fewer of many actors."""
+    return max(20, min(most, SAMPLES_MOST // max(len(actors), 1)))
 
 
 def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], NDArray[np.intp]]:

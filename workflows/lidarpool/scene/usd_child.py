@@ -64,9 +64,7 @@ class Scene:
         looks.time = self._time
         self._numbers: dict[tuple[Any, ...], int] = {}  # {key: number}
         self._todo: list[tuple[Any, ...]] = []
-        self._known: dict[
-            Any, bool
-        ] = {}  # {prototype and test: whether a prim passes}
+        self._known: dict[Any, bool] = {}  # {prototype and test: whether a prim passes}
         self._meshes: dict[bytes, int] = {}  # {hash of the content: number}
         self.roots: list[int] = []
         self.nodes: list[Any] = []

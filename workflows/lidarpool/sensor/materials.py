@@ -214,6 +214,21 @@ def with_classes(
     return out
 
 
+def with_class(
+    materials: Sequence[Material], semantic_class: int, rows: NDArray[np.intp], names: Sequence[str]
+) -> list[Material]:
+    """Give some objects a class, and leave the rest of their materials.
+
+    LidarpoolError if a material is for no object.
+    """
+    out, last = list(materials), _last_for(materials, names)[rows]
+    for number in np.unique(last).tolist():
+        of = materials[number] if number >= 0 else Material("*")
+        objects = [escape(names[row]) for row in rows[last == number]]
+        out.append(replace(of, objects=objects, semantic_class=semantic_class))
+    return out
+
+
 @dataclass(frozen=True, eq=False)
 class MaterialTable:
     """Materials of objects: each array has one value for each."""
