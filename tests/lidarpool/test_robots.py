@@ -12,6 +12,7 @@ from tests.lidarpool.test_moving import made, stored_positions
 
 from lidarpool import Actor, LidarpoolError, Pose, Scene, Survey, Track, load_robot, load_sensor
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.run.job import make_job
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
@@ -532,3 +533,26 @@ def test_a_robot_in_a_loop_is_placed_link_by_link(ground):
     assert base.pose(0).position == (3, 0, 0.3)
     actor = Actor(robot.meshes["hand"], hand)
     assert np.allclose(actor.placed(0).bounds.mean(axis=0), hand.pose(0).position, atol=1e-9)
+
+
+def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
+    table = "time_s,turret\n0.2,0\n0.6,1\n"
+    (folder / "joints.csv").write_text(table)
+    points = [{"time_s": t, "position": [5, 0, 0]} for t in (0.2, 0.6)]
+    scenario = Scenario.from_data(
+        {
+            "scene": {"ground": {}, "copies": [{"name": "Post", "box": [1, 1, 1], "at": [[9, 9]]}]},
+            "poses": [[0, 0, 1]],
+            "steps": 360,
+            "actors": [ROVER | {"trajectory": {"points": points, "beyond": "absent"}}],
+        },
+        folder=folder,
+    )
+    job = make_job(scenario, "numpy")
+    for actor in job.scene.actors:
+        assert actor.trajectory.presence_ns == pytest.approx((0.2e9, 0.6e9))
+
+
+def test_a_robot_as_a_scene_is_told_where_it_belongs(folder):
+    with pytest.raises(LidarpoolError, match=r"rover\.urdf is a robot: name it as the file of one"):
+        Scenario.from_data({"scene": "rover.urdf"}, folder=folder).build_scene()

@@ -304,6 +304,8 @@ def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any])
 
 def _bytes_of(path: Path, most: int) -> bytes:
     """Content of a file of a known format, or of its beginning; -1 for all."""
+    if path.suffix.lower() == ".urdf":
+        raise LidarpoolError(f"{path} is a robot: name it as the file of one of the actors.")
     if path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "

@@ -362,6 +362,7 @@ class LinkPath:
         LidarpoolError
             If the trajectory or the joints have no values for a time.
         """
+        times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
         positions, rotations = self.base.poses(station, times_ns)
         place, count = positions.T, len(times_ns)
         turn = np.broadcast_to(np.eye(3)[..., None], (3, 3, count))
