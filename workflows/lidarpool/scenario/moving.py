@@ -15,14 +15,12 @@ from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
 from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.survey import Steps
-from ..sensor.trajectory import Beyond
+from ..sensor.trajectory import CLOCK_S, Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import MeshEntry, PoseSection, Section, SensorSection, ShapeSection, told
 from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
-
-_CLOCK_S = 1e-6
 
 
 class MountSection(PoseSection):
@@ -137,7 +135,7 @@ class TrajectorySection(Section):
         assert way.start_s is not None  # of every track
         begin, end = way.start_s, way.start_s + way.duration_ns / 1e9
         for piece in pieces:
-            if piece.times_s[0] <= begin + _CLOCK_S and end - _CLOCK_S <= piece.times_s[-1]:
+            if piece.times_s[0] <= begin + CLOCK_S and end - CLOCK_S <= piece.times_s[-1]:
                 return replace(piece, beyond=way.beyond)
         raise LidarpoolError(
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."

@@ -17,7 +17,7 @@ from ..base.errors import LidarpoolError
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
 # firing are fired a little after its pose.
-_CLOCK_S, _FIRING_S = 1e-6, 1e-3
+CLOCK_S, _FIRING_S = 1e-6, 1e-3
 
 ALWAYS = (-np.inf, np.inf)
 
@@ -253,7 +253,7 @@ class Track:
             object.__setattr__(self, name, array)
         start = times[0] if self.start_s is None else self.start_s
         last = times[-1] if self.duration_s is None else start + self.duration_s
-        most = _CLOCK_S if self.beyond == "refuse" else np.inf
+        most = CLOCK_S if self.beyond == "refuse" else np.inf
         for what, time in (("start_s", start), ("the end by duration_s", last)):
             gap = max(times[0] - time, time - times[-1])
             if not gap <= most:  # or NaN
