@@ -1,6 +1,8 @@
 """The survey pipeline: four stages on the partitions of a cluster, and their driver."""
 
+from .crew import Crew
 from .driver import SurveyDriver
+from .failures import JobError
 from .long_stages import LongStages
 from .messages import Frame, Receipt
 from .names import COLLECT, EXPORT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
@@ -17,7 +19,9 @@ __all__ = [
     "OTHER",
     "SORT",
     "CastingWorkers",
+    "Crew",
     "Frame",
+    "JobError",
     "LongStages",
     "Receipt",
     "RigPlan",

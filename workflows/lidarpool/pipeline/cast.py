@@ -31,20 +31,24 @@ class CastBatch:
     record: TaskRecord
 
 
-def intersect(handle: str, spans: Sequence[Span]) -> list[CastBatch]:
+def intersect(
+    handle: str, spans: Sequence[Span], plan: bytes | None = None, scene: bytes | None = None
+) -> list[CastBatch]:
     """Cast the rays of batches and make their columns; runs on a GPU worker.
 
-    `spans` are the first scan and the end of each. `handle` is that of the worker's rig, which is
-    the id of the run.
+    `spans` are the first scan and the end of each. `handle` is that of the survey's rig, which is
+    made of `plan` and `scene` if the worker has none.
 
     Raises
     ------
     RigMissing
-        If the worker has no such rig.
+        If the worker has no such rig, and nothing to make it of.
+    RigFailed
+        If the rig cannot be made.
     RuntimeError
         If casting or a column fails, naming the scans.
     """
-    rig = rig_of(handle)
+    rig = rig_of(handle, plan, scene)
     return [_cast(rig, handle, first, stop) for first, stop in spans]
 
 

@@ -1,4 +1,4 @@
-"""The driver's side of the survey: it offers batches, commits parts and hands out frames.
+"""The driver's side of one survey: it offers batches, commits parts and hands out frames.
 
 Everything happens in `step`, called repeatedly from one thread; nothing in it waits for long. There
 is one rule of recovery: uncommitted batches are offered again, and frames that were not handed out
@@ -10,28 +10,25 @@ and workers.
 
 from __future__ import annotations
 
-import secrets
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterable
-from contextlib import suppress
 from itertools import chain
 
 import numpy as np
 
 from poolpart import TaskRecord, Whereabouts
 
-from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
-from ..columns.parts import part_name, probe_name
+from ..columns.parts import part_name
 from ..sensor import Survey
 from . import policies
-from .batches import Batch, Batches, Place
+from .batches import Batch, Place
+from .crew import Seat
 from .database import RunDatabase
-from .failures import storing
-from .long_stages import LongStages
+from .failures import JobError, storing
 from .messages import (
     CollectOrder,
     ColumnsLost,
@@ -45,27 +42,24 @@ from .messages import (
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR, SORT
 from .policies import Loss, Verdict
 from .task_book import TaskBook
-from .workers import CastingWorkers, Outcome
+from .workers import Outcome
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
-WAIT_S = 0.02  # for news, where there is nothing else to do
-CLOSING_S = 0.001  # longest wait while the stages end
 
 
 class SurveyDriver:
     """Runs one survey on the partitions of a cluster.
 
-    `workers` are stage 2 and `stages` the others: all that it asks of Dask, so that tests can play
-    the cluster. Scans in `db` are not cast again, and `storage` is where parts go. `read` reads the
-    points of a committed scan. `on_frame` is called with each frame, in scan order, in the driver's
-    thread, and `on_parts` with parts that were committed. So many scans `fit` into the memory of a
-    batch.
+    `seat` is its place among the crew, workers and stages: all that it asks of Dask, so that tests
+    can play the cluster. Scans in `db` are not cast again, and `storage` is where parts go. `read`
+    reads the points of a committed scan. `on_frame` is called with each frame, in scan order, in
+    the driver's thread, and `on_parts` with parts that were committed. So many scans `fit` into the
+    memory of a batch; `in_all` are those of the whole run, where it has several surveys.
     """
 
     def __init__(
         self,
-        workers: CastingWorkers,
-        stages: LongStages,
+        seat: Seat,
         survey: Survey,
         db: RunDatabase,
         storage: Storage,
@@ -73,94 +67,70 @@ class SurveyDriver:
         on_frame: Callable[[Frame], None],
         on_parts: Callable[[list[Receipt]], None],
         fit: int,
+        in_all: int = 0,
     ) -> None:
-        self.survey = survey
-        self._fit = fit
-        self._workers, self._stages = workers, stages
+        self.survey, self.seat, self.batches = survey, seat, seat.batches
+        self._fit, self._in_all = fit, max(in_all, survey.scan_count)
         self._db, self._storage = db, storage
         self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
         self._mark = db.meta["mark"]
-        self._probe = (probe_name(self._mark, stages.run), secrets.token_bytes(16))
         self._summary = summary_type(samples_of_scan(survey.scan_count))
         self.book = TaskBook()
-        self.batches = Batches()
         self.generated = 0  # scans taken from stage 1, from the first on
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
-        self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
+        self._seconds = seat.seconds  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
         self._hidden: set[str] = set()  # addresses of LIDAR workers that do not see the storage
         self._sorted_at = time.monotonic()  # when the last frames came
-        self._closed = False  # all is committed, and the stages are ending
+        with storing(storage):
+            storage.prepare()
 
     # -- beginning and state ---------------------------------------------------------------
 
-    def start(self) -> None:
-        """Make the pipes and start the stages; after this `stop` and `finish` must be called."""
-        with storing(self._storage):
-            self._storage.prepare()
-            self._storage.write(*self._probe)
-        self._stages.open(self._probe)
-        self._workers.look()
-        self._look_after_stages()
-
     @property
     def finished(self) -> bool:
-        """True once all stages have exited, or the shutdown timeout has elapsed."""
-        return self._closed and self._stages.ended
+        """True once all is committed and was handed out."""
+        return self._db.complete
 
     @property
-    def waits_for(self) -> str:
-        """Partition whose slots other runs hold, so that the stages cannot start; else empty."""
-        return LIDAR if self._stages.waiting else ""
+    def progress(self) -> int:
+        """A number that grows when something is committed or handed out."""
+        return self._db.scans_done + self._db.frames
 
     @property
     def notes(self) -> list[str]:
         """Notes on the survey for the user."""
-        notes = [*self._stages.notes, *self._workers.notes]
-        if self._hidden:
-            notes.append(
-                f"{', '.join(sorted(self._hidden))} of partition {LIDAR} cannot see "
-                f"{self._storage.url}: the driver wrote their parts"
-            )
-        return notes
+        if not self._hidden:
+            return []
+        return [
+            f"{', '.join(sorted(self._hidden))} of partition {LIDAR} cannot see "
+            f"{self._storage.url}: the driver wrote their parts"
+        ]
 
     # -- one step --------------------------------------------------------------------------
 
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
 
-        LidarpoolError if a task of the survey has failed, naming stage and scans.
+        JobError if a task of stage 2 has failed, naming the scans.
         """
         moved = self._receive()
-        if self._closed:  # only receive last messages
-            return moved
         moved |= self._check_casts()
-        if (seen := self._workers.look()) is not None:
+        if (seen := self.seat.whereabouts()) is not None:
             self._leave_workers(seen)
         self._look_after_stages()
         moved |= self._hand_over()
         moved |= self._offer()
         if self._condemned and not self.batches:
-            raise LidarpoolError("\n".join(self._condemned))
-        if self._db.complete:
-            self._stages.close()
-            self._closed = True
+            raise JobError("\n".join(self._condemned))
+        room = policies.room(len(self.batches), self.batches.span, self._most)
+        left = self.generated < self.survey.scan_count
+        self.seat.wants_scans = room > 0 and left and not self._condemned
         return moved
 
-    def wait(self, seconds: float) -> None:
-        """Wait until there may be something to do, at most so long."""
-        room = policies.room(len(self.batches), self.batches.span, self._most)
-        # The pipe of stage 1 is closed after the last scan, which would end each wait.
-        wanted = room > 0 and self.generated < self.survey.scan_count
-        self._stages.wait(
-            min(seconds, CLOSING_S) if self._closed else max(seconds, WAIT_S),
-            self._workers.pending,
-            scans=wanted and not self._condemned and not self._closed,
-        )
-
     def _receive(self) -> bool:
-        messages = self._stages.receive()
+        messages = self.seat.receive()
         self._commit([m for m in messages if isinstance(m, Receipt) and self._is_stored(m)])
         for message in messages:
             match message:
@@ -177,7 +147,7 @@ class SurveyDriver:
 
     @property
     def _most(self) -> int:
-        slots, collectors = self._workers.slot_count, self._stages.collector_count
+        slots, collectors = self.seat.slot_count, self.seat.collector_count
         return policies.most_under_way(slots, collectors, self._per_task)
 
     @property
@@ -186,7 +156,7 @@ class SurveyDriver:
         return policies.batches_per_task(self._seconds, largest, self._fit)
 
     def _trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
-        trace(f"driver.{event}", run=self._stages.run, stage=stage, scans=list(scans), **more)
+        trace(f"driver.{event}", run=self.seat.run, stage=stage, scans=list(scans), **more)
 
     # -- stage 1: taking scans ---------------------------------------------------------------
 
@@ -195,17 +165,20 @@ class SurveyDriver:
         if first < scans.stop:
             self._trace("take", GENERATE, range(first, scans.stop))
             self.generated = scans.stop
-            for run in self._db.missing(first, scans.stop):
-                self.batches.add(*run)
+            for at, stop in self._db.missing(first, scans.stop):
+                for begin in range(at, stop, self._fit):  # advised for another survey perhaps
+                    self.batches.add(begin, min(begin + self._fit, stop))
 
     # -- stage 2: casting --------------------------------------------------------------------
 
     def _offer(self) -> bool:
         """Offer waiting batches to workers that have room."""
-        slots, most = self._workers.slots, self._most
-        chosen = policies.offers([*self.batches], slots, most, self._per_task)
+        if not self.batches.at(Place.WAITING):
+            return False
+        slots, most, beside = self.seat.slots, self._most, self.seat.beside
+        chosen = policies.offers([*self.batches], slots, most, self._per_task, beside)
         for task, worker in chosen:
-            key = self._workers.cast([(batch.first, batch.stop) for batch in task], worker)
+            key = self.seat.cast([(batch.first, batch.stop) for batch in task], worker)
             for batch in task:
                 batch.key, batch.worker, batch.collector = key, worker, ""
                 batch.to(Place.CASTING, time.monotonic())
@@ -215,13 +188,12 @@ class SurveyDriver:
     def _check_casts(self) -> bool:
         moved = False
         for batch in self.batches.at(Place.CASTING):
-            outcome = self._workers.outcome(batch.key)
+            outcome = self.seat.outcome(batch.key, batch.worker)
             if outcome is Outcome.DONE:
                 batch.to(Place.CAST, time.monotonic())
                 self.cast += len(batch)
                 moved = True
             elif outcome is Outcome.NO_RIG:
-                self._workers.drop(batch.worker)
                 self._again(batch, "its worker has no scene any more")
             elif outcome is Outcome.KILLED:
                 self._lose(batch, Loss.DIED)
@@ -229,7 +201,7 @@ class SurveyDriver:
 
     def _leave_workers(self, seen: Whereabouts) -> None:
         """Offer batches again whose workers died, are silent, late, or take no tasks."""
-        prepared, late_s = len(self._workers.slots), policies.late_after_s(self._seconds)
+        prepared, late_s = len(self.seat.slots), policies.late_after_s(self._seconds)
         for batch in self.batches:
             if reason := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
                 self._lose(batch, reason)
@@ -255,7 +227,7 @@ class SurveyDriver:
         """Drop a batch's casting task, unless others of the same task need it."""
         key, batch.key = batch.key, ""
         if all(other.key != key for other in self.batches):
-            self._workers.forget(key)
+            self.seat.forget(key)
 
     # -- poison batches ----------------------------------------------------------------------
 
@@ -273,7 +245,7 @@ class SurveyDriver:
                 f"{batch.name} kills the worker that runs stage {stage}: "
                 f"{policies.KILLS_MOST} workers died, one after the other, with no other scan in "
                 "that stage"
-                f"{self._workers.words_on_memory(worker)}. Look into the logs of the "
+                f"{self.seat.words_on_memory(worker)}. Look into the logs of the "
                 f"{partition} workers."
             )
 
@@ -281,8 +253,11 @@ class SurveyDriver:
 
     def _hand_over(self) -> bool:
         """Assign batches that were cast to collectors."""
+        if not self.batches.at(Place.CAST):
+            return False
         orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
-        for task, name in policies.handovers([*self.batches], self._stages.collectors):
+        batches, beside = [*self.batches], self.seat.beside
+        for task, name in policies.handovers(batches, self.seat.collectors, beside):
             parts = []
             for batch in task:
                 batch.collector = name
@@ -293,7 +268,7 @@ class SurveyDriver:
             order = CollectOrder(task[0].key, task[0].worker, tuple(parts))
             orders.setdefault(name, []).append(order)
         for name, messages in orders.items():
-            self._stages.send(name, messages)
+            self.seat.send(name, messages)
         return bool(orders)
 
     def _is_stored(self, receipt: Receipt) -> bool:
@@ -301,7 +276,7 @@ class SurveyDriver:
         if not receipt.held_at:
             return True
         self._hidden.add(receipt.held_at)
-        data = self._stages.take_held(receipt)
+        data = self.seat.take_held(receipt)
         if data is None:
             for batch in self.batches.within(receipt.first, receipt.stop):
                 if batch.place is Place.COLLECTING:
@@ -330,23 +305,24 @@ class SurveyDriver:
         """Record a task of stage 2, and advise stage 1 on the scans in one item."""
         self.book.add(record)
         self._seconds.append(record.seconds)
-        count, slots = self.survey.scan_count, self._workers.slot_count
-        self._stages.advise(
-            policies.scans_per_batch(record.seconds, record.items, self._fit, count, slots)
+        slots = self.seat.slot_count
+        self.seat.advise(
+            policies.scans_per_batch(record.seconds, record.items, self._fit, self._in_all, slots)
         )
 
     # -- stage 3: frames in order --------------------------------------------------------------
 
     def _look_after_stages(self) -> None:
-        """Take back the batches of a collector that died; a new sorter gets all that it needs."""
-        done, framed = self._db.scans_done, self._db.frames
-        changes = self._stages.look(done + framed, self.generated, framed)
+        """Take back the batches of a collector that died; new stages get all that they need."""
+        changes = self.seat.changes()
         for batch in self.batches.at(Place.COLLECTING):
             name = batch.collector
             if name in changes.died or name in changes.started:
                 self._again(batch, f"{name} was replaced", Place.CAST)
                 if name in changes.died:
                     self._blame(batch, COLLECT, changes.died[name])
+        if GENERATE in changes.started and self.generated < self.survey.scan_count:
+            self.seat.describe(self.survey, self.generated)
         if SORT in changes.started or time.monotonic() - self._sorted_at > STALL_S:
             self._sorted_at = time.monotonic()
             self._send_summaries(self._db.unframed())
@@ -354,9 +330,10 @@ class SurveyDriver:
     def _send_summaries(self, parts: list[Receipt]) -> None:
         """Send parts to the sorter; an absent one gets them when it is started."""
         if parts:
-            messages = [Summaries(part.first, part.stop, part.summaries) for part in parts]
+            framed, count = self._db.frames, self.survey.scan_count
+            messages = [Summaries(p.first, p.stop, p.summaries, framed, count) for p in parts]
             self._trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
-            self._stages.send(SORT, messages)
+            self.seat.send(SORT, messages)
 
     def _take_frames(self, ordered: Summaries) -> None:
         """Hand out frames; some may have been handed out before, by an earlier sorter or run."""
@@ -386,21 +363,3 @@ class SurveyDriver:
         if scan + 1 == part.stop:
             self._db.forget_summaries(part)
         self._trace("release", SORT, [scan])
-
-    # -- the end -----------------------------------------------------------------------------
-
-    def stop(self, reason: str) -> None:
-        """End all stages at once; `finish` does the rest."""
-        for batch in self.batches:
-            self._workers.forget(batch.key)
-        self._stages.stop(reason)
-
-    def finish(self) -> None:
-        """Wait a moment for the stages to end, and clean up scheduler and storage."""
-        try:
-            for record in self._stages.finish(self._workers.futures):
-                self.book.add(record)
-        finally:
-            self._workers.release()
-            with suppress(OSError):
-                self._storage.remove([self._probe[0]])

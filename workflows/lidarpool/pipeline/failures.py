@@ -11,9 +11,13 @@ from poolpart import WorkerLeft
 
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
-from .rigs import RigMissing
+from .rigs import RigFailed, RigMissing
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
+
+
+class JobError(LidarpoolError):
+    """A survey cannot be made; others on the same workers can."""
 
 
 @contextmanager
@@ -46,6 +50,11 @@ def was_killed(future: Future) -> bool:
 def rig_is_missing(future: Future) -> bool:
     """Whether a task of stage 2 failed because its worker had no rig."""
     return isinstance(future.exception(timeout=ASK_S), RigMissing)
+
+
+def rig_has_failed(future: Future) -> bool:
+    """Whether a task of stage 2 failed because its worker could not make the rig."""
+    return future.status == "error" and isinstance(future.exception(timeout=ASK_S), RigFailed)
 
 
 def raise_if_failed(future: Future, what: str) -> None:

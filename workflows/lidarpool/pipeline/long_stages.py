@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -26,9 +27,9 @@ from poolpart import (
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike
 from ..base.storage import Storage
-from ..sensor import Survey
-from .failures import raise_if_failed, was_killed, words_on_memory
-from .messages import CollectOrder, Message, Receipt, StageStart, Summaries
+from ..columns.parts import probe_name
+from .failures import raise_if_failed, storing, was_killed, words_on_memory
+from .messages import CollectOrder, Description, Message, Receipt, StageStart, Summaries
 from .names import COLLECT, GENERATE, SORT
 from .stages import collect, generate, sort_frames
 
@@ -39,6 +40,8 @@ ASK_LOCK_S = 0.05
 LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
 LINGER_S = 0.004  # of a wait, for more messages
 
+Order = Description | CollectOrder | Summaries  # to a stage
+
 
 @dataclass(eq=False)
 class _Task:
@@ -46,7 +49,7 @@ class _Task:
 
     future: Future
     worker: str  # address of the one worker that it may run on
-    inlet: Pipe | None  # from the driver; stage 1 has none
+    inlet: Pipe  # from the driver
     since: float
     dead_since: float | None = None  # it has died, and has not been restarted yet
 
@@ -69,7 +72,8 @@ class LongStages:
     wait for each other for ever.
 
     `run` is the run's id, part of the names of tasks and pipes; `sources` is ``lidarpool`` of its
-    `software`. Stage 1 may be `queue_capacity` items ahead, and slots are waited for `patience_s`.
+    `software`. Parts go to `storage`, where files have the run's `mark`. Stage 1 may be
+    `queue_capacity` items ahead, and slots are waited for `patience_s`.
     """
 
     def __init__(
@@ -78,8 +82,8 @@ class LongStages:
         partition: Partition,
         run: str,
         sources: str,
-        survey: Survey,
         storage: Storage,
+        mark: str,
         *,
         queue_capacity: int,
         collectors: int,
@@ -87,17 +91,17 @@ class LongStages:
     ) -> None:
         self.client, self.partition, self.run = client, partition, run
         self.collector_count = collectors
-        self._sources, self._survey, self._storage = sources, survey, storage
+        self._sources, self._storage = sources, storage
         self._patience_s = patience_s
         self._names = [GENERATE, SORT, *(f"{COLLECT}-{number}" for number in range(collectors))]
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
-        self._first: dict[str, int] = {}  # {stage: the scan that it begins with when started}
-        self._probe = ("", b"")
+        # A file in the storage, by which collectors find out whether they see it.
+        self._probe = (probe_name(mark, run), secrets.token_bytes(16))
         self._scans = self._pipe("scans", queue_capacity)
         self._news = self._pipe("news", 64)  # from stages 3 and 4
         self._inbox: list[Message] = []
-        self._outbox: dict[str, list[Sequence[CollectOrder | Summaries]]] = {}  # by pipe
+        self._outbox: dict[str, list[Sequence[Order]]] = {}  # by pipe
         self._looked_at = 0.0
         self._progress = -1  # when something was last committed
         self._deaths: dict[str, list[str]] = {}  # {name: workers that have died since then}
@@ -107,12 +111,11 @@ class LongStages:
         self._closed_at: float | None = None
         self.notes: list[str] = []  # what a user should know
 
-    def open(self, probe: tuple[str, bytes]) -> None:
-        """Make the pipes; `look` starts the stages.
-
-        Collectors find out by `probe`, name and content of a file, whether they see the storage.
-        """
-        self._probe = probe
+    def open(self) -> None:
+        """Make the pipes; `look` starts the stages, and `finish` must be called after this."""
+        with storing(self._storage):
+            self._storage.prepare()
+            self._storage.write(*self._probe)
         for pipe in (self._scans, self._news):
             pipe.create()
 
@@ -135,13 +138,13 @@ class LongStages:
         messages, self._inbox = self._inbox, []
         return messages
 
-    def send(self, name: str, messages: Sequence[CollectOrder | Summaries]) -> None:
-        """Send messages to a stage 3 or 4 with the next `wait`.
+    def send(self, name: str, messages: Sequence[Order]) -> None:
+        """Send messages to a stage with the next `wait`.
 
         They are lost if it is not running, or is being replaced: then it gets all of it.
         """
         task = self._tasks.get(name)
-        if task is not None and task.inlet is not None:
+        if task is not None:
             self._outbox.setdefault(task.inlet.name, []).append(messages)
 
     def advise(self, scans: int) -> None:
@@ -223,11 +226,10 @@ class LongStages:
 
     # -- looking after them ------------------------------------------------------------------
 
-    def look(self, progress: int, generated: int, framed: int) -> StageChanges:
+    def look(self, progress: int) -> StageChanges:
         """From time to time, start all stages, or those again that died or wait behind another.
 
-        `progress` is any number that grows when something is committed; so many scans were
-        `generated`, taken from stage 1, and `framed`, handed out as frames.
+        `progress` is any number that grows when something is committed.
 
         LidarpoolError if a stage has failed, or keeps dying with nothing committed in between, or
         the partition has too few slots for too long.
@@ -236,7 +238,6 @@ class LongStages:
         if now - self._looked_at < LOOK_EVERY_S:
             return StageChanges()
         self._looked_at = now
-        self._first = {GENERATE: generated, SORT: framed}
         if progress > self._progress:
             self._progress, self._deaths = progress, {}
         if not self._tasks:
@@ -312,9 +313,9 @@ class LongStages:
         free[worker] -= 1
         number, self._submitted = self._submitted, self._submitted + 1
         earlier = self._tasks.get(name)
-        if earlier is not None and earlier.inlet is not None:
+        if earlier is not None:
             forget_pipes(self.client, [earlier.inlet.name])
-        inlet = None if name == GENERATE else self._pipe(f"{name}-{number}", 1_000_000).create()
+        inlet = self._pipe(f"{name}-{number}", 1_000_000).create()
         future = self.partition.submit(
             call_alike,
             self._sources,
@@ -326,13 +327,12 @@ class LongStages:
         if earlier is not None:
             earlier.future.cancel()  # if it still runs, its result is dropped
 
-    def _work(self, me: StageStart, inlet: Pipe | None) -> tuple[Any, ...]:
+    def _work(self, me: StageStart, inlet: Pipe) -> tuple[Any, ...]:
         """Return the function of a stage and its arguments."""
-        first = self._first.get(me.stage, 0)
         if me.stage == GENERATE:
-            return generate, me, self._survey, self._scans, first
+            return generate, me, inlet, self._scans
         if me.stage == SORT:
-            return sort_frames, me, first, inlet, self._news
+            return sort_frames, me, inlet, self._news
         return collect, me, self._storage, self._probe, inlet, self._news
 
     # -- the end -----------------------------------------------------------------------------
@@ -344,8 +344,13 @@ class LongStages:
         self._closed_at = time.monotonic()
 
     @property
+    def closed(self) -> bool:
+        """Whether the stages were told to end."""
+        return self._closed_at is not None
+
+    @property
     def _inlets(self) -> list[Pipe]:
-        return [task.inlet for task in self._tasks.values() if task.inlet is not None]
+        return [task.inlet for task in self._tasks.values()]
 
     @property
     def _done(self) -> bool:
@@ -384,6 +389,8 @@ class LongStages:
             self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
             # In one message: the answer to a second one could miss a client that leaves.
             self.client.cancel([*futures, *others])
+            with suppress(OSError):
+                self._storage.remove([self._probe[0]])
 
 
 def _forget_lock(name: str, dask_scheduler: Any = None) -> None:

@@ -1,6 +1,6 @@
 """Messages between the four stages and the driver: descriptions, summaries and receipts.
 
-Their size does not depend on the number of points.
+Their size does not depend on the number of points. Each says which `job` of a run it is about.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from poolpart import TaskRecord
 
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
-from ..sensor import Pose
+from ..sensor import Pose, Survey
 
 Span = tuple[int, int]  # the first scan of a batch, and its end
 
@@ -40,7 +40,7 @@ def summary_type(samples: int) -> np.dtype[np.void]:
 class StageStart:
     """One start of a stage, for its traces."""
 
-    run: str  # id of the survey
+    run: str  # id of the run
     stage: str
     attempt: int  # starts of stages before this one
 
@@ -50,11 +50,21 @@ class StageStart:
 
 
 @dataclass(frozen=True, slots=True)
+class Description:
+    """To stage 1: describe the scans of a survey from `first` on."""
+
+    survey: Survey
+    first: int
+    job: str = ""
+
+
+@dataclass(frozen=True, slots=True)
 class ScanRange:
     """From stage 1: scans `first` to `stop` can be described, and may be cast."""
 
     first: int
     stop: int
+    job: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,6 +74,9 @@ class Summaries:
     first: int
     stop: int
     data: bytes  # of an array of `summary_type`
+    framed: int = 0  # scans that had been handed out when it was sent, from the first on
+    scan_count: int = 0  # of the survey
+    job: str = ""
 
     @property
     def scans(self) -> range:
@@ -78,6 +91,7 @@ class CollectOrder:
     key: str  # of the casting task
     worker: str  # address of the worker that has its result
     parts: tuple[tuple[Span, str], ...]  # scans and name of each
+    job: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -85,6 +99,7 @@ class ColumnsLost:
     """From stage 4: the result of casting task `key` could not be fetched."""
 
     key: str
+    job: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +116,7 @@ class Receipt:
     summaries: bytes  # of its scans, of `summary_type`
     record: TaskRecord | None = None  # the casting task; None for a receipt from the database
     held_at: str = ""  # worker that holds the part because it does not see the storage; else ""
+    job: str = ""
 
 
 # To the driver.

@@ -79,7 +79,11 @@ def suspect(batch: Batch, stage: str) -> bool:
 
 
 def offers(
-    batches: Sequence[Batch], slots: Mapping[str, int], most: int, per_task: int = 1
+    batches: Sequence[Batch],
+    slots: Mapping[str, int],
+    most: int,
+    per_task: int = 1,
+    beside: Sequence[Batch] = (),
 ) -> list[tuple[list[Batch], str]]:
     """Choose workers for waiting batches, at most so many under way in all.
 
@@ -87,15 +91,17 @@ def offers(
     of fewer only if a slot is idle and stage 4 keeps up. A batch with which a worker has died gets
     a task for itself, or its neighbours would share the blame for the next one. A suspect batch
     gets a worker for itself, and is waited for: the others must not occupy all workers. `slots`
-    says how many tasks each worker runs at a time.
+    says how many tasks each worker runs at a time; `beside` are batches of other surveys, which
+    are under way on the same workers.
     """
-    casting = [b for b in batches if b.place is Place.CASTING]
+    under_way = [*batches, *(b for b in beside if b.place is not Place.WAITING)]
+    casting = [b for b in under_way if b.place is Place.CASTING]
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
-    left = most - sum(b.place in (Place.CAST, Place.COLLECTING) for b in batches)
+    left = most - sum(b.place in (Place.CAST, Place.COLLECTING) for b in under_way)
     left -= sum(b.worker in slots for b in casting)
     waiting = deque(b for b in batches if b.place is Place.WAITING)
-    backlog = any(b.place is Place.CAST for b in batches)
+    backlog = any(b.place is Place.CAST for b in under_way)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
     size = per_task if backlog else min(per_task, -(-len(waiting) // max(1, idle)))
     chosen: list[tuple[list[Batch], str]] = []
@@ -125,16 +131,17 @@ def offers(
 
 
 def handovers(
-    batches: Sequence[Batch], collectors: Mapping[str, str]
+    batches: Sequence[Batch], collectors: Mapping[str, str], beside: Sequence[Batch] = ()
 ) -> list[tuple[list[Batch], str]]:
     """Choose collectors for batches that were cast, those of a task together.
 
     Those with which a collector has died come alone. A collector on the host of the columns is
     preferred. A suspect batch is collected while there is no other in stage 4: several collectors
-    may share a process. `collectors` has the address of the worker of each.
+    may share a process. `collectors` has the address of the worker of each; `beside` are batches of
+    other surveys.
     """
     ready = [b for b in batches if b.place is Place.CAST]
-    busy = [b for b in batches if b.place is Place.COLLECTING]
+    busy = [b for b in (*batches, *beside) if b.place is Place.COLLECTING]
     if suspects := [b for b in ready if suspect(b, COLLECT)]:
         ready = [] if busy else suspects[:1]
     if any(suspect(b, COLLECT) for b in busy):

@@ -1,8 +1,9 @@
 """Rigs of GPU workers: each process makes a survey's rig once, and casting tasks name it.
 
-A task bound to the worker makes it and keeps it in a table of this module. A task's result would
-not work: Dask drops copies that no task needs at an instant, and every new copy would build its
-tree again.
+The first task of a survey on a worker brings what the rig is made of; the worker keeps it in a
+table of this module, and the scene with its trees for other surveys of the same scene. A task's
+result would not work: Dask drops copies that no task needs at an instant, and every new copy would
+build its tree again.
 """
 
 from __future__ import annotations
@@ -18,11 +19,13 @@ from distributed import get_worker
 from poolpart import own_device
 
 from ..base.tracing import trace
+from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.rig import Rig
 
 UNUSED_S = 600.0  # a rig unused for so long is dropped when another is made
+RIGS, SCENES = 32, 4  # of one run that are kept at most
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,46 +36,113 @@ class RigPlan:
     survey: Survey
     backend: str
 
-    def packed(self) -> bytes:
-        """Bytes to send to workers, which check their version before they unpickle them."""
+    def packed(self, scene: str) -> bytes:
+        """All but the scene's still part, which has the name `scene`, as bytes to send to workers.
+
+        Workers check their version before they unpickle them.
+        """
         # Sensors and columns of a user's script, including lambdas, are sent by value.
-        return cloudpickle.dumps(self, protocol=5)
+        packed = (scene, self.scene.actors, self.survey, self.backend)
+        return cloudpickle.dumps(packed, protocol=5)
+
+    def packed_scene(self) -> bytes:
+        """Return the scene's still part as bytes."""
+        return cloudpickle.dumps(self.scene.with_actors(()), protocol=5)
+
+    @property
+    def still(self) -> tuple[int, ...]:
+        """Identity of the scene's still part while it exists: surveys of it share their trees."""
+        scene = self.scene
+        return id(scene.vertices), id(scene.faces), id(scene.instances)
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
-    """The worker has no such rig: it was restarted, or has dropped it."""
+    """The worker has no such rig, or its scene: it was restarted, or has dropped it."""
 
 
-_rigs: dict[str, Rig] = {}  # {handle: the rig of this process}
-_used_at: dict[str, float] = {}  # {handle: when it was asked for}
+class RigFailed(RuntimeError):  # noqa: N818
+    """The rig of a survey cannot be made."""
+
+
+@dataclass(eq=False)
+class _Kept:
+    """A rig, or a scene with one of its rigs, and when it was asked for."""
+
+    rig: Rig
+    used_at: float
+
+
+_rigs: dict[str, _Kept] = {}  # {handle: the rig of this process}
+_scenes: dict[str, _Kept] = {}  # {handle: a rig of the scene}
 _lock = threading.Lock()
 
 
-def set_up(handle: str, packed: bytes) -> None:
-    """Make a rig in this process, unless it exists; runs on a GPU worker."""
+def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -> Rig:
+    """Return a rig of this process, made of a plan and scene if there is none.
+
+    RigMissing if it is not there, or its scene is not, and nothing to make it of; RigFailed if it
+    cannot be made.
+    """
     with _lock:
-        if handle in _rigs:
-            return
-        now = time.monotonic()
-        for other in [h for h, used_at in list(_used_at.items()) if now - used_at > UNUSED_S]:
-            drop_rig(other)
-        plan: RigPlan = pickle.loads(packed)  # noqa: S301 - of the run's own driver, by Dask
-        threads = get_worker().state.nthreads
-        _rigs[handle] = Rig(plan.scene, plan.survey, plan.backend, threads, own_device())
-        _used_at[handle] = time.monotonic()
-        trace("intersect.built", run=handle, stage="intersect", scans=[])
+        kept = _rigs.get(handle)
+        if kept is None:
+            kept = _rigs[handle] = _Kept(_made(handle, plan, scene), 0.0)
+        kept.used_at = time.monotonic()
+        return kept.rig
 
 
-def rig_of(handle: str) -> Rig:
-    """Return a rig of this process; RigMissing if there is none."""
-    rig = _rigs.get(handle)
-    if rig is None:
+def _made(handle: str, plan: bytes | None, scene: bytes | None) -> Rig:
+    if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
-    _used_at[handle] = time.monotonic()
+    try:
+        name, actors, survey, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
+        found = _scenes.get(name)
+        if found is None and scene is None:
+            raise RigMissing(f"This worker has no scene {name!r}.")
+        _make_room(handle, name)
+        rig = _assembled(found, scene, actors, survey, backend)
+    except RigMissing:
+        raise
+    except Exception as error:
+        raise RigFailed(str(error) or type(error).__name__) from error
+    _scenes[name] = _Kept(rig, time.monotonic())
+    trace("intersect.built", run=handle, stage="intersect", scans=[])
     return rig
 
 
-def drop_rig(handle: str) -> None:
-    """Drop a rig; no error if there is none."""
-    _rigs.pop(handle, None)
-    _used_at.pop(handle, None)
+def _assembled(
+    found: _Kept | None,
+    scene: bytes | None,
+    actors: tuple[Actor, ...],
+    survey: Survey,
+    backend: str,
+) -> Rig:
+    if found is not None:
+        return found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
+    assert scene is not None
+    still: Scene = pickle.loads(scene)  # noqa: S301
+    threads = get_worker().state.nthreads
+    return Rig(still.with_actors(actors), survey, backend, threads, own_device())
+
+
+def _make_room(handle: str, scene: str) -> None:
+    """Drop rigs and scenes that nobody has used for long, and the oldest of this run beyond some.
+
+    Rigs of surveys that follow each other are not used again.
+    """
+    run = handle.partition(".")[0]
+    for kept, most, new in ((_rigs, RIGS, handle), (_scenes, SCENES, scene)):
+        now = time.monotonic()
+        ours = sorted((one.used_at, h) for h, one in kept.items() if h.partition(".")[0] == run)
+        oldest = [h for _, h in ours[: max(0, len(ours) + (new not in kept) - most)]]
+        unused = [h for h, one in kept.items() if now - one.used_at > UNUSED_S]
+        for one in {*oldest, *unused} - {new}:
+            kept.pop(one, None)
+
+
+def drop_rigs(run: str) -> None:
+    """Drop the rigs and scenes of a run."""
+    with _lock:
+        for kept in (_rigs, _scenes):
+            for handle in [h for h in kept if h.partition(".")[0] == run]:
+                del kept[handle]

@@ -8,6 +8,8 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import replace
 from itertools import chain
 
 from distributed import secede
@@ -26,10 +28,17 @@ from poolpart import (
 
 from ..base.storage import Storage
 from ..columns.parts import pack
-from ..sensor import Survey
 from .cast import CastBatch
 from .failures import naming_scans, storing
-from .messages import CollectOrder, ColumnsLost, Receipt, ScanRange, StageStart, Summaries
+from .messages import (
+    CollectOrder,
+    ColumnsLost,
+    Description,
+    Receipt,
+    ScanRange,
+    StageStart,
+    Summaries,
+)
 from .names import COLLECT, GENERATE, LIDAR, SORT
 
 TELL_EVERY_S = 0.02  # messages that follow each other so fast travel together
@@ -37,70 +46,81 @@ FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
 
 
 @telling_departure()
-def generate(me: StageStart, survey: Survey, outlet: Pipe, first: int) -> TaskRecord:
-    """Stage 1: describe every scan from `first` on, with the advised number in one item.
+def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
+    """Stage 1: describe the scans of surveys, one after the other, the advised number in one item.
 
-    An item is a `ScanRange`: the survey describes the scans equally on every worker.
+    From the driver come lists of `Description`. An item is a `ScanRange`: the survey describes the
+    scans equally on every worker.
     """
     secede()
     recorder = Recorder(GENERATE, LIDAR)
-    sent = first
+    scans = 0
     me.trace("start")
-    try:
-        while sent < survey.scan_count:
-            items: list[ScanRange] = []
-            until = time.monotonic() + TELL_EVERY_S
-            while not items or (
-                sent < survey.scan_count
-                and len(items) < outlet.capacity
-                and time.monotonic() < until
-            ):
-                item = ScanRange(sent, min(sent + outlet.advice, survey.scan_count))
-                with naming_scans(item.first, item.stop - 1):
-                    survey.scan(item.stop - 1)  # raises here if a scan cannot be described
-                me.trace("put", range(item.first, item.stop))
-                items.append(item)
-                sent = item.stop
-            outlet.put_many(items)
-            for item in items:
-                me.trace("sent", range(item.first, item.stop))
-        outlet.close()
-    except PipeFailed:
-        pass
-    except PipeClosed:  # an earlier start of this task has closed it
-        sent = survey.scan_count
-    return recorder.done(sent - first)
+    with suppress(PipeClosed, PipeFailed):
+        while True:
+            for one in chain.from_iterable(inlet.get_all()):
+                _describe(me, one, outlet)
+                scans += one.survey.scan_count - one.first
+    return recorder.done(scans)
+
+
+def _describe(me: StageStart, one: Description, outlet: Pipe) -> None:
+    survey, sent = one.survey, one.first
+    while sent < survey.scan_count:
+        items: list[ScanRange] = []
+        until = time.monotonic() + TELL_EVERY_S
+        while not items or (
+            sent < survey.scan_count and len(items) < outlet.capacity and time.monotonic() < until
+        ):
+            item = ScanRange(sent, min(sent + outlet.advice, survey.scan_count), one.job)
+            with naming_scans(item.first, item.stop - 1):
+                survey.scan(item.stop - 1)  # raises here if a scan cannot be described
+            me.trace("put", range(item.first, item.stop))
+            items.append(item)
+            sent = item.stop
+        outlet.put_many(items)
+        for item in items:
+            me.trace("sent", range(item.first, item.stop))
 
 
 @telling_departure()
-def sort_frames(me: StageStart, following: int, inlet: Pipe, outlet: Pipe) -> TaskRecord:
-    """Stage 3: put the summaries of scans into scan order.
+def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
+    """Stage 3: put the summaries of the scans of each survey into scan order.
 
-    All before the scan `following` have been handed out. From the driver come lists of `Summaries`,
-    and to it goes each of them once those before it went.
+    From the driver come lists of `Summaries`, and to it goes each of them once those before it
+    went, or had been handed out already, as they say.
     """
     secede()
     recorder = Recorder(SORT, LIDAR)
-    waiting: dict[int, Summaries] = {}  # {first scan that is wanted of them: summaries}
-    begin = following
-    try:
-        me.trace("start")
+    following: dict[str, int] = {}  # {job: the scan that comes next}
+    waiting: dict[str, dict[int, Summaries]] = {}  # {job: {first scan that is wanted: summaries}}
+    count = 0
+    me.trace("start")
+    with suppress(PipeClosed, PipeFailed):
         while True:
+            jobs: dict[str, int] = {}  # those with news, and where they were
             for item in chain.from_iterable(inlet.get_all()):
                 me.trace("get", item.scans)
-                if item.stop > following:
-                    waiting[max(item.first, following)] = item
-            ready, at = [], following
-            while (item := waiting.pop(following, None)) is not None:
-                ready.append(item)
-                following = item.stop
+                at = max(following.get(item.job, 0), item.framed)
+                following[item.job] = jobs[item.job] = at
+                if item.stop > at:
+                    waiting.setdefault(item.job, {})[max(item.first, at)] = item
+            ready = []
+            for job in jobs:
+                while (item := waiting.get(job, {}).pop(following[job], None)) is not None:
+                    ready.append(item)
+                    following[job] = item.stop
+                    if item.stop == item.scan_count:  # nothing follows
+                        waiting.pop(job)
             if ready:
-                me.trace("put", range(at, following))
+                scans = [*chain.from_iterable(item.scans for item in ready)]
+                me.trace("put", scans)
                 outlet.put_many(ready, unbounded=True)
-                me.trace("sent", range(at, following))
-    except (PipeClosed, PipeFailed):
-        pass
-    return recorder.done(following - begin)
+                me.trace("sent", scans)
+                count += len(scans)
+            for job in [job for job in jobs if job not in waiting]:
+                del following[job]
+    return recorder.done(count)
 
 
 @telling_departure()
@@ -149,12 +169,12 @@ def _collected(
     """Make the parts of a casting task; gives the messages to the driver."""
     found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
     if order.key not in found:
-        yield ColumnsLost(order.key)
+        yield ColumnsLost(order.key, order.job)
         return
     batches: dict[int, CastBatch] = {batch.part.first: batch for batch in found[order.key]}
     for (first, stop), name in order.parts:
         me.trace("get", range(first, stop))
-        yield _stored(me, storage, batches[first], stop, name)
+        yield replace(_stored(me, storage, batches[first], stop, name), job=order.job)
 
 
 def _stored(

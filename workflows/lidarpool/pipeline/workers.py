@@ -1,4 +1,4 @@
-"""The GPU workers and their casting tasks: prepared, refused, paused, silent, gone."""
+"""The GPU workers and their casting tasks: checked, refused, paused, silent, gone."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
 
@@ -16,16 +17,24 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from .cast import intersect
-from .failures import raise_if_failed, rig_is_missing, was_killed, words_on_memory
+from .failures import (
+    JobError,
+    raise_if_failed,
+    rig_has_failed,
+    rig_is_missing,
+    was_killed,
+    words_on_memory,
+)
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigPlan, drop_rig
+from .rigs import SCENES, RigPlan, drop_rigs
 
 LOOK_EVERY_S = 1.0
-SETUP_DEATHS = 4  # workers in a row that may die while they prepare themselves
-ANSWER_S = 1.0  # longest wait for a prepared worker's answer without a sign of life
+SETUP_DEATHS = 4  # workers in a row that may die while they are checked
+ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
 RELEASE_S = 3.0  # for workers to drop their rigs
-PREPARING = "preparing the scene on the GPU workers"
+INLINE_BYTES = 1 << 17  # larger things are sent to a worker once, and fetched from there by others
+CHECKING, PREPARING = "checking the GPU workers", "preparing the scene on the GPU workers"
 
 
 class Outcome(Enum):
@@ -37,48 +46,69 @@ class Outcome(Enum):
     NO_RIG = "no rig"  # its worker has dropped the scene
 
 
+@dataclass(eq=False)
+class _Packed:
+    """What tasks bring to workers that lack it: bytes, or what a worker has of a large thing."""
+
+    name: str  # on the workers
+    data: bytes | Future
+    there: set[str] = field(default_factory=set)  # addresses of workers that have it
+
+
+@dataclass(eq=False)
+class _Survey:
+    """What a survey's rig is made of."""
+
+    plan: RigPlan
+    rig: _Packed
+    scene: _Packed  # its still part, which other surveys may share
+
+
 class CastingWorkers:
-    """The GPU workers with a rig, and their tasks; each makes its own rig, including late ones.
+    """The GPU workers that may cast, and their casting tasks, for all surveys of a run.
 
     A worker's software is checked before it unpickles anything: a worker with other sources of
     lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts nothing.
+    The first tasks of a survey on a worker bring what that worker makes its rig of.
 
-    Rigs have the name `handle` and are made of `plan`; `software` is that of the workers that may
-    cast, see `base.software`.
+    `run` is the run's id; `software` is that of the workers that may cast, see `base.software`.
     """
 
     def __init__(
         self,
         client: Client,
         partition: Partition,
-        handle: str,
-        plan: RigPlan,
+        run: str,
+        backend: str,
         software: Mapping[str, str],
     ) -> None:
-        self._client, self._partition = client, partition
-        self.handle, self._packed = handle, plan.packed()
-        self._backend, self._software = plan.backend, dict(software)
-        self._plan: Future | None = None  # the packed plan, on the workers
-        self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
+        self._client, self._partition, self.run = client, partition, run
+        self.backend, self._software = backend, dict(software)
+        self._surveys: dict[str, _Survey] = {}  # by job
+        # Those that surveys had last; their plans keep what they are known by.
+        self._scenes: dict[tuple[int, ...], tuple[RigPlan, _Packed]] = {}
+        self._setups: dict[str, Future] = {}  # {address: task that checks the worker}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = self._offered = 0
         self._casts: dict[str, Future] = {}  # {key: casting task}
-        self._died: list[str] = []  # workers that died while preparing, in a row
+        self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
         self.seen = Whereabouts()
-        self.slots: dict[str, int] = {}  # {address of a prepared worker: batches at a time}
+        self.slots: dict[str, int] = {}  # {address of a worker that may cast: tasks at a time}
         self.notes: list[str] = []  # what a user should know
 
     @property
     def slot_count(self) -> int:
-        """Batches that all prepared workers cast at a time; at least 1."""
+        """Tasks that all workers cast at a time; at least 1."""
         return max(1, sum(self.slots.values()))
 
     @property
     def futures(self) -> list[Future]:
         """All tasks."""
-        plan = [self._plan] if self._plan else []
-        return [*self._casts.values(), *self._setups.values(), *plan]
+        rigs = (one.rig.data for one in self._surveys.values())
+        scenes = (scene.data for _, scene in self._scenes.values())
+        brought = [data for data in (*rigs, *scenes) if isinstance(data, Future)]
+        return [*self._casts.values(), *self._setups.values(), *brought]
 
     @property
     def pending(self) -> list[str]:
@@ -86,29 +116,66 @@ class CastingWorkers:
         casts = [key for key, future in self._casts.items() if future.status == "pending"]
         return casts + [f.key for a, f in self._setups.items() if a not in self.slots]
 
+    # -- surveys ---------------------------------------------------------------------------
+
+    def add(self, job: str, plan: RigPlan) -> None:
+        """Let a survey be cast."""
+        _, scene = self._scenes.pop(plan.still, (plan, None))
+        if scene is None:
+            scene = self._packed("scene", plan.packed_scene())
+        self._scenes[plan.still] = (plan, scene)  # the last used
+        while len(self._scenes) > SCENES:
+            del self._scenes[next(iter(self._scenes))]
+        rig = self._packed(job, plan.packed(scene.name))
+        self._surveys[job] = _Survey(plan, rig, scene)
+
+    def remove(self, job: str) -> None:
+        """Cast nothing more of a survey; its tasks must have been forgotten."""
+        self._surveys.pop(job, None)
+
+    def _packed(self, what: str, data: bytes) -> _Packed:
+        self._count += 1
+        name = f"{self.run}.{what}-{self._count}"
+        return _Packed(name, data if len(data) <= INLINE_BYTES else self._shared(name, data))
+
+    def _shared(self, name: str, data: bytes) -> Future:
+        self._count += 1
+        return share(self._partition, data, key=f"{name}-packed-{self._count}", priority=10)
+
     # -- casting ---------------------------------------------------------------------------
 
-    def cast(self, spans: Sequence[Span], worker: str) -> str:
-        """Offer batches to a worker as one task; returns its key."""
+    def cast(self, job: str, spans: Sequence[Span], worker: str) -> str:
+        """Offer batches of a survey to a worker as one task; returns its key."""
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
+        one = self._surveys[job]
         self._offered += 1
-        key = f"{INTERSECT}-{self.handle}-{spans[0][0]}-{spans[-1][1]}.{self._offered}"
+        key = f"{INTERSECT}-{one.rig.name}-{spans[0][0]}-{spans[-1][1]}.{self._offered}"
+        brought = [
+            None if worker in packed.there else packed.data for packed in (one.rig, one.scene)
+        ]
         self._casts[key] = self._partition.submit(
-            intersect, self.handle, spans, key=key, workers=worker
+            intersect, one.rig.name, spans, *brought, key=key, workers=worker
         )
         return key
 
-    def outcome(self, key: str) -> Outcome:
-        """State of a casting task; LidarpoolError if it has failed."""
-        future = self._casts[key]
+    def outcome(self, job: str, key: str, worker: str) -> Outcome:
+        """State of a casting task; JobError if it has failed."""
+        future, one = self._casts[key], self._surveys[job]
         if future.status == "finished":
+            for packed in (one.rig, one.scene):
+                packed.there.add(worker)
             return Outcome.DONE
         if future.status == "error" and rig_is_missing(future):
+            for packed in (one.rig, one.scene):
+                packed.there.discard(worker)
             return Outcome.NO_RIG
         if future.status == "error" and was_killed(future):
             return Outcome.KILLED
-        raise_if_failed(future, f"stage {INTERSECT}")  # the error names the scans
+        try:  # the error names the scans
+            raise_if_failed(future, PREPARING if rig_has_failed(future) else f"stage {INTERSECT}")
+        except LidarpoolError as error:
+            raise JobError(str(error)) from error.__cause__
         return Outcome.PENDING
 
     def forget(self, key: str) -> None:
@@ -120,13 +187,13 @@ class CastingWorkers:
         """Clause for a message about a dead worker, if a nanny ended it for its memory."""
         return words_on_memory(self._client, [worker])
 
-    # -- preparing workers -------------------------------------------------------------------
+    # -- checking workers --------------------------------------------------------------------
 
     def look(self) -> Whereabouts | None:
         """From time to time, handle workers that have joined or left, or take no tasks.
 
         Returns where workers and casting tasks are, None if it is not time to look. LidarpoolError
-        if preparing the scene fails, or kills several workers in a row.
+        if no worker may cast, or several in a row die while they are checked.
         """
         if time.monotonic() - self._looked_at <= LOOK_EVERY_S:
             self._check()
@@ -143,7 +210,7 @@ class CastingWorkers:
         return self.seen
 
     def _check(self) -> None:
-        """Record the workers that are prepared."""
+        """Record the workers that may cast."""
         for address, future in list(self._setups.items()):
             if address in self.slots:
                 if address not in self.seen.free:
@@ -151,14 +218,12 @@ class CastingWorkers:
             elif future.status == "finished" and address in self.seen.free:
                 self._take(address, future)
             elif future.status == "error" and not was_killed(future):
-                raise_if_failed(future, PREPARING)
-        if self._plan is not None and self._plan.status in ("lost", "cancelled", "error"):
-            self._plan = None  # sent again for the next worker that needs it
-
-    def drop(self, address: str) -> None:
-        """Prepare a worker again: its rig is gone."""
-        self._setups.pop(address, None)
-        self.slots.pop(address, None)
+                raise_if_failed(future, CHECKING)
+        for one in self._surveys.values():
+            if _is_gone(one.rig.data):
+                one.rig.data = self._shared(one.rig.name, one.plan.packed(one.scene.name))
+            if _is_gone(one.scene.data):
+                one.scene.data = self._shared(one.scene.name, one.plan.packed_scene())
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
@@ -168,23 +233,18 @@ class CastingWorkers:
             # Dask tries for half a minute to reach a worker that is ending.
             with suppress(TimeoutError):
                 self._client.run(
-                    drop_rig,
-                    self.handle,
+                    drop_rigs,
+                    self.run,
                     workers=addresses,
                     on_error="ignore",
                     callback_timeout=RELEASE_S,
                 )
 
     def _prepare(self, address: str) -> None:
-        if self._plan is None:
-            key = f"scene-{self.handle}-{self._count}"
-            self._plan = share(self._partition, self._packed, key=key)
         self._count += 1
         self._setups[address] = self._partition.submit(
-            _preparation(self._backend, self._software),
-            self.handle,
-            self._plan,
-            key=f"prepare-{self.handle}-{self._count}",
+            _preparation(self.backend),
+            key=f"check-{self.run}-{self._count}",
             priority=10,
             workers=address,
         )
@@ -211,9 +271,12 @@ class CastingWorkers:
         self._died.clear()
 
     def _remove(self, address: str) -> None:
-        """Remove a worker that has gone; the scene may have killed it."""
+        """Remove a worker that has gone."""
         future = self._setups.pop(address)
         self._refused.pop(address, None)
+        for one in self._surveys.values():
+            one.rig.there.discard(address)
+            one.scene.there.discard(address)
         if self.slots.pop(address, None) is not None:
             return
         place = self.seen.tasks.get(future.key)
@@ -221,10 +284,14 @@ class CastingWorkers:
             self._died.append(address)
         if len(self._died) >= SETUP_DEATHS and not self.slots:
             raise LidarpoolError(
-                f"{PREPARING} has killed {len(self._died)} of them in a row"
+                f"{CHECKING} has killed {len(self._died)} of them in a row"
                 f"{words_on_memory(self._client, self._died)}: "
-                "look into their logs, or try another backend."
+                "look into their logs."
             )
+
+
+def _is_gone(data: bytes | Future) -> bool:
+    return isinstance(data, Future) and data.status in ("lost", "cancelled", "error")
 
 
 def share(partition: Partition, thing: Any, **options: Any) -> Future:
@@ -239,24 +306,19 @@ def _same(thing: Any) -> Any:
     return thing
 
 
-def _preparation(backend: str, wanted: dict[str, str]) -> Callable[[str, bytes], dict[str, Any]]:
-    """Make the task that prepares a worker.
+def _preparation(backend: str) -> Callable[[], dict[str, Any]]:
+    """Make the task that checks a worker.
 
     It is nested, so that it is sent by value: a worker without the package, or with another
     version, can still say so.
     """
     software = software_there(backend)
 
-    def prepare(handle: str, packed: bytes) -> dict[str, Any]:
+    def prepare() -> dict[str, Any]:
         from distributed import get_worker
 
         worker = get_worker()
         slots = {name: int(count) for name, count in worker.state.total_resources.items()}
-        here = software()
-        if here == wanted:
-            from lidarpool.pipeline.rigs import set_up
-
-            set_up(handle, packed)
-        return {"worker": str(worker.name), "software": here, "slots": slots}
+        return {"worker": str(worker.name), "software": software(), "slots": slots}
 
     return prepare

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from functools import partial
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from ..simulator.world import check_backend_here
 from .progress import Progress, Show
 from .ranges import LidarWorkers
 from .result import RunResult
-from .run import Run, make_result
+from .run import drive, make_result
 from .store import RunStore
 from .watch import Waiting
 
@@ -76,14 +76,18 @@ def conducted(
             waiting = Waiting(store.job.wait_s, tell)
             client = stack.enter_context(cluster(waiting))
             with progress as show:
-                run = Run(client, store, tell, waiting)
-                with nullcontext() if own else run.partitions_page():
-                    result = run.drive(
-                        partial(live.on_frame, take=on_frame),
-                        live.with_progress(show, run.partitions),
-                    )
+                result, on = drive(
+                    client,
+                    store,
+                    tell,
+                    waiting,
+                    own=own,
+                    on_frame=partial(live.on_frame, take=on_frame),
+                    watched=live.with_progress,
+                    show=show,
+                )
             if keep:
-                workers = LidarWorkers(client, run.partitions[LIDAR], store.job.patience_s, tell)
+                workers = LidarWorkers(client, on.partitions[LIDAR], store.job.patience_s, tell)
             else:
                 stack.close()
         yield result, workers

@@ -1,14 +1,14 @@
-"""A run on a cluster: steps the survey and the planning in turn."""
+"""A run on a cluster: steps the surveys and the planning in turn."""
 
 from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext, suppress
 from dataclasses import replace
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 
 from distributed import Client
 from distributed.client import FutureCancelledError
@@ -22,12 +22,24 @@ from poolpart import (
 )
 
 from ..base.errors import LidarpoolError
-from ..pipeline import GPU, LIDAR, OTHER, CastingWorkers, Frame, LongStages, RigPlan, SurveyDriver
+from ..base.storage import Storage
+from ..pipeline import (
+    GPU,
+    LIDAR,
+    OTHER,
+    CastingWorkers,
+    Crew,
+    Frame,
+    LongStages,
+    RigPlan,
+    SurveyDriver,
+)
 from ..pipeline.task_book import TaskBook
 from ..plan import best
 from ..simulator.memory import MB, scans_that_fit
 from .checks import find_workers, gpu_note
-from .progress import Progress
+from .job import Job
+from .progress import Show
 from .result import RunResult
 from .store import RunStore
 from .trials import TrialPump
@@ -44,31 +56,60 @@ LOST_S = 0.5  # for a client to notice that its scheduler is gone
 LONGEST_PAUSE_S = 0.05  # while nothing moves
 
 
-class Run:
-    """One run on one cluster, checked and ready to be driven.
+class Kept(Protocol):
+    """What a run has kept of the workers that cast."""
 
-    `tell` is called every few seconds with a message while the run waits, and `waiting` says how
-    long to wait for workers at the start. LidarpoolError if the cluster lacks something.
+    backend: str  # empty until known
+    casting: dict[str, str]  # their software, empty until known
+
+    @property
+    def advice(self) -> str:
+        """Advice if the backend is not available, for the end of a message."""
+
+    @property
+    def resumed(self) -> int:
+        """Scans of an earlier run."""
+
+
+class Surveys(Protocol):
+    """What a run casts, one survey or many."""
+
+    @property
+    def finished(self) -> bool:
+        """True once all is committed, handed out and written."""
+
+    @property
+    def progress(self) -> int:
+        """A number that grows when something is committed."""
+
+    def step(self) -> bool:
+        """Do what can be done now; returns whether there was anything to do."""
+
+
+class Cluster:
+    """A cluster that can run some jobs: checked, and ready for the crews of runs.
+
+    `job` is what it is checked for, and `kept` says what earlier runs cast with. `tell` is called
+    every few seconds with a message while the run waits, and `waiting` says how long to wait for
+    workers at the start. LidarpoolError if the cluster lacks something.
     """
 
     def __init__(
-        self, client: Client, store: RunStore, tell: Callable[[str], None], waiting: Waiting
+        self, client: Client, job: Job, kept: Kept, tell: Callable[[str], None], waiting: Waiting
     ) -> None:
-        job = store.job
-        self.client, self.job, self.store = client, job, store
-        self._tell = tell
+        self.client, self.job, self._tell, self._kept = client, job, tell, kept
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
             pool, casting, backend, software = find_workers(
                 client,
                 job,
-                store.backend or job.backend,
-                store.advice,
-                store.casting if store.resumed else {},
+                kept.backend or job.backend,
+                kept.advice,
+                kept.casting if kept.resumed else {},
                 waiting,
             )
-            store.backend, store.casting = backend, software
+            kept.backend, kept.casting = backend, software
         except LidarpoolError:
             raise
         except Exception as error:  # the kind depends on the request
@@ -103,84 +144,48 @@ class Run:
                 with suppress(PoolError, *_CLUSTER_LOST):
                     self._pool.leave_page()
 
-    def drive(
-        self, on_frame: Callable[[Frame], None], on_progress: Callable[[Progress], None]
-    ) -> RunResult:
-        """Run to the end; on any error, everything has been stopped."""
-        started = time.monotonic()
-        pumps: list[SurveyDriver | TrialPump] = []
-        trials = None
-        try:
-            if self.job.planning is not None:  # first: no slot of OTHER waits for the survey
-                trials = TrialPump(
-                    self.client,
-                    self.partitions[OTHER],
-                    self.job.planning,
-                    self.store.casting["lidarpool"],
-                    self.store.db.trials,
-                )
-                pumps.append(trials)
-                trials.step()
-            survey = self._survey_driver(on_frame)
-            pumps.append(survey)
-            survey.start()
-            times = self._loop(pumps, survey, trials, on_progress, started)
-            for pump in pumps:
-                pump.finish()
-            self.notes += survey.notes
-        except BaseException as error:
-            # A client that loses its scheduler cancels all futures, so tasks look cancelled.
-            # After some seconds it gives up and closes, and any call of it makes any error.
-            lost = _is_lost(self.client, error)
-            reason = str(error) or type(error).__name__
-            _stop(self.client, pumps, f"the run was stopped: {reason}")
-            if error is self.callers_error:
-                raise
-            if isinstance(error, PoolError) and not lost:
-                raise LidarpoolError(str(error)) from error
-            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
-                raise self._told_lost() from error
-            raise
-        self.store.save(now=True)
-        self.store.tidy()
-        return make_result(
-            self.store,
-            [survey.book, *([trials.book] if trials else [])],
-            self.notes,
-            seconds=time.monotonic() - started,
-            survey_seconds=times[SurveyDriver],
-            planning_seconds=times.get(TrialPump, 0.0),
-            replayed=survey.offered_again,
-        )
-
-    def _survey_driver(self, on_frame: Callable[[Frame], None]) -> SurveyDriver:
-        job, store = self.job, self.store
-        run, plan = uuid.uuid4().hex[:8], RigPlan(job.scene, job.survey, store.backend)
-        return SurveyDriver(
-            CastingWorkers(self.client, self.partitions[GPU], run, plan, store.casting),
+    def crew(self, storage: Storage, mark: str) -> Crew:
+        """Make the crew of a run, which keeps parts in `storage`."""
+        job, run = self.job, uuid.uuid4().hex[:8]
+        software = self._kept.casting
+        return Crew(
+            CastingWorkers(self.client, self.partitions[GPU], run, self._kept.backend, software),
             LongStages(
                 self.client,
                 self.partitions[LIDAR],
                 run,
-                store.casting["lidarpool"],
-                job.survey,
-                store.storage,
+                software["lidarpool"],
+                storage,
+                mark,
                 queue_capacity=job.queue_capacity,
                 collectors=job.collectors,
                 patience_s=job.patience_s,
             ),
-            job.survey,
+        )
+
+    def driver(
+        self, crew: Crew, store: RunStore, on_frame: Callable[[Frame], None], job: str = "0",
+        folder: str = "", in_all: int = 0,
+    ) -> SurveyDriver:  # fmt: skip
+        """Make the driver of a survey; `folder` is that of its parts in the crew's storage."""
+        given = store.job
+        backend = self._kept.backend
+        fit = scans_that_fit(
+            given.scene, given.survey, self.job.batch_mb * MB, on_device=backend == "cuda"
+        )
+        return SurveyDriver(
+            crew.seat(job, RigPlan(given.scene, given.survey, backend), folder),
+            given.survey,
             store.db,
             store.storage,
             store.points_of_scan,
-            partial(self._call, on_frame),
+            partial(self.call, on_frame),
             store.on_parts,
-            scans_that_fit(
-                job.scene, job.survey, job.batch_mb * MB, on_device=store.backend == "cuda"
-            ),
+            fit,
+            in_all,
         )
 
-    def _call(self, callback: Callable[[T], None], argument: T) -> None:
+    def call(self, callback: Callable[[T], None], argument: T) -> None:
         """Call a callback of the caller; its OSError must not look like the cluster's."""
         try:
             callback(argument)
@@ -188,16 +193,61 @@ class Run:
             self.callers_error = error
             raise
 
+    def run(
+        self,
+        crew: Crew,
+        surveys: Callable[[], Surveys],
+        trials: TrialPump | None,
+        save: Callable[[], None],
+        on_progress: Callable[[Surveys, float], None],
+    ) -> dict[str, float]:
+        """Run to the end; on any error, everything has been stopped.
+
+        `surveys` is called once the stages are starting. `save` is called once a second, and
+        `on_progress` ten times, with the seconds so far.
+
+        Returns
+        -------
+        Seconds that the survey and the trials took: {"survey": …, "planning": …}.
+        """
+        try:
+            if trials is not None:  # first: no slot of OTHER waits for the survey
+                trials.step()
+            crew.open()
+            times = self._loop(crew, surveys(), trials, save, on_progress)
+            self.stages = TaskBook()
+            for record in crew.finish():
+                self.stages.add(record)
+            if trials is not None:
+                trials.finish()
+            self.notes += crew.notes
+            return times
+        except BaseException as error:
+            # A client that loses its scheduler cancels all futures, so tasks look cancelled.
+            # After some seconds it gives up and closes, and any call of it makes any error.
+            lost = _is_lost(self.client, error)
+            reason = str(error) or type(error).__name__
+            _stop(
+                self.client, [crew, *([trials] if trials else [])], f"the run was stopped: {reason}"
+            )
+            if error is self.callers_error:
+                raise
+            if isinstance(error, PoolError) and not lost:
+                raise LidarpoolError(str(error)) from error
+            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
+                raise self._told_lost() from error
+            raise
+
     def _loop(
         self,
-        pumps: list[SurveyDriver | TrialPump],
-        survey: SurveyDriver,
+        crew: Crew,
+        surveys: Surveys,
         trials: TrialPump | None,
-        on_progress: Callable[[Progress], None],
-        started: float,
-    ) -> dict[type, float]:
-        """Step the pumps until all have finished; returns the time of each, in seconds."""
-        pause_s = 0.0
+        save: Callable[[], None],
+        on_progress: Callable[[Surveys, float], None],
+    ) -> dict[str, float]:
+        """Step everything until all have finished; returns the time of each, in seconds."""
+        started, pause_s = time.monotonic(), 0.0
         watch = Watch(
             self.client,
             [GPU, OTHER] if trials else [GPU],
@@ -205,41 +255,101 @@ class Run:
             patience_s=self.job.patience_s,
             tell=self._tell,
         )
-        times: dict[type, float] = {}
+        times: dict[str, float] = {}
         told = saved = float("-inf")
-        while len(times) < len(pumps):
+        while not (crew.ended and (trials is None or "planning" in times)):
             moved = False
-            for pump in pumps:
-                if not pump.finished:
-                    moved |= pump.step()
-                elif type(pump) not in times:
-                    times[type(pump)] = time.monotonic() - started
-                    watch.forget([OTHER] if pump is trials else [GPU, LIDAR])
-            for trial in trials.trials[len(self.store.db.trials) :] if trials else ():
-                self.store.db.add_trial(trial)
+            if not crew.closed:
+                crew.look(surveys.progress)
+                moved = surveys.step()
+                if surveys.finished:
+                    crew.close()
+                    times["survey"] = time.monotonic() - started
+                    watch.forget([GPU, LIDAR])
+            if trials is not None and "planning" not in times:
+                moved |= trials.step()
+                if trials.finished:
+                    times["planning"] = time.monotonic() - started
+                    watch.forget([OTHER])
             now = time.monotonic()
             if now - saved >= SAVE_EVERY_S:
                 saved = now
-                self.store.save()
+                save()
             watch.look(now)
-            if now - told >= PROGRESS_EVERY_S or len(times) == len(pumps):
+            if now - told >= PROGRESS_EVERY_S or surveys.finished:
                 told = now
-                self._call(on_progress, self._progress(survey, trials, now - started))
+                on_progress(surveys, now - started)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            (time.sleep if survey.finished else survey.wait)(pause_s)
+            (time.sleep if crew.ended else crew.wait)(pause_s)
         self.notes += watch.notes
         return times
 
-    def _progress(self, survey: SurveyDriver, trials: TrialPump | None, seconds: float) -> Progress:
-        return replace(
-            self.store.progress(),
+
+def drive(
+    client: Client,
+    store: RunStore,
+    tell: Callable[[str], None],
+    waiting: Waiting,
+    *,
+    own: bool,
+    on_frame: Callable[[Frame], None],
+    watched: Callable[[Show, Mapping[str, Partition]], Show],
+    show: Show,
+) -> tuple[RunResult, Cluster]:
+    """Run one job on a cluster to the end; on any error, everything has been stopped.
+
+    With `own` there is no page of partitions. `watched` wraps what shows the progress, for a live
+    page. LidarpoolError if the cluster lacks something.
+    """
+    started, job = time.monotonic(), store.job
+    cluster = Cluster(client, job, store, tell, waiting)
+    show = watched(show, cluster.partitions)
+    trials = None
+    if job.planning is not None:
+        software = store.casting["lidarpool"]
+        partition = cluster.partitions[OTHER]
+        trials = TrialPump(client, partition, job.planning, software, store.db.trials)
+    crew = cluster.crew(store.storage, store.db.meta["mark"])
+    drivers: list[SurveyDriver] = []
+
+    def surveys() -> SurveyDriver:
+        drivers.append(cluster.driver(crew, store, on_frame))
+        return drivers[0]
+
+    def save() -> None:
+        for trial in trials.trials[len(store.db.trials) :] if trials else ():
+            store.db.add_trial(trial)
+        store.save()
+
+    def on_progress(_: Surveys, seconds: float) -> None:
+        survey = drivers[0]
+        progress = replace(
+            store.progress(),
             generated=survey.generated,
-            cast=min(self.store.resumed + survey.cast, self.job.survey.scan_count),
+            cast=min(store.resumed + survey.cast, job.survey.scan_count),
             trials_done=len(trials.trials) if trials else 0,
             seconds=seconds,
             replayed=survey.offered_again,
-            waits_for=survey.waits_for,
+            waits_for=LIDAR if crew.stages.waiting else "",
         )
+        cluster.call(show, progress)
+
+    with nullcontext() if own else cluster.partitions_page():
+        times = cluster.run(crew, surveys, trials, save, on_progress)
+    save()
+    store.save(now=True)
+    store.tidy()
+    books = [drivers[0].book, cluster.stages, *([trials.book] if trials else [])]
+    result = make_result(
+        store,
+        books,
+        [*cluster.notes, *drivers[0].notes],
+        seconds=time.monotonic() - started,
+        survey_seconds=times["survey"],
+        planning_seconds=times.get("planning", 0.0),
+        replayed=drivers[0].offered_again,
+    )
+    return result, cluster
 
 
 def make_result(
@@ -279,7 +389,7 @@ def _is_lost(client: Client, error: BaseException) -> bool:
     return client.status != "running"
 
 
-def _stop(client: Client, pumps: list[SurveyDriver | TrialPump], reason: str) -> None:
+def _stop(client: Client, pumps: Sequence[Crew | TrialPump], reason: str) -> None:
     """Stop everything, as far as the cluster can be reached."""
     if client.status != "running":  # Dask would try for half a minute to reach it
         return

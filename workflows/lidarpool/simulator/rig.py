@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from copy import copy
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,11 +57,16 @@ class Rig:
         threads: int | None = None,
         device: int | None = None,
     ) -> None:
-        self.scene, self.survey = scene, survey
+        options = {"backend": backend, "threads": threads, "device": device}
+        self._assemble(scene, survey, options, None)
+
+    def _assemble(
+        self, scene: Scene, survey: Survey, options: dict[str, Any], like: World | None
+    ) -> None:
+        self.scene, self.survey, self._options = scene, survey, options
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        options = {"backend": backend, "threads": threads, "device": device}
-        self._world = World(scene, self._surfaces, **options)
+        self._world = World(scene, self._surfaces, like, **options)
         self._device: DeviceColumns | None = None
         self._see()
         check_trajectory(survey.path)
@@ -85,6 +90,15 @@ class Rig:
                 made = self._rays_of(number, 0, sensor.period or 0)
             self._made[number, moves] = made
         return made
+
+    def with_survey(self, scene: Scene, survey: Survey) -> Rig:
+        """Return a rig of another survey of the same scene, perhaps with other actors.
+
+        The tree of all that stands still is shared.
+        """
+        rig = copy(self)
+        rig._assemble(scene, survey, self._options, self._world)
+        return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""

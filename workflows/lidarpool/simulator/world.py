@@ -65,24 +65,21 @@ class World:
 
     Triangles of instances are numbered after those of the scene, and those of actors after both.
     Rays that touch no actor give the same bits as without actors. Where the actors are, the poses
-    of a scan say. A tally is by the counters of `surfaces`. `options` are those of `RayCaster`.
+    of a scan say. A tally is by the counters of `surfaces`. `options` are those of `RayCaster`. The
+    caster of another world `like` this one, of the same scene but for actors, is shared.
     """
 
-    def __init__(self, scene: Scene, surfaces: Surfaces, **options: Any) -> None:
+    def __init__(
+        self, scene: Scene, surfaces: Surfaces, like: World | None = None, **options: Any
+    ) -> None:
         self._surfaces, self._shared = surfaces, scene.instances
         self._begins: NDArray[np.int32] | None = None  # of each body of the caster
         self._faces = faces = len(scene.faces)
-        if self._shared is None:
-            self.caster = RayCaster(scene.vertices, scene.faces, **options)
-        else:
-            own = [Instance(Mesh(scene.vertices, scene.faces))] if faces else []
-            meshes = [_mesh_of(part) for part in self._shared.parts]
-            placed = zip(self._shared.part, self._shared.transforms, strict=True)
-            shared = [Instance(meshes[part], matrix) for part, matrix in placed]
-            self.caster = RayCaster.of([*own, *shared], **options)
+        if self._shared is not None:
             begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
-            self._begins = np.append([0] * bool(own), begins).astype(np.int32)
+            self._begins = np.append([0] * bool(faces), begins).astype(np.int32)
             faces += self._shared.triangles
+        self.caster: RayCaster = _caster_of(scene, options) if like is None else like.caster
         moving, self._shape_of = shapes_of(scene.actors)
         self._shapes = [_Shape(mesh, options) for mesh in moving]
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
@@ -229,6 +226,18 @@ class World:
             # Directions of a sensor that turns during a pose are not quite of unit length.
             lengths = np.linalg.norm(directions[on], axis=1)
             yield ray[on], distance / lengths, triangle + self._firsts[numbers[on]]
+
+
+def _caster_of(scene: Scene, options: dict[str, Any]) -> RayCaster:
+    """Build the trees of all that stands still."""
+    if scene.instances is None:
+        return RayCaster(scene.vertices, scene.faces, **options)
+    own = [Instance(Mesh(scene.vertices, scene.faces))] if len(scene.faces) else []
+    meshes = [_mesh_of(part) for part in scene.instances.parts]
+    placed = zip(scene.instances.part, scene.instances.transforms, strict=True)
+    return RayCaster.of(
+        [*own, *(Instance(meshes[part], matrix) for part, matrix in placed)], **options
+    )
 
 
 def _mesh_of(part: Part) -> Mesh:
