@@ -1,4 +1,4 @@
-"""The database of a run: which parts and trials belong to the result.
+"""The database of a run: which parts and trials, or jobs, belong to the result.
 
 One SQLite file. A batch belongs to the result once its receipt is in here; before that anything may
 be lost or done twice, after that a second receipt is ignored. Recovery and resuming offer all other
@@ -26,7 +26,7 @@ from ..columns.parts import part_name
 from ..plan import Trial
 from .messages import Receipt
 
-FORMAT = 6
+FORMAT = 7
 FILE = "run.db"
 
 _TABLES = """
@@ -36,6 +36,7 @@ CREATE TABLE parts (
     hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL
 );
 CREATE TABLE trials (trial INTEGER PRIMARY KEY, data TEXT NOT NULL);
+CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL);
 """
 
 
@@ -55,6 +56,7 @@ class RunDatabase:
         self.meta: dict[str, str] = {}
         self.parts: dict[int, Receipt] = {}  # {first scan: its part}
         self.trials: list[Trial] = []
+        self.jobs: dict[int, int] = {}  # {number of a job that has ended: whether it failed}
         self.committed = np.zeros(scan_count, bool)
         self.scans_done = 0
         self.point_count = self.hits = 0
@@ -99,6 +101,7 @@ class RunDatabase:
                 self._enter(Receipt(first, stop, name, count, size, hits, box, summaries))
         trials = self._sql.execute("SELECT data FROM trials ORDER BY trial").fetchall()
         self.trials = [_trial_of(json.loads(data)) for (data,) in trials]
+        self.jobs = dict(self._sql.execute("SELECT number, failed FROM jobs"))
 
     # -- reading -------------------------------------------------------------------------
 
@@ -106,6 +109,11 @@ class RunDatabase:
     def complete(self) -> bool:
         """Whether all scans are committed and were handed out."""
         return self.scans_done == self.scan_count and self.frames == self.scan_count
+
+    @property
+    def used(self) -> bool:
+        """Whether anything is committed."""
+        return bool(self.scans_done or self.trials or self.jobs)
 
     @property
     def ordered(self) -> list[Receipt]:
@@ -154,6 +162,15 @@ class RunDatabase:
         absent = np.flatnonzero(~self.committed[first:stop]) + first
         cuts = np.flatnonzero(np.diff(absent) > 1) + 1
         return [(int(run[0]), int(run[-1]) + 1) for run in np.split(absent, cuts) if len(run)]
+
+    def job_rows(self) -> Iterator[dict[str, Any]]:
+        """Yield what was stored of the jobs that have ended, by number; one at a time."""
+        with (
+            self._explained(),
+            closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
+        ):
+            for (data,) in rows:
+                yield json.loads(data)
 
     # -- writing -------------------------------------------------------------------------
 
@@ -213,6 +230,20 @@ class RunDatabase:
                 (trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist)),
             )
         self.trials.append(trial)
+
+    def end_job(self, number: int, data: Mapping[str, Any], *, failed: bool = False) -> None:
+        """Store that a job of a campaign has ended, and what is to be known of it."""
+        with self._transaction():
+            self._sql.execute(
+                "INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", (number, failed, json.dumps(data))
+            )
+        self.jobs[number] = int(failed)
+
+    def forget_failed_jobs(self) -> None:
+        """Let the jobs that have failed be done again."""
+        with self._transaction():
+            self._sql.execute("DELETE FROM jobs WHERE failed")
+        self.jobs = {number: failed for number, failed in self.jobs.items() if not failed}
 
     def save_frames(self) -> None:
         """Store how many frames were handed out; each commit does so anyway."""

@@ -44,15 +44,19 @@ _RESUME = "--resume (in Python resume=True)"
 _DROP = "--fresh (in Python remove_run)"
 
 
-class RunStore:
-    """Database and parts of one run.
+class KeptRun:
+    """What a run keeps, of one survey or many: its database, and where parts go.
 
     Parameters
     ----------
-    job
-        The job of the run.
+    identity
+        What must be the same for a run to go on, see `identity_of`.
+    scan_count
+        Scans that the database itself is about.
+    backend
+        The one that is asked for.
     place
-        Where they are kept, a folder or a URL; None for a temporary folder that goes with the
+        Where it is kept, a folder or a URL; None for a temporary folder that goes with the
         last user of the points.
     parts
         Another place for the parts, a path or URL, in which they get their own folder. A resumed
@@ -67,7 +71,9 @@ class RunStore:
 
     def __init__(
         self,
-        job: Job,
+        identity: dict[str, str],
+        scan_count: int,
+        backend: str,
         place: str | Path | None = None,
         parts: str | Path | None = None,
         *,
@@ -78,12 +84,11 @@ class RunStore:
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
             )
-        self.job = job
+        self._scan_count, self._wanted = scan_count, backend
         self.lasting = place is not None
         self.notes: list[str] = []  # remarks for the user
-        self.on_parts: Callable[[list[Receipt]], None] = lambda parts: None  # called with new ones
         self._gone = False
-        self.identity = here = identity_of(job)
+        self.identity = here = identity
         self._remote = None
         if place is None or is_url(place):
             folder = Path(tempfile.mkdtemp(prefix="lidarpool-"))
@@ -114,7 +119,7 @@ class RunStore:
 
     def _open(self, here: dict[str, str], parts: str | Path | None) -> RunDatabase:
         """Open the database, or a new one if nothing is committed in it."""
-        path, count = self._folder / FILE, self.job.survey.scan_count
+        path, count = self._folder / FILE, self._scan_count
         durable = self.lasting and self._remote is None
         mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
         try:
@@ -122,7 +127,7 @@ class RunStore:
                 fetch_database(self._remote.storage, self._folder)
             if path.exists():
                 db = RunDatabase(path, count, durable=durable)
-                if db.scans_done or db.trials:
+                if db.used:
                     return db
                 db.close()
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
@@ -173,9 +178,9 @@ class RunStore:
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with {_RESUME}, "
                 f"or drop it with {_DROP}."
             )
-        if self.job.backend not in ("auto", self.backend):
+        if self._wanted not in ("auto", self.backend):
             raise LidarpoolError(
-                f"Backend {self.job.backend!r} is asked for, and the scans in {self.place} were "
+                f"Backend {self._wanted!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
         self._drop(sizes)
@@ -245,6 +250,90 @@ class RunStore:
 
     @property
     def kept(self) -> str:
+        """What is committed, in words; empty for nothing."""
+        raise NotImplementedError
+
+    @property
+    def advice(self) -> str:
+        """Advice if the backend is not available, for the end of a message."""
+        if not self.resumed:
+            return AUTO_TAKES
+        return (
+            f"The scans in {self.place} were cast with it: continue where it is to be had, or "
+            f"drop them with {_DROP}."
+        )
+
+    # -- the end -----------------------------------------------------------------------------
+
+    def save(self, *, now: bool = False) -> None:
+        """Keep how many frames were handed out; where it is time or `now`, copy the database.
+
+        LidarpoolError if that fails, or another run has taken over.
+        """
+        self.db.save_frames()
+        if self._remote:
+            self._remote.save(self.db, now=now)
+
+    def tidy(self) -> None:
+        """Remove parts that are not in the result, of dead or superseded collectors."""
+        mark = self.db.meta["mark"]
+        ours = {mark_name(mark), *(part.name for part in self.db.parts.values())}
+        with suppress(OSError, LidarpoolError):
+            self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
+
+    def remove(self) -> None:
+        """Remove the store: the result is in place. Files of others among the parts stay."""
+        if self._remote:
+            self._remote.check()
+        self._gone = True
+        self.db.close()
+        _remove(self.place, self.storage, self.db.meta["mark"])
+
+    @contextmanager
+    def kept_on_error(self) -> Iterator[None]:
+        """Add to an error of the body how to resume; remove the store if nothing is committed."""
+        try:
+            yield
+        except BaseException as error:
+            if self._gone or not self.lasting:
+                raise
+            with suppress(LidarpoolError):  # report the first error
+                self.save(now=True)
+            if self._remote and self._remote.lost:
+                self.db.close()
+                raise
+            self._close()
+            if self.kept and (self._folder / FILE).exists():
+                error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
+            raise
+
+    def _close(self) -> None:
+        """Close the database after an error; remove a run that has committed nothing."""
+        self.db.close()
+        if not self.kept:
+            with suppress(OSError, LidarpoolError):
+                _remove(self.place, self.storage, self.db.meta["mark"])
+            (self._folder / FILE).unlink(missing_ok=True)  # where the place of the parts failed
+
+
+class RunStore(KeptRun):
+    """Database and parts of one job; `place`, `parts` and `resume` as of `KeptRun`."""
+
+    def __init__(
+        self,
+        job: Job,
+        place: str | Path | None = None,
+        parts: str | Path | None = None,
+        *,
+        resume: bool = False,
+    ) -> None:
+        self.job = job
+        self.on_parts: Callable[[list[Receipt]], None] = lambda parts: None  # called with new ones
+        count, wanted = job.survey.scan_count, job.backend
+        super().__init__(identity_of(job), count, wanted, place, parts, resume=resume)
+
+    @property
+    def kept(self) -> str:
         """Committed scans and trials in words; empty for none."""
         if self.db.scans_done:
             return f"{self.db.scans_done:,} of {self.job.survey.scan_count:,} scans"
@@ -256,16 +345,6 @@ class RunStore:
     def complete(self) -> bool:
         """Whether everything for a result is committed."""
         return self.db.complete and len(self.db.trials) == self.job.trials
-
-    @property
-    def advice(self) -> str:
-        """Advice if the backend is not available, for the end of a message."""
-        if not self.resumed:
-            return AUTO_TAKES
-        return (
-            f"The scans in {self.place} were cast with it: continue where it is to be had, or "
-            f"drop them with {_DROP}."
-        )
 
     def progress(self) -> Progress:
         """Progress of a resumed run at its start."""
@@ -332,58 +411,6 @@ class RunStore:
                     starts = np.broadcast_to(start, ends.shape)
                     rays.append(np.stack([starts, ends], axis=1))
         return np.concatenate(rays)
-
-    # -- the end -----------------------------------------------------------------------------
-
-    def save(self, *, now: bool = False) -> None:
-        """Keep how many frames were handed out; where it is time or `now`, copy the database.
-
-        LidarpoolError if that fails, or another run has taken over.
-        """
-        self.db.save_frames()
-        if self._remote:
-            self._remote.save(self.db, now=now)
-
-    def tidy(self) -> None:
-        """Remove parts that are not in the result, of dead or superseded collectors."""
-        mark = self.db.meta["mark"]
-        ours = {mark_name(mark), *(part.name for part in self.db.parts.values())}
-        with suppress(OSError, LidarpoolError):
-            self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
-
-    def remove(self) -> None:
-        """Remove the store: the result is in place. Files of others among the parts stay."""
-        if self._remote:
-            self._remote.check()
-        self._gone = True
-        self.db.close()
-        _remove(self.place, self.storage, self.db.meta["mark"])
-
-    @contextmanager
-    def kept_on_error(self) -> Iterator[None]:
-        """Add to an error of the body how to resume; remove the store if nothing is committed."""
-        try:
-            yield
-        except BaseException as error:
-            if self._gone or not self.lasting:
-                raise
-            with suppress(LidarpoolError):  # report the first error
-                self.save(now=True)
-            if self._remote and self._remote.lost:
-                self.db.close()
-                raise
-            self._close()
-            if self.kept and (self._folder / FILE).exists():
-                error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
-            raise
-
-    def _close(self) -> None:
-        """Close the database after an error; remove a run that has committed nothing."""
-        self.db.close()
-        if not self.kept:
-            with suppress(OSError, LidarpoolError):
-                _remove(self.place, self.storage, self.db.meta["mark"])
-            (self._folder / FILE).unlink(missing_ok=True)  # where the place of the parts failed
 
 
 def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
