@@ -12,7 +12,7 @@ from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
 from . import pieces
 from .boxes import Boxes, type_of
-from .pieces import Entry
+from .pieces import Data, Entry, as_data
 from .sweeps import Floats, Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
@@ -44,16 +44,17 @@ class Pieces(pieces.Pieces):
         kinds = ("velodyne", "labels", *(["label_2"] if sweeps.actors else []))
         self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes | None]:
         """Return the files of a sweep, and its boxes where there are actors."""
         sweeps = self.sweeps
         folder, name = self.sequences[sweeps.sensor[number]], f"{sweeps.numbers[number]:06}"
-        inside = sweeps.in_sensor(number, points.positions)
-        rows = np.column_stack([inside, points["intensity"]]).astype("<f4")
+        rows = np.empty((len(points), 4), "<f4")
+        rows[:, :3] = sweeps.in_sensor(number, points.positions)
+        rows[:, 3] = points["intensity"]
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
-        files = {
-            f"{folder}/velodyne/{name}.bin": rows.tobytes(),
-            f"{folder}/labels/{name}.label": labels.tobytes(),
+        files: dict[str, Data] = {
+            f"{folder}/velodyne/{name}.bin": as_data(rows),
+            f"{folder}/labels/{name}.label": as_data(labels),
         }
         if not sweeps.actors:
             return files, None

@@ -17,7 +17,7 @@ from ..base.fingerprint import fingerprint
 from ..columns.cloud import Cloud, CloudLike
 from . import pieces
 from .boxes import Boxes, type_of
-from .pieces import Entry
+from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
 
 VERSION = "v1.0-lidarpool"
@@ -59,12 +59,13 @@ class Pieces(pieces.Pieces):
         ]
         self.folders = [name.rpartition("/")[0] for name in self.names]
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes]:
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
         inside = self.sweeps.in_sensor(number, points.positions)
         light = np.clip(points["intensity"], 0, 1) * 255
-        rows = np.column_stack([inside, light, points["channel"]]).astype("<f4")
-        return {self.names[number]: rows.tobytes()}, Boxes.of(self.sweeps, number, points)
+        rows = np.empty((len(points), 5), "<f4")
+        rows[:, :3], rows[:, 3], rows[:, 4] = inside, light, points["channel"]
+        return {self.names[number]: as_data(rows)}, Boxes.of(self.sweeps, number, points)
 
     def others(self, made: Sequence[Boxes]) -> dict[str, bytes]:
         """Return the tables of a survey by itself, and its map."""

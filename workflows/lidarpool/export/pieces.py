@@ -11,6 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
@@ -22,6 +24,7 @@ RANGE_POINTS, RANGE_PIECES = 1_000_000, 100  # of a range at most: what a killed
 _MARK = ".writing"  # a file in the folder while ranges are written
 
 
+Data = bytes | memoryview
 Span = tuple[int, int]  # a range of pieces
 Written = tuple[int, list[Any]]  # points of a range, and what `Pieces.others` needs of its pieces
 
@@ -52,7 +55,7 @@ class Pieces:
         """Yield the points of some pieces."""
         return self.sweeps.points(self.cloud, first, stop)
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Any]:
+    def files(self, number: int, points: Cloud) -> tuple[Mapping[str, Data], Any]:
         """Return the files of a piece, and what `others` needs of it."""
         raise NotImplementedError
 
@@ -152,6 +155,11 @@ def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None
     """Return the pieces of a cloud in the format of a module, as a job's with an `entry`."""
     pieces: Pieces = import_module(f".{module}", __package__).Pieces(cloud, sweeps, entry)
     return pieces
+
+
+def as_data(array: NDArray[Any]) -> Data:
+    """Return the bytes of an array, without a copy of them."""
+    return array.data.cast("B") if array.size else b""
 
 
 def _make_folders(place: Storage, names: Sequence[str]) -> None:
