@@ -6,15 +6,17 @@ renamed, and an object store shows only complete objects.
 
 from __future__ import annotations
 
+import io
 import os
 import re
 import secrets
+import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from .errors import LidarpoolError
 
@@ -153,15 +155,38 @@ class Storage:
             system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
 
     def _write_file(self, name: str, pieces: list[Any]) -> None:
-        target = Path(self.url, name)
+        with self._replacing(Path(self.url, name)) as file:
+            for piece in pieces:
+                view = memoryview(piece).cast("B")
+                while len(view):
+                    view = view[file.write(view) :]
+
+    @contextmanager
+    def writing(self, name: str) -> Iterator[IO[bytes]]:
+        """Write a file bit by bit: it appears once the body has ended without an error.
+
+        Folders in its name are made.
+        """
+        if self.is_local:
+            target = Path(self.url, name)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with self._replacing(target, io.DEFAULT_BUFFER_SIZE) as file:
+                yield file
+            return
+        with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+            path = Path(folder, "file")
+            with path.open("wb") as file:
+                yield file
+            self.put(path, name)
+
+    @contextmanager
+    def _replacing(self, target: Path, buffering: int = 0) -> Iterator[IO[bytes]]:
         temporary = target.with_name(f"{_TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
-            with temporary.open("xb", buffering=0) as file:
-                for piece in pieces:
-                    view = memoryview(piece).cast("B")
-                    while len(view):
-                        view = view[file.write(view) :]
+            with temporary.open("xb", buffering) as file:
+                yield file
                 if self.durable:
+                    file.flush()
                     os.fsync(file.fileno())
             temporary.replace(target)
         except BaseException:

@@ -12,14 +12,22 @@ import pyarrow.parquet as pq
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import AXES, Column
 from . import pieces
+from .pieces import Entry
 from .sweeps import Sweeps
+
+_GROUP_ROWS = 65_536
 
 
 class Pieces(pieces.Pieces):
-    """A file for each million points; units and meanings are in the metadata of the fields."""
+    """A file for each million points; units and meanings are in the metadata of the fields.
 
-    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
-        super().__init__(cloud, sweeps)
+    In a data set it is a partition, `points/job=7`, in groups of rows of which readers of single
+    sweeps read one or two.
+    """
+
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
+        super().__init__(cloud, sweeps, entry)
+        self.folders = [] if entry is None else [f"points/job={entry.number}"]
         fields = [
             pa.field(c.in_files, pa.from_numpy_dtype(kind), True, _words(c))
             for c, kind in (
@@ -50,8 +58,9 @@ class Pieces(pieces.Pieces):
 
     def _file(self, number: int, table: pa.Table) -> dict[str, bytes]:
         memory = pa.BufferOutputStream()
-        pq.write_table(table, memory)
-        return {f"part-{number:05}.parquet": memory.getvalue()}
+        pq.write_table(table, memory, row_group_size=_GROUP_ROWS if self.entry else None)
+        name = f"part-{number:05}.parquet"
+        return {"/".join([*self.folders, name]): memory.getvalue()}
 
 
 def _words(column: Column) -> dict[str, str]:

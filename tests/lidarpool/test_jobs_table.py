@@ -1,0 +1,202 @@
+"""The table of a data set's jobs: what was varied and what came of it, with types kept."""
+
+import dataclasses
+import doctest
+import hashlib
+import tracemalloc
+from itertools import pairwise
+
+import numpy as np
+import pyarrow.parquet as pq
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from lidarpool import Cloud, LidarpoolError
+from lidarpool.base.storage import Storage
+from lidarpool.export import jobs
+from lidarpool.export.jobs import JobRow, Tally, read_table, write_table
+
+DONE = JobRow(
+    7, "0007", "train", {"weather.rain": 2, "sensors.roof.model": "vlp16", "night": True},
+    "", 10, 2, 1000, 800, 640, 1.25, "ab" * 32, {0: 40, 6: 600},
+)  # fmt: skip
+FAILED = JobRow(8, "0008", "", {"weather.rain": 0.5}, 'No "mesh",\r\nor none here.')
+NAMES = ("weather.rain", "sensors.roof.model", "night")
+
+
+@pytest.fixture(params=["folder", "memory"])
+def place(request, tmp_path):
+    url = tmp_path if request.param == "folder" else f"memory://{request.node.name}/set"
+    place = Storage.at(url, durable=False)
+    yield place
+    place.remove(list(place.sizes()))
+
+
+def test_rows_are_read_as_they_were_written(place):
+    told = write_table(place, NAMES, iter([DONE, FAILED]))
+    assert told == "jobs.csv and jobs.parquet"
+    assert set(place.sizes()) == {"jobs.csv", "jobs.parquet"}
+    done, failed = read_table(place)
+    assert done == DONE and done.done
+    assert failed == dataclasses.replace(FAILED, error='No "mesh",\nor none here.')
+    assert not failed.done
+    head = place.read("jobs.csv").decode().splitlines()[0]
+    assert head == (
+        "number,name,split,weather.rain,sensors.roof.model,night,error,scans,sweeps,rays,hits,"
+        "points,seconds,sha256,class_0,class_6"
+    )
+
+
+def test_parquet_has_the_same_table(tmp_path):
+    write_table(Storage.at(tmp_path), NAMES, [DONE, FAILED])
+    table = pq.read_table(tmp_path / "jobs.parquet")
+    head = (tmp_path / "jobs.csv").read_text().splitlines()[0]
+    assert table.column_names == head.split(",")
+    rain, model, night = (table[name].to_pylist() for name in NAMES)
+    assert (rain, model, night) == ([2.0, 0.5], ["vlp16", None], [True, None])
+    assert table["class_6"].to_pylist() == [600, 0]
+    assert str(table.schema.field("points").type) == "int64"
+
+
+SCALARS = st.one_of(
+    st.booleans(), st.integers(), st.floats(allow_nan=False), st.text(st.characters()),
+    st.sampled_from(["", "12", "true", "null", "NaN", '"', "[[", " 1", "1e5", "0417", "a\r\nb"]),
+)  # fmt: skip
+
+
+@given(st.lists(st.dictionaries(st.sampled_from(["points", "class_3", "a.b"]), SCALARS)))
+def test_values_keep_their_types(tmp_path_factory, rows):
+    """Also text that looks like a number, and names that are those of other columns."""
+    place = Storage.at(tmp_path_factory.mktemp("set"), durable=False)
+    write_table(
+        place, ["points", "class_3", "a.b"], (JobRow(k, "", "", v) for k, v in enumerate(rows))
+    )
+    read = [row.values for row in read_table(place)]
+    assert read == rows
+    assert [[type(v) for v in row.values()] for row in map(_sorted, read)] == [
+        [type(v) for v in row.values()] for row in map(_sorted, rows)
+    ]
+
+
+def _sorted(values):
+    return dict(sorted(values.items()))
+
+
+def test_no_jobs_are_a_table_too(tmp_path):
+    write_table(Storage.at(tmp_path), ["a"], [])
+    assert list(read_table(Storage.at(tmp_path))) == []
+    assert pq.read_table(tmp_path / "jobs.parquet").num_rows == 0
+
+
+def test_memory_is_bounded(tmp_path):
+    """Ten thousand rows take no more than a row group of Parquet."""
+    place = Storage.at(tmp_path, durable=False)
+    row = dataclasses.replace(DONE, classes={k: k for k in range(30)})
+    write_table(place, NAMES, [row])  # which imports pyarrow
+    tracemalloc.start()
+    write_table(place, NAMES, (dataclasses.replace(row, number=k) for k in range(10_000)))
+    written = tracemalloc.get_traced_memory()[1]
+    tracemalloc.reset_peak()
+    assert sum(1 for _ in read_table(place)) == 10_000
+    read = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert written < 12e6 and read < 2e6
+
+
+def test_a_table_is_whole_or_not_there(tmp_path):
+    def broken():
+        yield DONE
+        raise LidarpoolError("the database cannot be read")
+
+    with pytest.raises(LidarpoolError, match="database"):
+        write_table(Storage.at(tmp_path), NAMES, broken())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_does_not_fit_is_refused(tmp_path):
+    place = Storage.at(tmp_path)
+    with pytest.raises(LidarpoolError, match=r"0007 has a value 'night'.*weather.rain"):
+        write_table(place, NAMES[:2], [DONE])
+    with pytest.raises(LidarpoolError, match=r"\[1\], a list"):
+        write_table(place, ["a"], [JobRow(0, "0", values={"a": [1]})])
+    with pytest.raises(LidarpoolError, match="cannot be written"):
+        write_table(Storage.at("/proc/none"), [], [])
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a,b\n1,2\n", "HEAD7,x\n", "HEADx,,,,0,0,0,0,0,0,\n", 'HEAD"7', "\ud800"]
+)
+def test_damaged_tables_are_refused(tmp_path, text):
+    head = "number,name,split,error,scans,sweeps,rays,hits,points,seconds,sha256\n"
+    data = text.replace("HEAD", head).encode("utf-8", "surrogatepass")
+    (tmp_path / "jobs.csv").write_bytes(data)
+    with pytest.raises(LidarpoolError, match=r"jobs\.csv is damaged near line \d"):
+        list(read_table(Storage.at(tmp_path)))
+
+
+def test_a_missing_table_is_named(place):
+    with pytest.raises(LidarpoolError, match=r"jobs\.csv cannot be read.*give the folder"):
+        list(read_table(place))
+
+
+def cloud_of(count, dtype=np.float64):
+    rng = np.random.default_rng(3)
+    columns = {
+        "channel": rng.integers(0, 16, count).astype(np.uint16),
+        "class": rng.integers(0, 9, count).astype(np.uint16),
+        "intensity": rng.random(count).astype(np.float32),
+    }
+    return Cloud(rng.random((count, 3)).astype(np.float32).astype(dtype), columns)
+
+
+@given(st.lists(st.integers(0, 500), max_size=8))
+def test_hash_and_classes_do_not_depend_on_the_division(cuts):
+    cloud, tally = cloud_of(500), Tally()
+    edges = [0, *sorted(cuts), 500]
+    for first, stop in pairwise(edges):
+        tally.add(cloud.part(slice(first, stop)))
+    whole = Tally.of(cloud)
+    assert (tally.points, tally.sha256, tally.classes) == (500, whole.sha256, whole.classes)
+    assert sum(tally.classes.values()) == 500
+    assert tally.classes[6] == np.count_nonzero(cloud["class"] == 6)
+
+
+def test_hash_is_that_of_values():
+    cloud = cloud_of(100)
+    same = Tally.of(cloud).sha256
+    assert Tally.of(cloud_of(100, np.float32)).sha256 == same
+    swapped = {name: a.astype(a.dtype.newbyteorder(">")) for name, a in cloud.columns.items()}
+    assert Tally.of(Cloud(cloud.positions, swapped)).sha256 == same
+    others = {
+        Tally.of(cloud.part(slice(0, 99))).sha256,
+        Tally.of(cloud.part(np.arange(100)[::-1])).sha256,
+    }
+    for name in cloud.columns:
+        array = cloud[name].copy()
+        array[50] += 1
+        others.add(Tally.of(Cloud(cloud.positions, {**cloud.columns, name: array})).sha256)
+    moved = cloud.positions.copy()
+    moved[50, 1] = np.nextafter(moved[50, 1], 2)
+    others.add(Tally.of(Cloud(moved, cloud.columns)).sha256)
+    assert len(others) == 6 and same not in others
+
+
+def test_hash_can_be_computed_from_its_description():
+    cloud = Cloud(np.arange(6.0).reshape(2, 3), {"class": np.array([3, 4])})
+    places = hashlib.sha256(np.arange(6, dtype="<f8").tobytes()).hexdigest()
+    classes = hashlib.sha256(np.array([3, 4], "<u2").tobytes()).hexdigest()
+    lines = f"positions <f8 {places}\nclass <u2 {classes}\n"
+    assert Tally.of(cloud).sha256 == hashlib.sha256(lines.encode()).hexdigest()
+    assert Tally().sha256 == Tally.of(cloud.part(slice(0, 0))).sha256
+    assert Tally().classes == {}
+
+
+def test_points_of_other_columns_are_refused():
+    tally = Tally.of(cloud_of(5))
+    with pytest.raises(LidarpoolError, match="give all the same"):
+        tally.add(Cloud(np.zeros((1, 3)), {}))
+
+
+def test_example():
+    assert doctest.testmod(jobs, extraglobs={"np": np}) == (0, 6)
