@@ -13,7 +13,7 @@ from ..base.declared import declared
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
-from ..scenario.scenario import Scenario
+from ..scenario.scenario import KeptScenes, Scenario
 from ..scenario.sections import TaskOptions
 from ..scene.scene import Scene
 from ..sensor import Survey
@@ -51,13 +51,19 @@ class Job(TaskOptions):
 
 
 def make_job(
-    scenario: Scenario, backend: str | None = None, no_plan: bool = False, **options: Any
+    scenario: Scenario,
+    backend: str | None = None,
+    no_plan: bool = False,
+    kept: KeptScenes | None = None,
+    **options: Any,
 ) -> Job:
     """Read the scene and make the job of a scenario; options override it.
 
+    What stands still in a scene may be `kept` from other scenarios.
+
     LidarpoolError if a mesh file cannot be read, or fields do not fit together or the scene.
     """
-    scene, survey, planning = scenario.build_scene(), None, None
+    scene, survey, planning = scenario.build_scene(kept), None, None
     mistakes = Mistakes()
     with mistakes.noted():
         survey = scenario.survey(scene)

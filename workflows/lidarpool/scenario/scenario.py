@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
 from functools import partial
 from glob import escape
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import PrivateAttr, Strict, ValidationError
@@ -79,6 +80,32 @@ SEED_KEPT = 5
 
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
+
+
+class Still(NamedTuple):
+    """The still part of a scenario's scene, and what was noted when it was built."""
+
+    scene: Scene
+    standing: Standing
+    notes: tuple[str, ...]
+    remarks: tuple[str, ...]
+    sources: dict[str, str]
+    rasters: tuple[tuple[MeshFile, Raster], ...]
+
+
+class KeptScenes:
+    """Still parts of the scenes that scenarios had last, for others that have the same."""
+
+    def __init__(self, most: int = 4) -> None:
+        self._most, self._kept = most, dict[object, Still]()
+
+    def find(self, key: object, make: Callable[[], Still]) -> Still:
+        """Return what is kept under a key, or what `make` makes."""
+        found = self._kept.pop(key, None) or make()
+        self._kept[key] = found  # the last used
+        while len(self._kept) > self._most:
+            del self._kept[next(iter(self._kept))]
+        return found
 
 
 class Scenario(Section):
@@ -381,21 +408,53 @@ class Scenario(Section):
             at = np.array(positions[:: -(-len(positions) // _LOOKED_FROM)]) - scene.origin
         return inside_note(scene, at, self._carried()[0])
 
-    def build_scene(self) -> Scene:
-        """Read the mesh files and build the scene.
+    def build_scene(self, kept: KeptScenes | None = None) -> Scene:
+        """Read the mesh files and build the scene; its still part may be `kept` from another.
 
         Raises
         ------
         LidarpoolError
             If a mesh file cannot be read.
         """
+        self._robots.clear()
+        self._vehicles.clear()
+        self._placing = None
+        still = self._still() if kept is None else kept.find(self._of_scene, self._still)
+        scene, standing = still.scene, still.standing
+        self._notes[:], self._remarks[:] = still.notes, still.remarks
+        self._rasters[:] = still.rasters
+        self._sources.clear()
+        self._sources |= still.sources
+        self._epsg = self._system()
+        if not (self.actors or self.traffic):
+            return scene
+        with prefixed(self._source):
+            carrier = None if self.trajectory is None else self._track(scene, standing)
+        start = 0.0 if carrier is None else carrier.start_s
+        assert start is not None  # of every track
+        own, others = self._actors(standing, carrier), self._traffic(scene, standing, start)
+        return scene.with_actors([*scene.actors, *own, *others])
+
+    @property
+    def _of_scene(self) -> object:
+        """What the still part of the scene is made of: equal for scenarios that may share it."""
+        names = [entry.file for entry in self.scene.files]
+        for copies in self.scene.copies:
+            names += [one.file for one in (copies.file, copies.table) if one is not None]
+        states = []
+        for name in names:
+            with suppress(OSError, LidarpoolError):  # is told when it is read
+                found = self._path(name).stat()
+                states.append((name, found.st_mtime_ns, found.st_size))
+        section = self.scene.model_dump_json()
+        return section, str(self._folder), self.coloured, self.cloud.epsg, tuple(states)
+
+    def _still(self) -> Still:
+        """Build the scene without the actors and traffic of the scenario."""
         self._notes.clear()
         self._remarks.clear()
         self._sources.clear()
         self._rasters.clear()
-        self._robots.clear()
-        self._vehicles.clear()
-        self._placing = None
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         moving: list[Actor] = []
         mistakes = Mistakes()
@@ -405,7 +464,6 @@ class Scenario(Section):
                 meshes += found.standing
                 moving += found.moving
         mistakes.tell()
-        self._epsg = self._system()
         if self.scene.copies:
             meshes += self._copies(meshes)
         objects = Objects(tuple(meshes), tuple(moving))
@@ -413,15 +471,14 @@ class Scenario(Section):
             below = Scene.from_meshes(meshes or objects.still(lambda _: None))
             objects = objects._replace(standing=(*meshes, self._ground(below)))
         scene = Scene.of_objects(objects, self._notes.append)
-        if not (self.actors or self.traffic):
-            return scene
-        standing = Standing(scene)
-        with prefixed(self._source):
-            carrier = None if self.trajectory is None else self._track(scene, standing)
-        start = 0.0 if carrier is None else carrier.start_s
-        assert start is not None  # of every track
-        own, others = self._actors(standing, carrier), self._traffic(scene, standing, start)
-        return scene.with_actors([*scene.actors, *own, *others])
+        return Still(
+            scene,
+            Standing(scene),
+            tuple(self._notes),
+            tuple(self._remarks),
+            dict(self._sources),
+            tuple(self._rasters),
+        )
 
     def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
         """Return the trajectory in the coordinates of a scene; it is made once."""
