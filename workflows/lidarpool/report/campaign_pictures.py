@@ -85,7 +85,7 @@ def _of_labels(varied: Varied) -> Scale:
         values = values.copy()
         values[known] = place[values[known].astype(np.intp)]
         labels = (*(labels[k] for k in kept), f"{len(labels) - len(kept)} others")
-    return Scale(values, np.arange(len(labels) + 1) - 0.5, labels)
+    return Scale(values, np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1), labels)
 
 
 def draw_varied(figures: Figures) -> Page | None:
