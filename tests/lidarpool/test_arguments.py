@@ -12,6 +12,8 @@ import lidarpool
 from lidarpool import (
     Actor,
     Beams,
+    Campaign,
+    CampaignJob,
     Cloud,
     Column,
     Instance,
@@ -55,6 +57,18 @@ WRONG = {
         ([[1], [2, 3]], "[[1"),
     ],
     Beams.even: [("4", 60, "layers is '4'"), (4, "60", "a number"), (4.5, 60, "whole")],
+    Campaign: [
+        (3, 4, "make is 3; it must be a function"),
+        (print, 0, "count is 0; it must be 1 to 10000000"),
+        (print, "4", "count is '4'; it must be a whole number"),
+    ],
+    Campaign.load: [(3, "path is 3"), (["a.yaml"], "text or a path"), ("a.yaml", "not exist")],
+    Campaign.of_scenarios: [("a.yaml", "a list of text or a path"), (3, "paths is 3"), ([], "name one")],
+    CampaignJob: [
+        ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
+        (Scene.seed(), GRID, "survey is a Sensor"),
+        (Scene.seed(), Survey(poses=AT), ["fog"], "values is ['fog']; it must be a dict"),
+    ],
     Cloud: [("x", {}, "positions"), (POINTS, [1], "a dict"), ([["a", 0, 0]], {}, "numbers")],
     Column: [
         (1, "u1", "", "", "name"),

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .pipeline import Frame
     from .plan import Plan, Planning
     from .run.store import remove_run
+    from .scenario.campaign import Campaign, CampaignJob
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
@@ -43,6 +44,8 @@ if TYPE_CHECKING:
 __all__ = [
     "Actor",
     "Beams",
+    "Campaign",
+    "CampaignJob",
     "Cloud",
     "Column",
     "Frame",
@@ -87,6 +90,7 @@ _MODULES = {
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
+    "scenario.campaign": ("Campaign", "CampaignJob"),
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),

@@ -287,19 +287,30 @@ class Scenario(Section):
                 with mistakes.noted(), prefixed(self._source):
                     sensor = section.sensor(self._folder)
                     self.returns.of(sensor.optics)
+        for path in self.files if mistakes.lines else ():
+            if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
+                mistakes.lines.append(f"{self._source}: {str(path)!r} does not exist.")
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """Files that it names, each once: meshes, tables, trajectories, data of sensors."""
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         shaped = (*placed, *(self.traffic.vehicles if self.traffic else ()))
         entries = [*self.scene.files, *(entry.file for entry in shaped if entry.file)]
-        files = [entry.file for entry in entries]
+        files: list[str | None] = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
         files += [entry.table.file for entry in self.scene.copies if entry.table]
-        files += [entry.joints for entry in self.actors if entry.joints]
-        files += [one for one in (self.trajectory and self.trajectory.file,) if one]
-        for file in files if mistakes.lines else ():
-            with suppress(RuntimeError):  # of a user who is not known
-                path = str(self._folder / Path(file).expanduser())
-                if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
-                    mistakes.lines.append(f"{self._source}: {path!r} does not exist.")
+        files += [entry.joints for entry in self.actors]
+        for way in (self.trajectory, *(entry.trajectory for entry in self.actors)):
+            files += [way.file, way.times] if way else []
+        for section in (self.sensor, *self.sensors.values()):
+            files += [section.calibration]
+            files += [section.model] if section.has_own_model else []
+        out = []
+        for file in dict.fromkeys(file for file in files if file):
+            with suppress(LidarpoolError):  # of a user who is not known
+                out.append(self._path(file))
+        return tuple(out)
 
     def advice(self, scene: Scene) -> list[str]:
         """Return notes on likely mistakes, such as a size that suggests another unit.

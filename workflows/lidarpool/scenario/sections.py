@@ -375,6 +375,11 @@ class SensorSection(Section):
             raise ValueError("columns and rays_per_revolution mean the same: give one of them.")
         return self
 
+    @property
+    def has_own_model(self) -> bool:
+        """Whether its model is a file of the user's."""
+        return self.model is not None and self.model.endswith((".yaml", ".yml"))
+
     def sensor(self, folder: Path) -> Sensor:
         """Return the lidar, its files from a folder; LidarpoolError if they cannot be used."""
         given = {
@@ -387,7 +392,7 @@ class SensorSection(Section):
             fov = self.vertical_fov_deg
             return Sensor.grid(azimuths, self.layers, fov, self.step_deg, **given)
         model = self.model
-        if model is not None and model.endswith((".yaml", ".yml")):
+        if model is not None and self.has_own_model:
             model = str(folder / Path(model).expanduser())
         unit = self.calibration
         return load_sensor(

@@ -64,18 +64,18 @@ def _fields(model: type[BaseModel], place: Iterable[int | str]) -> set[str]:
             for one in found
             for name, field in one.model_fields.items()
             if step in (name, field.alias)
-            for deeper in _models(field.annotation)
+            for deeper in models_in(field.annotation)
         ]
         found = inner or found  # it may be the number of an entry, or a key
     return {field.alias or name for one in found for name, field in one.model_fields.items()}
 
 
-def _models(annotation: Any) -> Iterator[type[BaseModel]]:
+def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
     """Models in an annotation, such as `tuple[Model, ...] | None`."""
     if isinstance(annotation, type) and issubclass(annotation, BaseModel):
         yield annotation
     for inner in get_args(annotation):
-        yield from _models(inner)
+        yield from models_in(inner)
 
 
 def _dotted(place: Sequence[int | str]) -> str:

@@ -1,0 +1,614 @@
+"""Campaigns: many jobs from one description, each with values of its own."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
+from pathlib import Path
+from types import MappingProxyType
+from typing import Annotated, Any, Protocol
+
+import numpy as np
+from pydantic import Field, ValidationError
+
+from ..base.arguments import checked, checked_fields, shown
+from ..base.declared import Seed, declared
+from ..base.errors import LidarpoolError, Mistakes, explained, prefixed
+from ..base.fingerprint import fingerprint
+from ..base.words import counted
+from ..base.yamlfile import read_yaml
+from ..scene.scene import Scene
+from ..sensor import Survey
+from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits, Value, file_of
+from .draws import Draw
+from .paths import FieldPath, find_field, held, opened, put
+from .scenario import Scenario
+from .tables import Row, read_rows
+from .validation_errors import validation_errors
+
+_FORM = "a campaign has base:, count:, vary:, keep:, splits:"
+_SUFFIXES = (".yaml", ".yml")
+_NOISE = "noise.seed"  # where a job's own seed goes
+_DIGITS_LEAST = 4  # of a job's name, so that a campaign may grow
+_KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
+_UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
+
+
+@dataclass(frozen=True)
+@checked_fields
+class CampaignJob:
+    """A job that a function of Python makes for a `Campaign`.
+
+    Parameters
+    ----------
+    scene, survey
+        As for `simulate`: poses in the scene's local coordinates.
+    values
+        What is of its own: {name: number, text, or True and False}; None for an empty cell. All
+        jobs of a campaign have the same names, the columns of its table.
+
+    Raises
+    ------
+    LidarpoolError
+        If something is of another type.
+    """
+
+    scene: Scene
+    survey: Survey
+    values: Mapping[str, Value | None] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Described:
+    """A job of a campaign.
+
+    Parameters
+    ----------
+    number
+        From 0.
+    name
+        Of its files: its number with zeros before it; of a given scenario, that of its file.
+    values
+        What differs from job to job: {name: value}; of a sample, how many rows. A name is missing
+        where the value is none.
+    split
+        Name of its split; empty without splits.
+    scenario
+        What it is, if a file describes it,
+    made
+        or what a function made.
+    """
+
+    number: int
+    name: str
+    values: Mapping[str, Value]
+    split: str = ""
+    scenario: Scenario | None = None
+    made: CampaignJob | None = None
+
+
+class _Jobs(Protocol):
+    """Where the jobs of a campaign come from."""
+
+    @property
+    def names(self) -> tuple[str, ...]: ...
+    @property
+    def choices(self) -> Mapping[str, str]: ...
+    @property
+    def identity(self) -> dict[str, str]: ...
+    def job(self, number: int) -> Described: ...
+
+
+class Campaign:
+    """Many jobs (surveys) from one description, into one data set.
+
+    `Campaign.load` reads a campaign file, `Campaign.of_scenarios` takes scenario files as they
+    are, and this one asks a function of Python for each job.
+
+    Parameters
+    ----------
+    make
+        ``make(number, rng)`` returns the `CampaignJob` of a number from 0 on. `rng` is a
+        ``numpy.random.Generator`` that depends on the seed and the number alone: a job is the same
+        however often, in whatever order and wherever it is made.
+    count
+        How many jobs.
+    seed
+        Another seed gives other random numbers.
+    keep
+        Format of the data set: "kitti", "nuscenes", "mcap", "parquet" or "folder"; or
+        ``{"format": "mcap", "layout": "ouster"}``.
+    splits
+        {name: share of the jobs}; they add up to 1.
+    license, title
+        For the card of the data set.
+
+    Raises
+    ------
+    LidarpoolError
+        If an argument cannot be meant.
+
+    Notes
+    -----
+    A survey with noise whose seed is 0 gets a seed of the job's own.
+    """
+
+    count: int
+    seed: int
+    keep: Keep
+    splits: Mapping[str, float]
+    license: str
+    title: str
+
+    @checked
+    def __init__(
+        self,
+        make: Callable[[int, np.random.Generator], CampaignJob],
+        count: Annotated[int, Field(ge=1, le=COUNT_MOST)],
+        *,
+        seed: Seed = 0,
+        keep: str | Keep | Mapping[str, str] = "kitti",
+        splits: Mapping[str, float] = MappingProxyType({}),
+        license: str = "",  # noqa: A002 - as in the file
+        title: str = "",
+    ) -> None:
+        given = {"keep": keep, "splits": splits, "license": license, "title": title}
+        self._begin(_Made(make, count, seed), _head(count=count, seed=seed, **given))
+
+    def _begin(self, jobs: _Jobs, head: CampaignSection) -> None:
+        assert head.count is not None, "known by now"
+        self.count, self.seed, self.license = head.count, head.seed, head.license
+        self.title, self.splits = head.title, MappingProxyType(head.splits)
+        self.keep = Keep(**declared(head.keep, Keep))
+        self._jobs, self._split = jobs, Splits(head.splits, head.seed)
+
+    @classmethod
+    @checked
+    def load(cls, path: str | Path) -> Campaign:
+        """Read a campaign file, with its bases and tables.
+
+        Raises
+        ------
+        LidarpoolError
+            With the file, the field or path, what was given and what is allowed: if a path leads
+            to no field, a value that can be drawn is not valid there, or a file is missing.
+        """
+        path = Path(path)
+        section = _valid(read_yaml(path, _FORM), str(path))
+        jobs = _Varied(section, path)
+        title = section.title or path.stem
+        self = cls.__new__(cls)
+        self._begin(jobs, section.model_copy(update={"count": jobs.count, "title": title}))
+        return self
+
+    @classmethod
+    @checked
+    def of_scenarios(
+        cls,
+        paths: Iterable[str | Path],
+        *,
+        keep: str | Keep | Mapping[str, str] = "kitti",
+        splits: Mapping[str, float] = MappingProxyType({}),
+        seed: Seed = 0,
+        license: str = "",  # noqa: A002 - as in the file
+        title: str = "",
+    ) -> Campaign:
+        """Take scenario or mesh files as jobs, as they are; a job has the name of its file.
+
+        Raises
+        ------
+        LidarpoolError
+            If one of them cannot be used; or an argument cannot be meant.
+        """
+        jobs = _Given([Path(path) for path in paths])
+        given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
+        self = cls.__new__(cls)
+        self._begin(jobs, _head(count=jobs.count, **given))
+        return self
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of what differs from job to job, in the order of the table's columns.
+
+        Of a function, those of its first job, which is made to be asked.
+        """
+        return self._jobs.names
+
+    @property
+    def choices(self) -> Mapping[str, str]:
+        """How the values are chosen, in words: {name: «0.2 to 20, log_uniform»}.
+
+        Empty for functions.
+        """
+        return self._jobs.choices
+
+    def describe(self, number: int) -> Described:
+        """Return a job; the same number gives the same job.
+
+        Raises
+        ------
+        LidarpoolError
+            If there is no such job, or its values do not fit together; the message names it and
+            them.
+        """
+        if not 0 <= number < self.count:
+            raise LidarpoolError(
+                f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
+            )
+        found = self._jobs.job(number)
+        name = found.name or f"{number:0{max(_DIGITS_LEAST, len(str(self.count - 1)))}d}"
+        return replace(found, name=name, split=self._split(number))
+
+    @cached_property
+    def identity(self) -> dict[str, str]:
+        """Hashes of what the data set depends on: {name: SHA-256, hexadecimal}.
+
+        Campaigns of the same content have the same, wherever their files are. Files that mesh
+        files refer to (images, buffers) are not read for it.
+        """
+        shared = {"seed": self.seed, "count": self.count, "keep": self.keep}
+        own = {name: fingerprint(value) for name, value in shared.items()}
+        return own | {"splits": fingerprint(dict(self.splits))} | self._jobs.identity
+
+
+def is_campaign(path: str | Path) -> bool:
+    """Whether a file is that of a campaign: YAML with the key `base` or `vary`."""
+    path = Path(path)
+    if path.suffix.lower() not in _SUFFIXES:
+        return False
+    try:
+        if not _KEYS.search(path.read_text("utf-8-sig")):
+            return False  # without reading all poses of a scenario as YAML
+        return bool({"base", "vary"} & read_yaml(path).keys())
+    except (OSError, ValueError, LidarpoolError):
+        return False  # what is wrong, the reader of scenarios says
+
+
+def _valid(data: Mapping[str, Any], source: str) -> CampaignSection:
+    try:
+        return CampaignSection.model_validate(data)
+    except ValidationError as error:
+        mistakes = Mistakes()
+        lines = validation_errors(error, CampaignSection)
+        mistakes.lines += [f"{source}: {line}" if source else line for line in lines]
+        mistakes.tell()
+        raise AssertionError("an error has lines") from error
+
+
+def _head(**given: Any) -> CampaignSection:
+    """Check the fields that Python gives."""
+    keep = given.pop("keep")
+    keep = declared(keep, Keep) if isinstance(keep, Keep) else keep
+    keep = dict(keep) if isinstance(keep, Mapping) else keep
+    return _valid({"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}, "")
+
+
+class _Made:
+    """Jobs that a function makes."""
+
+    def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
+        self._make, self._seed = make, seed
+
+    choices: Mapping[str, str] = MappingProxyType({})
+
+    @cached_property
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._made(0).values)
+
+    @property
+    def identity(self) -> dict[str, str]:
+        return {"make": fingerprint(self._make)}
+
+    def job(self, number: int) -> Described:
+        made = self._made(number)
+        if extra := [name for name in made.values if name not in self.names]:
+            raise LidarpoolError(
+                f"job {number} has the value {extra[0]!r}, which job 0 has not: give all jobs the "
+                "same names, with None where there is no value."
+            )
+        values = {name: _plain(number, name, value) for name, value in made.values.items()}
+        survey = made.survey
+        if (survey.noise.loses or survey.noise.displaces) and not survey.noise.seed:
+            noise = replace(survey.noise, seed=_noise_seed(self._seed, number))
+            made = replace(made, survey=replace(survey, noise=noise))
+        return Described(number, "", _without_none(values), made=made)
+
+    def _made(self, number: int) -> CampaignJob:
+        try:
+            made = self._make(number, Draw(self._seed, number, "make").generator())
+        except LidarpoolError as error:
+            raise LidarpoolError(f"job {number}: {error}") from error
+        except Exception as error:
+            # One job's failure must not end the others.
+            told = f"job {number}: the function raised {type(error).__name__}: {error}"
+            raise LidarpoolError(told) from error
+        if not isinstance(made, CampaignJob):
+            raise LidarpoolError(
+                f"job {number}: the function returned {shown(made)}; it must return a "
+                "CampaignJob(scene, survey)."
+            )
+        return made
+
+
+def _plain(number: int, name: Any, value: Any) -> Value | None:
+    value = value.item() if isinstance(value, np.generic) else value
+    if not isinstance(name, str) or not isinstance(value, (bool, int, float, str, type(None))):
+        raise LidarpoolError(
+            f"job {number} has the value {name!r}: {shown(value)}; values are numbers, text, True "
+            "or False, by names."
+        )
+    return value
+
+
+class _Given:
+    """Scenario and mesh files as they are."""
+
+    choices: Mapping[str, str] = MappingProxyType({})
+    names: tuple[str, ...] = ()
+
+    def __init__(self, paths: Sequence[Path]) -> None:
+        if not paths:
+            raise LidarpoolError("a campaign needs a scenario at least: name one or more files.")
+        self._paths, self.count = paths, len(paths)
+        mistakes = Mistakes()
+        self._files: list[list[Path]] = []
+        self._prints: list[str] = []
+        for path in paths:
+            with mistakes.noted():
+                if is_campaign(path):
+                    told = f"{path} is a campaign, with jobs of its own: run it by itself."
+                    raise LidarpoolError(told)
+                read = Scenario.load(path)
+                self._prints.append(_print(read))
+                self._files.append(_existing(read, str(path)))
+        mistakes.tell()
+        self._names = _unique([path.stem for path in paths])
+
+    @property
+    def identity(self) -> dict[str, str]:
+        files = [path for each in self._files for path in each]
+        return {"scenarios": fingerprint(self._prints), "files": _contents(files)}
+
+    def job(self, number: int) -> Described:
+        return Described(
+            number, self._names[number], {}, scenario=Scenario.load(self._paths[number])
+        )
+
+
+def _unique(stems: Iterable[str]) -> list[str]:
+    """Names for files, each once: «hall», «hall-2»."""
+    out: list[str] = []
+    taken: set[str] = set()
+    for stem in stems:
+        first = name = _UNSAFE.sub("_", stem).lstrip(".") or "job"
+        number = 1
+        while name.lower() in taken:  # some systems know no capitals
+            number += 1
+            name = f"{first}-{number}"
+        taken.add(name.lower())
+        out.append(name)
+    return out
+
+
+class _Varied:
+    """Jobs of a campaign file: a base with other values."""
+
+    def __init__(self, section: CampaignSection, path: Path) -> None:
+        self._vary, self._seed, self._source = section.vary, section.seed, str(path)
+        mistakes = Mistakes()
+        self._bases: list[_Base] = []
+        tables: dict[Any, list[Row]] = {}
+        for name in section.base:
+            with mistakes.noted(), prefixed(path):
+                file = file_of(path.parent, name)
+                if is_campaign(file):
+                    raise LidarpoolError(f"base {name!r} is a campaign; give a scenario.")
+                self._bases.append(_Base(file, section.vary, tables))
+        mistakes.tell()
+        for one in self._bases:
+            one.check(self._source, mistakes)
+        mistakes.tell()
+        self._strides: dict[str, int] = {}  # {path with each: jobs until its value changes}
+        grid = len(self._bases)
+        for text, choice in section.vary.items():
+            if choice.each is not None:
+                self._strides[text] = grid
+                grid *= len(choice.listed)
+        drawn = [text for text, choice in section.vary.items() if choice.each is None]
+        if section.count is None and drawn:
+            raise LidarpoolError(
+                f"{path}: count is missing: how many jobs, as {drawn[0]} is drawn?"
+            )
+        self.count = min(section.count or grid, COUNT_MOST)
+        several = ("base",) if len(self._bases) > 1 else ()
+        self.names = (*several, *section.vary)
+        listed = ", ".join(base.name for base in self._bases[:8])
+        listed += ", …" * (len(self._bases) > 8)
+        self.choices = dict.fromkeys(several, f"{listed}, each of {len(self._bases):,}")
+        self.choices |= {text: choice.words for text, choice in section.vary.items()}
+
+    @property
+    def identity(self) -> dict[str, str]:
+        files = sorted({path for base in self._bases for path in base.files})
+        return {
+            "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
+            "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
+            "files": _contents(files),
+        }
+
+    def job(self, number: int) -> Described:
+        base = self._bases[number % len(self._bases)]
+        told: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
+        values: dict[str, Any] = {}
+        rows: dict[str, list[Any]] = {}
+        for text, choice in self._vary.items():
+            draw = Draw(self._seed, number, text)
+            if choice.sample is not None:
+                chosen = draw.integer(*choice.sample.count)
+                table = base.tables[text]
+                rows[text] = [table[i].entry for i in draw.subset(len(table), chosen)]
+                told[text] = chosen
+            elif choice.each is not None:
+                turn = number // self._strides[text] % len(choice.listed)
+                values[text], told[text] = choice.option(turn)
+            else:
+                values[text], told[text] = choice.drawn(draw)
+        found = _without_none(told)
+        try:
+            seed = _noise_seed(self._seed, number)
+            scenario = base.scenario_of(values, rows, f"{self._source}: job {number}", seed)
+        except LidarpoolError as error:
+            shown = ", ".join(f"{name}: {value}" for name, value in found.items())
+            raise LidarpoolError(
+                f"{error}\nIts values are {shown or 'those of the base'}."
+            ) from error
+        return Described(number, "", found, scenario=scenario)
+
+
+class _Base:
+    """A scenario, and where the paths of a campaign lead in it."""
+
+    def __init__(
+        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Row]]
+    ) -> None:
+        self.scenario, self.name, self._folder = Scenario.load(path), path.name, path.parent
+        self._vary, self._noise = vary, find_field(self.scenario, _NOISE)
+        self._fields: dict[str, FieldPath] = {}
+        self.tables: dict[str, list[Row]] = {}
+        self.files: set[Path] = set()  # that a job may read
+        mistakes = Mistakes()
+        for text, choice in vary.items():
+            with mistakes.noted(), prefixed("vary"):
+                self._fields[text] = find_field(self.scenario, text)
+            if choice.sample is None or text not in self._fields:
+                continue
+            with mistakes.noted(), prefixed(f"vary: {text}"):
+                table = file_of(self._folder, choice.sample.file)
+                kind = self._fields[text].kind
+                if (key := (table, repr(kind))) not in tables:
+                    tables[key] = read_rows(table, kind)
+                self.tables[text] = tables[key]
+                self.files.add(table)
+                if (most := choice.sample.count[1]) > (there := len(tables[key])):
+                    has = counted(there, "row")
+                    raise LidarpoolError(f"count is up to {most:,}, and {table} has {has}.")
+        with mistakes.noted():
+            self._check_apart()
+        mistakes.tell()
+
+    def _check_apart(self) -> None:
+        """Refuse paths that lead to the same field, or into one that is replaced as a whole."""
+        fields = list(self._fields.values())
+        for i, one in enumerate(fields):
+            for other in fields[:i]:
+                short, long = sorted((one, other), key=lambda field: len(field.keys))
+                added = self._vary[short.text].sample is not None and short.keys != long.keys
+                if long.keys[: len(short.keys)] == short.keys and not added:
+                    raise LidarpoolError(
+                        f"vary: {short.text} and {long.text} choose the same: leave one out, or "
+                        f"write the second within the values of {short.text}."
+                    )
+
+    def check(self, source: str, mistakes: Mistakes) -> None:
+        """Note values that are not valid, and files that are missing.
+
+        The first values of all paths are tried together, then the second, and so on; only if
+        something is wrong, each alone, to find out which.
+        """
+        trials: dict[str, list[Any]] = {t: c.ends for t, c in self._vary.items() if not c.sample}
+        samples = {t: c.sample.count for t, c in self._vary.items() if c.sample}
+        together: LidarpoolError | None = None
+        for turn in range(max([2, *map(len, trials.values())])):
+            values = {text: ends[turn % len(ends)] for text, ends in trials.items()}
+            rows = {
+                text: [row.entry for row in self.tables[text][: counts[turn % 2]]]
+                for text, counts in samples.items()
+            }
+            try:
+                found = self.scenario_of(values, rows, f"{source}: vary")
+            except LidarpoolError as error:
+                together = error
+                break
+            self._take_files(found, source, mistakes)
+        if together is None:
+            return
+        before = len(mistakes.lines)
+        for text, ends in trials.items():
+            for value in ends:
+                with mistakes.noted():
+                    self._try(source, text, value)
+        if len(mistakes.lines) == before:
+            mistakes.lines += str(together).splitlines()
+
+    def _try(self, source: str, text: str, value: Any) -> None:
+        try:
+            self.scenario_of({text: value}, {}, "")
+        except LidarpoolError as error:
+            keys = self._fields[text].keys
+            place = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys)[1:]
+            lines = []
+            for line in str(error).removeprefix(": ").splitlines():
+                own = line.removeprefix(": ").removeprefix(f"{place} is ")
+                named = own if own != line.removeprefix(": ") else f"{shown(value)}: {own}"
+                lines.append(f"{source}: vary: {text}: {named}")
+            raise LidarpoolError("\n".join(lines)) from error
+
+    def _take_files(self, scenario: Scenario, source: str, mistakes: Mistakes) -> None:
+        with mistakes.noted():
+            self.files.update(_existing(scenario, source, self.files))
+
+    def scenario_of(
+        self,
+        values: Mapping[str, Any],
+        rows: Mapping[str, Sequence[Any]],
+        source: str,
+        noise_seed: int = 0,
+    ) -> Scenario:
+        """Return the scenario with other values, and with entries added to lists."""
+        made: Any = self.scenario
+        with prefixed(source):
+            for text, value in values.items():
+                made = put(made, self._fields[text].steps, value)
+            for text, entries in rows.items():
+                steps = self._fields[text].steps
+                made = put(made, steps, [*(held(made, steps) or ()), *entries])
+        if noise_seed and _NOISE not in values and not held(made, self._noise.steps):
+            made = put(made, self._noise.steps, noise_seed)
+        return Scenario.from_data(opened(made), source=source, folder=self._folder)
+
+
+def _noise_seed(seed: int, number: int) -> int:
+    return Draw(seed, number, _NOISE).bits(63) or 1
+
+
+def _without_none(values: Mapping[str, Value | None]) -> dict[str, Value]:
+    return {name: value for name, value in values.items() if value is not None}
+
+
+def _print(scenario: Scenario) -> str:
+    """Fingerprint of a scenario; how a cluster runs it is no part."""
+    return fingerprint(scenario.model_dump(exclude={"pool"}))
+
+
+def _existing(scenario: Scenario, source: str, known: Iterable[Path] = ()) -> list[Path]:
+    """Files that a scenario names; LidarpoolError if one is missing."""
+    known = known if isinstance(known, set) else set(known)
+    files = [path for path in scenario.files if path not in known]
+    # os.path also takes names that no file can have.
+    if missing := [path for path in files if not os.path.exists(path)]:  # noqa: PTH110
+        more = f", nor do {len(missing) - 1:,} more" if missing[1:] else ""
+        raise LidarpoolError(f"{source}: {str(missing[0])!r} does not exist{more}.")
+    return files
+
+
+def _contents(files: Iterable[Path]) -> str:
+    """Fingerprint of the content of files, wherever they are."""
+    digests = []
+    for path in sorted(set(files), key=lambda path: path.name):
+        with explained(f"{path} cannot be read"), path.open("rb") as file:
+            digests.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
+    return fingerprint(sorted(digests))

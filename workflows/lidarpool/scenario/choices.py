@@ -1,0 +1,334 @@
+"""The sections of a campaign file: jobs from a base, and how their values are chosen."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from fractions import Fraction
+from math import isclose, lcm
+from pathlib import Path
+from statistics import NormalDist
+from typing import Annotated, Any, Literal
+
+from pydantic import Field, Strict, model_validator
+
+from ..base.arguments import checked_fields
+from ..base.declared import Seed, Text, TextOrTexts, is_text, short
+from ..export.table import FORMATS, LAYOUTS
+from .draws import SHARE_LEAST, SIGMAS, Draw
+from .sections import Section, told
+
+COUNT_MOST = 10_000_000
+KEPT = ("kitti", "nuscenes", "mcap", "parquet", "folder")
+Value = bool | int | float | str  # in the table of jobs
+
+_SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
+_WHOLE_MOST = 2**62
+
+Number = Annotated[float, Field(ge=-1e300, le=1e300)]
+Interval = Annotated[tuple[Number, Number], Strict(False)]
+Whole = Annotated[int, Field(ge=-_WHOLE_MOST, le=_WHOLE_MOST)]
+Wholes = Annotated[tuple[Whole, Whole], Strict(False)]
+Options = Annotated[tuple[Any, ...], Strict(False), Field(min_length=1)]
+NamedOptions = Annotated[dict[Text, Any], Field(min_length=1)]
+Weight = Annotated[float, Field(ge=0, le=1e9)]
+Share = Annotated[float, Field(ge=0, le=1)]
+
+
+class Normal(Section):
+    """A normal distribution; outside `limits` numbers are drawn again."""
+
+    mean: Annotated[Number, told("mean")]
+    std: Annotated[float, told("standard deviation", gt=0, le=1e300)]
+    limits: Annotated[
+        Interval | None, told("least and largest number; by default 6 standard deviations", [0, 1])
+    ] = None
+
+    @model_validator(mode="after")
+    def _room(self) -> Normal:
+        if self.limits is not None:
+            low, high = self.limits
+            of = NormalDist(self.mean, self.std)
+            if low > high or of.cdf(high) - of.cdf(low) < SHARE_LEAST:
+                raise ValueError(
+                    f"limits are [least, largest], with at least {SHARE_LEAST:.0%} of the "
+                    "distribution between them."
+                )
+        return self
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Least and largest number."""
+        reach = SIGMAS * self.std
+        return self.limits or (self.mean - reach, self.mean + reach)
+
+
+class Sample(Section):
+    """Rows of a table, as further entries of a list such as `actors`."""
+
+    file: Annotated[
+        Text,
+        Field(
+            alias="from",
+            description="a .csv with a header of fields of an entry (name, box, "
+            "trajectory.points); from the base's folder",
+        ),
+    ]
+    count: Annotated[
+        Annotated[
+            Annotated[
+                tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], Strict(False)
+            ],
+            short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
+        ],
+        told("how many rows a job has: a number, or [least, most]"),
+    ]
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Sample:
+        if self.count[0] > self.count[1]:
+            raise ValueError("count is a number, or [least, most].")
+        return self
+
+
+class Choice(Section):
+    """How a value is chosen for each job: one of these."""
+
+    uniform: Annotated[
+        Interval | None, told("a number between two, all alike likely", [0.5, 2])
+    ] = None
+    log_uniform: Annotated[
+        Interval | None, told("a number between two above 0, its logarithm uniform", [0.2, 20])
+    ] = None
+    normal: Annotated[
+        Normal | None, told("a normally distributed number", {"mean": 0, "std": 1})
+    ] = None
+    integer: Annotated[Wholes | None, told("a whole number between two, both included", [1, 6])] = (
+        None
+    )
+    choice: Annotated[
+        Options | NamedOptions | None,
+        told("one of a list, or of a mapping of names to values", ["velodyne/vlp16", "my.yaml"]),
+    ] = None
+    weights: Annotated[
+        tuple[Weight, ...] | None, Strict(False), told("of choice: how likely each is", [3, 1])
+    ] = None
+    each: Annotated[
+        Options | NamedOptions | None,
+        told("all of a list in turn; several of these make a grid, the first changes fastest"),
+    ] = None
+    sample: Annotated[
+        Sample | None,
+        told("rows of a table, added to a list", {"from": "parked.csv", "count": [0, 40]}),
+    ] = None
+
+    @model_validator(mode="after")
+    def _one(self) -> Choice:
+        kinds = [name for name in _KINDS if getattr(self, name) is not None]
+        if len(kinds) != 1:
+            raise ValueError(f"give one of {', '.join(_KINDS)}.")
+        for name in ("uniform", "log_uniform", "integer"):
+            ends = getattr(self, name)
+            if ends is not None and ends[0] > ends[1]:
+                raise ValueError(f"{name} is [least, largest].")
+        if self.log_uniform is not None and self.log_uniform[0] <= 0:
+            raise ValueError("log_uniform is [least, largest], both above 0.")
+        if self.weights is not None:
+            if self.choice is None or len(self.weights) != len(self.choice):
+                raise ValueError("give as many weights as there are values of choice.")
+            if not sum(self.weights):
+                raise ValueError("weights must not all be 0.")
+        return self
+
+    @property
+    def kind(self) -> str:
+        """Name of the field that is given."""
+        return next(name for name in _KINDS if getattr(self, name) is not None)
+
+    @property
+    def listed(self) -> list[Any]:
+        """Values of `choice` or `each`."""
+        given = self.choice if self.choice is not None else self.each
+        return list(given.values() if isinstance(given, Mapping) else given or ())
+
+    @property
+    def ends(self) -> list[Any]:
+        """Values that are valid if all are: the ends of a range, or all of a list."""
+        if self.normal is not None:
+            return list(self.normal.ends)
+        return list(self.uniform or self.log_uniform or self.integer or self.listed)
+
+    def drawn(self, draw: Draw) -> tuple[Any, Value | None]:
+        """Draw a value, and what the table of jobs says of it; None for an empty cell.
+
+        Not of `each` and `sample`, which need more than a job's random numbers.
+        """
+        if self.uniform is not None:
+            value: Any = draw.uniform(*self.uniform)
+        elif self.log_uniform is not None:
+            value = draw.log_uniform(*self.log_uniform)
+        elif self.normal is not None:
+            value = draw.normal(self.normal.mean, self.normal.std, self.normal.limits)
+        elif self.integer is not None:
+            value = draw.integer(*self.integer)
+        else:
+            return self.option(draw.position(len(self.listed), self.weights or ()))
+        return value, value
+
+    def option(self, position: int) -> tuple[Any, Value | None]:
+        """Return a value of `choice` or `each`, and what the table says of it."""
+        given = self.choice if self.choice is not None else self.each
+        value = self.listed[position]
+        if isinstance(given, Mapping):
+            return value, list(given)[position]
+        return value, _in_table(value, position)
+
+    @property
+    def words(self) -> str:
+        """The values that there are: «0.2 to 20, log_uniform»."""
+        if self.sample is not None:
+            low, high = self.sample.count
+            rows = f"{low:,}" if low == high else f"{low:,} to {high:,}"
+            return f"{rows} of {self.sample.file}"
+        if self.normal is not None:
+            least, most = self.normal.ends
+            about = f"normal, {self.normal.mean:g} ± {self.normal.std:g}"
+            return f"{least:g} to {most:g}, {about}"
+        if ends := self.uniform or self.log_uniform or self.integer:
+            return f"{ends[0]:.12g} to {ends[1]:.12g}, {self.kind}"
+        labels = [self.option(position)[1] for position in range(len(self.listed))]
+        shown = ["none" if label is None else str(label) for label in labels]
+        return f"{', '.join(shown[:8])}{', …' * (len(shown) > 8)}, {self.kind} of {len(shown):,}"
+
+
+_KINDS = tuple(name for name in Choice.model_fields if name != "weights")
+
+
+def _in_table(value: Any, position: int) -> Value | None:
+    if isinstance(value, (list, dict)):
+        text = json.dumps(value, ensure_ascii=False, default=str)
+        return text if len(text) <= _SHOWN else f"choice {position + 1}"
+    known = value is None or isinstance(value, (bool, int, float, str))
+    return value if known else str(value)  # a date or time
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Keep:
+    """The format of a data set.
+
+    LidarpoolError if there is no such format or layout.
+    """
+
+    format: Annotated[
+        Literal[KEPT],  # type: ignore[valid-type]
+        Field(description="kitti, nuscenes, mcap, parquet; folder: a cloud for each job"),
+    ] = "kitti"
+    layout: Annotated[
+        Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
+        Field(description="layout of points in mcap"),
+    ] = "velodyne"
+
+    @property
+    def needs(self) -> tuple[str, ...]:
+        """Names of the columns that the format needs."""
+        return () if self.format == "folder" else FORMATS[self.format].needed(self.layout)
+
+
+class KeepSection(Section, Keep):
+    """The format of the data set; in YAML also just its name."""
+
+
+KeepEntry = Annotated[KeepSection, short(is_text, lambda v: {"format": v}, Text | KeepSection)]
+
+
+class CampaignSection(Section):
+    """Many jobs from one description: scenarios, and what differs from job to job.
+
+    Relative names of files start from the base's folder; that of the base from the campaign's.
+    """
+
+    base: Annotated[
+        TextOrTexts,
+        told("a scenario or mesh file, or a list of them that jobs take in turn", min_length=1),
+    ]
+    count: Annotated[
+        int | None,
+        told(
+            "how many jobs; by default one for each base and value of each, if nothing is drawn",
+            1000,
+            ge=1,
+            le=COUNT_MOST,
+        ),
+    ] = None
+    seed: Annotated[Seed, told("another seed draws other values")] = 0
+    vary: Annotated[
+        dict[Text, Choice],
+        told(
+            "{path: how its value is chosen}; a path has keys, numbers of entries, or their names",
+            {"weather.visibility_km": {"log_uniform": [0.2, 20]}},
+            {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
+        ),
+    ] = {}  # noqa: RUF012 - of a frozen model
+    keep: Annotated[KeepEntry, told("format of the data set")] = KeepSection()
+    splits: Annotated[
+        dict[str, Share],
+        told(
+            "{name: share of the jobs}; they add up to 1", {"train": 0.8, "val": 0.1, "test": 0.1}
+        ),
+    ] = {}  # noqa: RUF012 - of a frozen model
+    license: Annotated[str, told("licence of the data set, for its card", "CC-BY-4.0")] = ""
+    title: Annotated[str, told("title of the data set; by default the file's name")] = ""
+
+    @model_validator(mode="after")
+    def _whole(self) -> CampaignSection:
+        for name in self.splits:
+            if not re.fullmatch(r"[A-Za-z0-9_-]+", name):
+                raise ValueError(
+                    f"the split {name!r} gets a file of its name: take letters, digits, - and _."
+                )
+        if self.splits and not isclose(sum(self.splits.values()), 1, abs_tol=1e-6):
+            raise ValueError(
+                f"splits add up to {sum(self.splits.values()):.6g}; they must add up to 1."
+            )
+        return self
+
+
+class Splits:
+    """Which job is of which split: in each block of jobs exactly the shares, in random order.
+
+    The block is the shortest that the shares divide, so a job's split does not depend on how many
+    jobs there are: of 0.8, 0.1 and 0.1 each ten jobs have 8, 1 and 1.
+    """
+
+    BLOCK_MOST = 1000
+
+    def __init__(self, shares: Mapping[str, float], seed: int) -> None:
+        self._seed = seed
+        exact = {name: Fraction(str(share)) for name, share in shares.items()}
+        total = sum(exact.values())
+        exact = {name: share / total for name, share in exact.items()}
+        size = min(lcm(*(share.denominator for share in exact.values())), self.BLOCK_MOST)
+        self._block: list[str] = []
+        done = Fraction(0)
+        for name, share in exact.items():
+            done += share
+            self._block += [name] * (round(done * size) - len(self._block))
+        self._last: tuple[int, Sequence[str]] = (-1, ())
+
+    def __call__(self, number: int) -> str:
+        """Name of a job's split; empty if there are none."""
+        if not self._block:
+            return ""
+        block, place = divmod(number, len(self._block))
+        if self._last[0] != block:
+            order = Draw(self._seed, block, "splits").order(len(self._block))
+            self._last = block, [self._block[i] for i in order]
+        return self._last[1][place]
+
+
+def file_of(folder: Path, name: str) -> Path:
+    """Path of a file that a campaign names."""
+    return folder / Path(name).expanduser()
