@@ -53,9 +53,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             lock = _lock(folder)
-        for left in folder.iterdir():
-            if _LEFT.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
-                shutil.rmtree(left)
+        remove_left(folder)
     except BlockingIOError as error:
         raise LidarpoolError(
             f"Another run or export is using the folder {folder}: wait for it, or give another "
@@ -123,6 +121,13 @@ def local_folder(place: Path | Storage) -> Iterator[Path]:
         folder = Path(temporary, place.url.rpartition("/")[2])
         folder.mkdir()
         yield folder
+
+
+def remove_left(folder: Path) -> None:
+    """Remove the folders of `staging` that killed programs have left in a folder."""
+    for left in folder.iterdir():
+        if _LEFT.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
+            shutil.rmtree(left)
 
 
 @contextmanager

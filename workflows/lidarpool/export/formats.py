@@ -90,6 +90,10 @@ class Format:
             raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
         if path.exists() and not overwrite:
             raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
+        self.check_columns(cloud)
+
+    def check_columns(self, cloud: CloudLike) -> None:
+        """Check that a cloud has the columns that the format needs, or raise LidarpoolError."""
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
             laid_out = f"with the layout {self.layout} " if self._row.layouts else ""

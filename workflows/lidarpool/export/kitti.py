@@ -10,9 +10,10 @@ import numpy as np
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
-from . import pieces
+from . import pieces, reading
 from .boxes import Boxes, type_of
-from .sweeps import Floats, Sweeps
+from .pieces import Data, Entry, as_data
+from .sweeps import Floats, Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
 # From the sensor's axes to KITTI's of a camera: x to the right, y down, z ahead.
@@ -21,6 +22,8 @@ _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 class Pieces(pieces.Pieces):
     """A sequence for each sensor: `sequences/00`, `01`, ...
+
+    In a data set the first sensor of job 7 has `sequences/07`, others `07_NAME`.
 
     In each are `velodyne/000000.bin` (float32 x, y, z in the sensor's axes when the sweep began,
     intensity), `labels/000000.label` (uint32: instance << 16 | class; the instance is the object's
@@ -32,31 +35,34 @@ class Pieces(pieces.Pieces):
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
 
-    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         if len(sweeps.objects) + len(sweeps.actors) > INSTANCES_MOST:
             raise LidarpoolError(f"KITTI labels hold {INSTANCES_MOST:,} objects at most.")
-        super().__init__(cloud, sweeps)
-        self.sequences = [f"sequences/{sensor:02}" for sensor in range(len(sweeps.sensors))]
+        super().__init__(cloud, sweeps, entry)
+        self.names = _names(sweeps, entry)
+        self.sequences = [f"sequences/{name}" for name in self.names]
         kinds = ("velodyne", "labels", *(["label_2"] if sweeps.actors else []))
         self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
-        """Return the files of a sweep."""
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes | None]:
+        """Return the files of a sweep, and its boxes where there are actors."""
         sweeps = self.sweeps
         folder, name = self.sequences[sweeps.sensor[number]], f"{sweeps.numbers[number]:06}"
-        inside = sweeps.in_sensor(number, points.positions)
-        rows = np.column_stack([inside, points["intensity"]]).astype("<f4")
+        rows = np.empty((len(points), 4), "<f4")
+        rows[:, :3] = sweeps.in_sensor(number, points.positions)
+        rows[:, 3] = points["intensity"]
         labels = (points["object"].astype("<u4") + 1) << 16 | points["class"]
-        files = {
-            f"{folder}/velodyne/{name}.bin": rows.tobytes(),
-            f"{folder}/labels/{name}.label": labels.tobytes(),
+        files: dict[str, Data] = {
+            f"{folder}/velodyne/{name}.bin": as_data(rows),
+            f"{folder}/labels/{name}.label": as_data(labels),
         }
-        if sweeps.actors:
-            lines = _labels(sweeps, number, Boxes.of(sweeps, number, points))
-            files[f"{folder}/label_2/{name}.txt"] = lines.encode()
-        return files, None
+        if not sweeps.actors:
+            return files, None
+        boxes = Boxes.of(sweeps, number, points)
+        files[f"{folder}/label_2/{name}.txt"] = _labels(sweeps, number, boxes).encode()
+        return files, boxes
 
-    def others(self, made: Sequence[None]) -> dict[str, bytes]:
+    def others(self, made: Sequence[Boxes | None]) -> dict[str, bytes]:
         """Return poses, times and calibrations."""
         sweeps = self.sweeps
         files: dict[str, bytes] = {}
@@ -68,11 +74,44 @@ class Pieces(pieces.Pieces):
                 [first @ turns @ _CAMERA.T, ((places - places[0]) @ first.T)[..., None]], axis=2
             )
             poses = _table(rows.reshape(-1, 12))
-            files |= {f"{folder}/poses.txt": poses, f"poses/{sensor:02}.txt": poses}
+            files |= {f"{folder}/poses.txt": poses, f"poses/{self.names[sensor]}.txt": poses}
             files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[own] / 1e9)
             lines = [f"P{camera}: {_row(np.eye(3))}\n" for camera in range(4)]
             files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(_CAMERA)}\n"]).encode()
         return files
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: intensity, class and object of each point."""
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the file of points."""
+        return self._file(sweep, "velodyne", "bin")
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep."""
+        rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 4)
+        file = self._file(sweep, "labels", "label")
+        labels = self.rows(file, np.dtype("<u4"))
+        reading.checked_length(len(labels), len(rows), file)
+        return np.ascontiguousarray(rows[:, :3]), {
+            "intensity": np.ascontiguousarray(rows[:, 3]),
+            "class": labels.astype(np.uint16),
+            "object": (labels >> 16).astype(np.int32) - 1,
+        }
+
+    def _file(self, sweep: int, folder: str, ending: str) -> str:
+        name = _names(self.sweeps, self.entry)[self.sweeps.sensor[sweep]]
+        return f"sequences/{name}/{folder}/{self.sweeps.numbers[sweep]:06}.{ending}"
+
+
+def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
+    """Names of the sequences of all sensors."""
+    if entry is None:
+        return [f"{sensor:02}" for sensor in range(len(sweeps.sensors))]
+    first = f"{entry.number:02}"
+    others = plain_names(name or "lidar" for name in sweeps.sensors)[1:]
+    return [first, *(f"{first}_{name}" for name in others)]
 
 
 def _table(rows: Floats) -> bytes:

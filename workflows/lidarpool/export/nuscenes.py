@@ -4,23 +4,33 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from contextlib import ExitStack
+from functools import cached_property
 from hashlib import md5
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from ..base.fingerprint import fingerprint
+from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
-from . import pieces
+from . import pieces, reading
 from .boxes import Boxes, type_of
+from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
 
 VERSION = "v1.0-lidarpool"
 _SCENE, _LOG = "scene-0001", "survey"
 _DATE = "1980-01-06"  # surveys begin at time 0 of no date
 _MAP = "maps/none.png"
+_TABLES = (
+    "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
+    "sample_annotation", "sample_data", "scene", "sensor", "visibility",
+)  # fmt: skip
+_SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
 
 
 class Pieces(pieces.Pieces):
@@ -32,59 +42,134 @@ class Pieces(pieces.Pieces):
     sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
     sensor's, at each sweep. Actors are annotated in each sample.
 
+    In a data set each job is a scene with its name, its files are in folders of that name in
+    `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables once all jobs are there.
+
     Caesar et al., nuScenes, 2020.
     """
 
-    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
-        super().__init__(cloud, sweeps)
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
+        super().__init__(cloud, sweeps, entry)
         self.channels = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
-        begins = sweeps.begins_ns[sweeps.sensor == 0]
-        self.sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
-        self.first = np.diff(self.sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
-        self.names = [
-            f"{'samples' if key else 'sweeps'}/{self.channels[sensor]}/{number:06}.pcd.bin"
-            for key, sensor, number in zip(self.first, sweeps.sensor, sweeps.numbers, strict=True)
-        ]
+        self.sample, self.first = _samples(sweeps)
+        self.names = _files(sweeps, self.channels, self.first, entry)
         self.folders = [name.rpartition("/")[0] for name in self.names]
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes]:
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
         inside = self.sweeps.in_sensor(number, points.positions)
         light = np.clip(points["intensity"], 0, 1) * 255
-        rows = np.column_stack([inside, light, points["channel"]]).astype("<f4")
-        return {self.names[number]: rows.tobytes()}, Boxes.of(self.sweeps, number, points)
+        rows = np.empty((len(points), 5), "<f4")
+        rows[:, :3], rows[:, 3], rows[:, 4] = inside, light, points["channel"]
+        return {self.names[number]: as_data(rows)}, Boxes.of(self.sweeps, number, points)
 
     def others(self, made: Sequence[Boxes]) -> dict[str, bytes]:
-        """Return the tables of the data set, and its map."""
-        tables = _Tables(self.sweeps)
+        """Return the tables of a survey by itself, and its map."""
+        if self.entry is not None:
+            return {}
+        files = {
+            f"{VERSION}/{name}.json": json.dumps(rows, indent=1).encode()
+            for name, rows in self._tables(made).items()
+        }
+        return files | {_MAP: _no_map()}
+
+    def summary(self, made: Sequence[Boxes]) -> dict[str, Any]:
+        """Return the tables of a job, for `merge`."""
+        return {"tables": self._tables(made)}
+
+    def _tables(self, made: Sequence[Boxes]) -> dict[str, list[dict[str, Any]]]:
+        tables = _Tables(self.sweeps, self.entry)
         tables.add_frames(self.channels, self.sample, self.names)
         samples = int((self.sweeps.sensor == 0).sum())
         counts = np.zeros((samples, len(self.sweeps.actors)), np.int64)
         for sweep in np.flatnonzero(self.first):
             counts[self.sample[sweep]] += made[int(sweep)].points
         tables.add_actors(list(made[:samples]), counts)
+        return tables.rows
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: intensity and channel of each point."""
+
+    @cached_property
+    def _files(self) -> list[str]:
+        channels = plain_names(name or "LIDAR_TOP" for name in self.sweeps.sensors)
+        return _files(self.sweeps, channels, _samples(self.sweeps)[1], self.entry)
+
+    def file(self, sweep: int) -> str:
+        """Return the name of its file."""
+        return self._files[sweep]
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep."""
+        rows = self.rows(self.file(sweep), np.dtype(("<f4", 5)))
+        columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
+        return np.ascontiguousarray(rows[:, :3]), columns
+
+
+def _samples(sweeps: Sweeps) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Sample of each sweep, and whether the sweep is its sensor's first in that."""
+    begins = sweeps.begins_ns[sweeps.sensor == 0]
+    sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
+    return sample, np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
+
+
+def _files(
+    sweeps: Sweeps, channels: Sequence[str], first: NDArray[np.bool_], entry: Entry | None
+) -> list[str]:
+    """Names of the files of all sweeps."""
+    below = "" if entry is None else f"{entry.name}/"
+    return [
+        f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"
+        for key, sensor, number in zip(first, sweeps.sensor, sweeps.numbers, strict=True)
+    ]
+
+
+def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
+    """Write the tables of a data set, from the summaries of its jobs in turn."""
+    shared: set[str] = set()  # tokens of rows that several jobs have
+    with ExitStack() as stack:
         files = {
-            f"{VERSION}/{name}.json": json.dumps(rows, indent=1).encode()
-            for name, rows in tables.rows.items()
+            name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
         }
-        image = io.BytesIO()
-        Image.new("L", (1, 1)).save(image, "png")
-        return files | {_MAP: image.getvalue()}  # the devkit looks whether there is one
+        before = dict.fromkeys(files, b"[\n")  # what comes before the next row
+        for job in jobs:
+            for name, rows in job["tables"].items():
+                for row in rows:
+                    if name in _SHARED:
+                        if row["token"] in shared:
+                            continue
+                        shared.add(row["token"])
+                    files[name].write(before[name] + json.dumps(row).encode())
+                    before[name] = b",\n"
+        for name, file in files.items():
+            file.write(b"[]\n" if before[name] == b"[\n" else b"\n]\n")
+    with place.writing(_MAP) as file:
+        file.write(_no_map())
+
+
+def _no_map() -> bytes:
+    """Return a picture of no map: the devkit looks whether there is one."""
+    image = io.BytesIO()
+    Image.new("L", (1, 1)).save(image, "png")
+    return image.getvalue()
 
 
 class _Tables:
-    """Tables of a data set; what its rows are called by follows from the survey."""
+    """Tables of a survey; what its rows are called by follows from the survey, and from the job."""
 
-    def __init__(self, sweeps: Sweeps) -> None:
-        self.sweeps = sweeps
-        self._salt = fingerprint(sweeps)
+    def __init__(self, sweeps: Sweeps, entry: Entry | None) -> None:
+        self.sweeps, self._entry = sweeps, entry
+        self._scene = _SCENE if entry is None else entry.name
+        self._salt = f"{'' if entry is None else f'{entry.name} '}{fingerprint(sweeps)}"
         self.rows: dict[str, list[dict[str, Any]]] = {"attribute": [], "visibility": []}
         self._add("log", _LOG, logfile="", vehicle="", date_captured=_DATE, location="")
         logs = [self._token("log", _LOG)]
         self._add("map", _MAP, category="semantic_prior", filename=_MAP, log_tokens=logs)
 
     def _token(self, table: str, what: object) -> str:
-        return md5(f"{self._salt} {table} {what}".encode(), usedforsecurity=False).hexdigest()
+        salt = self._salt if self._entry is None or table not in _SHARED else ""
+        return md5(f"{salt} {table} {what}".encode(), usedforsecurity=False).hexdigest()
 
     def _add(self, table: str, what: object, **fields: Any) -> None:
         self.rows.setdefault(table, []).append({"token": self._token(table, what), **fields})
@@ -99,13 +184,13 @@ class _Tables:
         sweeps = self.sweeps
         count = int((sweeps.sensor == 0).sum())
         self._add(
-            "scene", _SCENE, name=_SCENE, description="", nbr_samples=count,
+            "scene", self._scene, name=self._scene, description="", nbr_samples=count,
             log_token=self._token("log", _LOG), first_sample_token=self._token("sample", 0),
             last_sample_token=self._token("sample", count - 1),
         )  # fmt: skip
         times = [round(begin / 1000) for begin in sweeps.begins_ns]  # microseconds
         for number, beside in enumerate(self._chain("sample", list(range(count)))):
-            scene = self._token("scene", _SCENE)
+            scene = self._token("scene", self._scene)
             self._add("sample", number, timestamp=times[number], scene_token=scene, **beside)
         for sensor, channel in enumerate(channels):
             self._add("sensor", channel, channel=channel, modality="lidar")

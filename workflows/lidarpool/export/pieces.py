@@ -11,6 +11,8 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
+from numpy.typing import NDArray
+
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
@@ -22,16 +24,29 @@ RANGE_POINTS, RANGE_PIECES = 1_000_000, 100  # of a range at most: what a killed
 _MARK = ".writing"  # a file in the folder while ranges are written
 
 
+Data = bytes | memoryview
+Span = tuple[int, int]  # a range of pieces
+Written = tuple[int, list[Any]]  # points of a range, and what `Pieces.others` needs of its pieces
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A job in a data set of many: its number and name make its files differ from others'."""
+
+    number: int
+    name: str
+
+
 class Pieces:
     """The files of a cloud in a format of many: those of each piece, a sweep or other, and more.
 
-    `folders` are those of the files of the pieces.
+    `folders` are those of the files of the pieces. With an `entry` they are a job's in a data set.
     """
 
     folders: Sequence[str] = ()
 
-    def __init__(self, cloud: CloudLike, sweeps: Sweeps) -> None:
-        self.cloud, self.sweeps = cloud, sweeps
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
+        self.cloud, self.sweeps, self.entry = cloud, sweeps, entry
 
     def __len__(self) -> int:
         return len(self.sweeps)
@@ -40,7 +55,7 @@ class Pieces:
         """Yield the points of some pieces."""
         return self.sweeps.points(self.cloud, first, stop)
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Any]:
+    def files(self, number: int, points: Cloud) -> tuple[Mapping[str, Data], Any]:
         """Return the files of a piece, and what `others` needs of it."""
         raise NotImplementedError
 
@@ -48,9 +63,31 @@ class Pieces:
         """Return the files that are not of one piece."""
         return {}
 
+    def summary(self, made: Sequence[Any]) -> dict[str, Any]:
+        """Return what the data set's own files need of this job, as JSON holds it."""
+        return {}
 
-Span = tuple[int, int]  # a range of pieces
-Written = tuple[int, list[Any]]  # points of a range, and what `Pieces.others` needs of its pieces
+    def make_folders(self, place: Storage) -> None:
+        """Make the folders of the files of pieces."""
+        _make_folders(place, self.folders)
+
+    def write(self, place: Storage, first: int, stop: int) -> Written:
+        """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
+        count, made = 0, []
+        for number, points in enumerate(self.read(first, stop), first):
+            files, more = self.files(number, points)
+            for name, data in files.items():
+                place.write(name, data)
+            count += len(points)
+            made.append(more)
+        return count, made
+
+    def write_others(self, place: Storage, made: Sequence[Any]) -> None:
+        """Write the files that are not of one piece; OSError if that fails."""
+        others = self.others(made)
+        _make_folders(place, [str(Path(name).parent) for name in others])
+        for name, data in others.items():
+            place.write(name, data)
 
 
 @dataclass(frozen=True)
@@ -79,14 +116,7 @@ class RangeWriter:
             return None
         if not self.place.sees(_MARK, self._mark):
             return None
-        count, made = 0, []
-        for number, points in enumerate(pieces.read(*span), span[0]):
-            files, more = pieces.files(number, points)
-            for name, data in files.items():
-                self.place.write(name, data)
-            count += len(points)
-            made.append(more)
-        return count, made
+        return pieces.write(self.place, *span)
 
     def stop(self) -> None:
         """Let no further range be written."""
@@ -102,7 +132,7 @@ class RangeWriter:
         """
         pieces = self._pieces()
         self.place.prepare()
-        self._make_folders(pieces.folders)
+        pieces.make_folders(self.place)
         count = len(pieces)
         size = max(1, min(RANGE_PIECES, RANGE_POINTS * count // max(1, len(self.cloud))))
         spans = [(first, min(first + size, count)) for first in range(0, count, size)]
@@ -114,20 +144,27 @@ class RangeWriter:
         self.stop()
         if sum(rows for rows, _ in made.values()) != len(self.cloud):
             raise LidarpoolError(MIXED_UP)
-        others = pieces.others([more for span in spans for more in made[span][1]])
-        self._make_folders([str(Path(name).parent) for name in others])
-        for name, data in others.items():
-            self.place.write(name, data)
+        pieces.write_others(self.place, [more for span in spans for more in made[span][1]])
         self.place.tidy()
 
     def _pieces(self) -> Pieces:
-        module = import_module(f".{self.module}", __package__)
-        pieces: Pieces = module.Pieces(self.cloud, self.sweeps)
-        return pieces
+        return pieces_of(self.module, self.cloud, self.sweeps)
 
-    def _make_folders(self, names: Sequence[str]) -> None:
-        for name in dict.fromkeys(names) if self.place.is_local else ():
-            Path(self.place.url, name).mkdir(parents=True, exist_ok=True)
+
+def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> Pieces:
+    """Return the pieces of a cloud in the format of a module, as a job's with an `entry`."""
+    pieces: Pieces = import_module(f".{module}", __package__).Pieces(cloud, sweeps, entry)
+    return pieces
+
+
+def as_data(array: NDArray[Any]) -> Data:
+    """Return the bytes of an array, without a copy of them."""
+    return array.data.cast("B") if array.size else b""
+
+
+def _make_folders(place: Storage, names: Sequence[str]) -> None:
+    for name in dict.fromkeys(names) if place.is_local else ():
+        Path(place.url, name).mkdir(parents=True, exist_ok=True)
 
 
 # Writes ranges on workers; returns what was written of those whose workers see the folder.

@@ -180,6 +180,10 @@ class Sweeps:
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; OSError if it cannot be written."""
+        path.write_bytes(self.packed())
+
+    def packed(self) -> bytes:
+        """Return it as a NumPy archive: the same sweeps give the same bytes."""
         words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
@@ -190,18 +194,20 @@ class Sweeps:
             arrays[f"{prefix}quaternions"] = poses.quaternions
         memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
         np.savez_compressed(memory, **arrays)
-        path.write_bytes(memory.getbuffer())
+        return memory.getvalue()
 
     @classmethod
-    def load(cls, path: Path) -> Sweeps:
+    def load(cls, path: Path | str, data: bytes | None = None) -> Sweeps:
         """Read what `save` wrote; nothing in the file is run.
+
+        With `data`, the content of the file, the path is only its name in errors.
 
         Raises
         ------
         LidarpoolError
             If it cannot be read, is damaged, or of another version.
         """
-        with open_archive(path) as arrays:
+        with open_archive(path, data) as arrays:
             words = json.loads(arrays["words"].tobytes())
             if words["format"] != _FORMAT:
                 raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")

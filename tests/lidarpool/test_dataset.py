@@ -1,0 +1,278 @@
+"""Data sets of many jobs, read by other libraries or by the published formats."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import pickle
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pyarrow.dataset
+import pyarrow.parquet
+import pytest
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from lidarpool import Cloud, LidarpoolError, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud
+from lidarpool.base.storage import Storage
+from lidarpool.export.boxes import Boxes
+from lidarpool.export.dataset import FORMATS, INDEX_FILE, DataSet
+from lidarpool.export.formats import Format
+from lidarpool.export.jobs import JobRow
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.scene.actors import Actor, box
+
+TURNS, SCANS = 3, 36  # of a sensor, of a turn
+KEPT = ("intensity", "class", "time")
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    track = Track([0, 2], [[5, 5, 0], [9, 5, 0]])
+    gone = Track([0.1, 2], [[0, 5, 0], [0, 9, 0]])
+    cars = Actor(box("Car 1", (4, 2, 1.5)), track), Actor(box("Van 1", (5, 2, 2.5)), gone)
+    return replace(Scene.seed(), actors=cars)
+
+
+@pytest.fixture(scope="module")
+def survey() -> Survey:
+    """Two sensors, three turns each, on a carrier that moves and turns."""
+    half = np.sqrt(0.5)
+    track = Track([0, 1], [[100, 0, 1], [110, 5, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
+    lidar = Sensor.grid(360, 4)
+    front = Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front")
+    steps = TURNS * SCANS
+    sensors = [front, Mounted(lidar, name="rear/left")]
+    return Survey(sensors=sensors, trajectory=track, steps=steps, columns=KEPT)
+
+
+@pytest.fixture(scope="module")
+def sweeps(survey, scene) -> Sweeps:
+    return Sweeps.of(survey, scene)
+
+
+@pytest.fixture(scope="module")
+def job(survey, scene, sweeps) -> Callable[[int], Cloud]:
+    """Return the points of a job: others for each, none in the second sweep of all."""
+
+    def make(number: int) -> Cloud:
+        rng = np.random.default_rng(number)
+        scan = np.sort(rng.integers(0, survey.scan_count, 900))
+        scan = scan[scan // SCANS != 1]
+        count = len(scan)
+        columns = {
+            "scan": scan,
+            "channel": rng.integers(0, 4, count),
+            "object": rng.integers(0, len(scene.names) + 2, count),
+            "intensity": rng.uniform(0, 1, count).astype(np.float32),
+            "class": rng.integers(0, 30, count),
+            "time": scan * 1000,
+        }
+        return Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
+
+    return make
+
+
+@pytest.fixture
+def written(tmp_path, job, sweeps):
+    def write(format: str, jobs=(0, 1, 7), layout: str = "velodyne") -> tuple[DataSet, Path]:  # noqa: A002
+        place = tmp_path / format
+        data = DataSet(Storage.at(place), format, layout)
+        for number in jobs:
+            data.write_job(number, f"{number:03}", job(number), sweeps)
+        data.finish(JobRow(number, f"{number:03}") for number in jobs)
+        return data, place
+
+    return write
+
+
+def files_of(folder: Path) -> dict[str, bytes]:
+    return {
+        str(path.relative_to(folder)): path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def test_kitti_has_a_sequence_for_each_sensor_of_each_job(written, job, sweeps, tmp_path):
+    _, place = written("kitti")
+    names = {path.name for path in (place / "sequences").iterdir()}
+    assert names == {f"{n:02}{s}" for n in (0, 1, 7) for s in ("", "_rear_left")}
+    assert {path.stem for path in (place / "poses").iterdir()} == names
+    # Its files are those of a job by itself.
+    Format("kitti").write(tmp_path / "alone", job(7), sweeps)
+    for sensor, name in enumerate(("07", "07_rear_left")):
+        own = files_of(place / "sequences" / name)
+        assert own == files_of(tmp_path / f"alone/sequences/{sensor:02}")
+        assert len(own) == 3 * TURNS + 3
+        assert own["poses.txt"] == (place / f"poses/{name}.txt").read_bytes()
+
+
+def test_parquet_is_one_table_of_partitions(written, job):
+    _, place = written("parquet")
+    table = pyarrow.dataset.dataset(place / "points", partitioning="hive").to_table()
+    frame = table.to_pandas()
+    for number in (0, 1, 7):
+        cloud, rows = job(number), frame[frame.job == number]
+        np.testing.assert_allclose(rows[["x", "y", "z"]], cloud.positions)
+        np.testing.assert_array_equal(rows["class"], cloud["class"])
+    assert len(frame) == sum(len(job(number)) for number in (0, 1, 7))
+
+
+def test_folder_has_a_result_for_each_job(written, job):
+    _, place = written("folder")
+    cloud = read_cloud(place / "jobs/007/cloud.ply")
+    np.testing.assert_allclose(cloud.positions, job(7).positions, atol=1e-4)
+    assert len(cloud.sweeps()) == 2 * TURNS  # so it can be saved in other formats
+
+
+def test_bags_are_those_of_jobs_by_themselves(written, job, sweeps, tmp_path):
+    _, place = written("mcap", layout="velodyne")
+    assert {path.name for path in (place / "bags").iterdir()} == {
+        "000.mcap",
+        "001.mcap",
+        "007.mcap",
+    }
+    # A bag holds the name of its file.
+    Format("mcap").write(tmp_path / "007.mcap", job(7), sweeps)
+    assert (place / "bags/007.mcap").read_bytes() == (tmp_path / "007.mcap").read_bytes()
+    with AnyReader(
+        [place / "bags/007.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
+    ) as bag:
+        assert "/rear_left/points" in bag.topics
+
+
+def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
+    _, place = written("nuscenes")
+    tables = {
+        path.stem: json.loads(path.read_text()) for path in (place / "v1.0-lidarpool").iterdir()
+    }
+    assert len(tables) == 13
+    for rows in tables.values():
+        assert len({row["token"] for row in rows}) == len(rows)
+    assert [row["name"] for row in tables["scene"]] == ["000", "001", "007"]
+    assert {row["channel"] for row in tables["sensor"]} == {"front", "rear_left"}
+    assert {row["name"] for row in tables["category"]} == {"Car", "Van"}
+    assert len(tables["map"]) == 1 and len(tables["log"]) == 1
+    assert len(tables["sample"]) == 3 * TURNS and len(tables["sample_data"]) == 6 * TURNS
+    # Each token that a row names is that of a row.
+    keys = {name: {row["token"] for row in rows} for name, rows in tables.items()}
+    named = 0
+    for rows in tables.values():
+        for row in rows:
+            for field, token in row.items():
+                table = field.removesuffix("_token")
+                if field != table and table in keys and token:
+                    assert token in keys[table], field
+                    named += 1
+    assert named > 100
+    for row in tables["sample_data"]:
+        assert (place / row["filename"]).stat().st_size % 20 == 0
+    # Chains stay within their scene.
+    samples = {row["token"]: row for row in tables["sample"]}
+    for scene in tables["scene"]:
+        token, count = scene["first_sample_token"], 0
+        while token:
+            assert samples[token]["scene_token"] == scene["token"]
+            token, count = samples[token]["next"], count + 1
+        assert count == scene["nbr_samples"] == TURNS
+    cloud = job(7)
+    rows = np.fromfile(place / "samples/rear_left/007/000002.pcd.bin", "<f4").reshape(-1, 5)
+    points = cloud.part(np.flatnonzero(cloud.scan // SCANS == TURNS + 2))
+    inside = sweeps.in_sensor(TURNS + 2, points.positions)
+    np.testing.assert_allclose(rows[:, :3], inside, atol=1e-5)
+    total = sum(row["num_lidar_pts"] for row in tables["sample_annotation"])
+    objects = len(sweeps.objects)
+    assert total == sum((job(number).object >= objects).sum() for number in (0, 1, 7))
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_same_job_has_the_same_bytes_and_can_be_removed(written, job, sweeps, tmp_path, format):  # noqa: A002
+    data, place = written(format)
+    before = files_of(place)
+    assert before and not [name for name in before if "lidarpool-" in Path(name).name]
+    moved = pickle.loads(pickle.dumps(data))
+    assert len(pickle.dumps(data)) < 500
+    moved.write_job(1, "001", job(1), sweeps)
+    assert files_of(place) == before
+    moved.remove_job(1, "001")
+    moved.remove_job(1, "001")
+    assert len(files_of(place)) < len(before)
+    moved.finish([JobRow(0, "000"), JobRow(1, "001", error="failed"), JobRow(7, "007")])
+    only = tmp_path / "only"
+    other = DataSet(Storage.at(only), format)
+    for number in (7, 0):
+        other.write_job(number, f"{number:03}", job(number), sweeps)
+    other.finish([JobRow(0, "000"), JobRow(7, "007")])
+    assert files_of(place) == files_of(only)
+
+
+def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
+    for _ in range(5):
+        data.write_job(3, "003", cloud, sweeps)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # noqa: A002
+    data = DataSet(Storage.at(tmp_path / "both"), format)
+    context = multiprocessing.get_context("spawn")
+    two = [context.Process(target=_write, args=(data, job(3), sweeps)) for _ in range(2)]
+    for process in two:
+        process.start()
+    for process in two:
+        process.join(60)
+        assert process.exitcode == 0
+    DataSet(Storage.at(tmp_path / "one"), format).write_job(3, "003", job(3), sweeps)
+    assert files_of(tmp_path / "both") == files_of(tmp_path / "one")
+
+
+def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeypatch):
+    held = []
+    write = Storage.write
+
+    def look(storage, name, data):
+        held.append(len(data))
+        write(storage, name, data)
+
+    monkeypatch.setattr(Storage, "write", look)
+    DataSet(Storage.at(tmp_path), "kitti").write_job(0, "0", job(0), sweeps)
+    assert max(held) < 16 * len(job(0)) / 3
+
+
+def test_boxes_are_kept_as_the_formats_have_them(written, job, sweeps):
+    for format in FORMATS:  # noqa: A001
+        _, place = written(format, (4,))
+        name = "jobs/004/boxes.npz" if format == "folder" else "boxes/004.npz"
+        with np.load(place / name) as kept:
+            for sweep, points in enumerate(sweeps.points(job(4))):
+                wanted = Boxes.of(sweeps, sweep, points)
+                np.testing.assert_allclose(kept["centres"][sweep], wanted.centres)
+                np.testing.assert_array_equal(kept["there"][sweep], wanted.there)
+
+
+def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):
+    place = Storage.at(tmp_path / "d")
+    with pytest.raises(LidarpoolError, match=r"format is 'las'; .* kitti, nuscenes"):
+        DataSet(place, "las")
+    bare = Cloud(job(0).positions, {"scan": job(0).scan})
+    with pytest.raises(LidarpoolError, match="kitti needs object, intensity, class"):
+        DataSet(place, "kitti").write_job(0, "0", bare, sweeps)
+    assert DataSet(place, "kitti").columns == ("scan", "object", "intensity", "class")
+    assert DataSet(place, "folder").columns == ()
+    assert "range" in DataSet(place, "mcap", "ouster").columns
+    half = replace(sweeps, scans=sweeps.scans[:4], begins_ns=sweeps.begins_ns[:3])
+    with pytest.raises(LidarpoolError, match="not in the order of their scans, or of another"):
+        DataSet(place, "kitti").write_job(0, "0", job(0), half)
+    with pytest.raises(LidarpoolError, match=r"Job 5 of .* is not whole: its \.jobs/5\.json"):
+        DataSet(place, "kitti").finish([JobRow(5, "5")])
+    assert not (tmp_path / "d" / INDEX_FILE).exists()
+    (tmp_path / "file").write_text("")
+    with pytest.raises(LidarpoolError, match=r"Job 0 cannot be written to .*file") as told:
+        DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(0, "0", job(0), sweeps)
+    assert "\n" not in str(told.value)
+    monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
+    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[parquet\]"'):
+        DataSet(place, "parquet").write_job(0, "0", job(0), sweeps)
