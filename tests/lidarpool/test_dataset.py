@@ -6,7 +6,7 @@ import json
 import multiprocessing
 import pickle
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,20 +21,12 @@ from lidarpool.base.storage import Storage
 from lidarpool.export.boxes import Boxes
 from lidarpool.export.dataset import FORMATS, INDEX_FILE, DataSet
 from lidarpool.export.formats import Format
+from lidarpool.export.jobs import JobRow
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import Actor, box
 
 TURNS, SCANS = 3, 36  # of a sensor, of a turn
 KEPT = ("intensity", "class", "time")
-
-
-@dataclass(frozen=True)
-class Row:
-    """As a row of the table of jobs."""
-
-    number: int
-    name: str
-    error: str = ""
 
 
 @pytest.fixture(scope="module")
@@ -91,7 +83,7 @@ def written(tmp_path, job, sweeps):
         data = DataSet(Storage.at(place), format, layout)
         for number in jobs:
             data.write_job(number, f"{number:03}", job(number), sweeps)
-        data.finish(Row(number, f"{number:03}") for number in jobs)
+        data.finish(JobRow(number, f"{number:03}") for number in jobs)
         return data, place
 
     return write
@@ -209,12 +201,12 @@ def test_the_same_job_has_the_same_bytes_and_can_be_removed(written, job, sweeps
     moved.remove_job(1, "001")
     moved.remove_job(1, "001")
     assert len(files_of(place)) < len(before)
-    moved.finish([Row(0, "000"), Row(1, "001", "failed"), Row(7, "007")])
+    moved.finish([JobRow(0, "000"), JobRow(1, "001", error="failed"), JobRow(7, "007")])
     only = tmp_path / "only"
     other = DataSet(Storage.at(only), format)
     for number in (7, 0):
         other.write_job(number, f"{number:03}", job(number), sweeps)
-    other.finish([Row(0, "000"), Row(7, "007")])
+    other.finish([JobRow(0, "000"), JobRow(7, "007")])
     assert files_of(place) == files_of(only)
 
 
@@ -275,7 +267,7 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
     with pytest.raises(LidarpoolError, match="not in the order of their scans, or of another"):
         DataSet(place, "kitti").write_job(0, "0", job(0), half)
     with pytest.raises(LidarpoolError, match=r"Job 5 of .* is not whole: its \.jobs/5\.json"):
-        DataSet(place, "kitti").finish([Row(5, "5")])
+        DataSet(place, "kitti").finish([JobRow(5, "5")])
     assert not (tmp_path / "d" / INDEX_FILE).exists()
     (tmp_path / "file").write_text("")
     with pytest.raises(LidarpoolError, match=r"Job 0 cannot be written to .*file") as told:

@@ -111,6 +111,11 @@ class Storage:
             raise LidarpoolError(f"{self.url} cannot be opened: {error}{hint}.") from error
         return system, folder
 
+    def file_system(self) -> tuple[Any, str]:
+        """Return the file system of fsspec and the folder, for libraries that open files."""
+        with self._remote() as opened:
+            return opened
+
     def __reduce__(self) -> tuple[Any, ...]:
         return Storage, (self.url, self.durable)
 

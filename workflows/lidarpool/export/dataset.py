@@ -7,20 +7,20 @@ import json
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any, Literal, Protocol, TypeVar
+from typing import IO, Any, Literal, TypeVar
 
 import numpy as np
 
 from .._version import __version__
 from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage, flush
+from ..base.storage import Storage
 from ..columns.cloud import CloudLike
 from .boxes import Boxes
-from .folder import local_folder, remove_left, staging
+from .folder import local_folder, remove_left
 from .formats import Format
+from .jobs import JobRow
 from .nuscenes import merge
 from .pieces import RANGE_PIECES, RANGE_POINTS, Entry, Pieces, Written, pieces_of
 from .sweeps import MIXED_UP, SWEEPS_FILE, Sweeps
@@ -35,24 +35,8 @@ FORMATS = {
 }  # fmt: skip
 INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
-_FORMAT = 1
+VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
-
-
-class Done(Protocol):
-    """What `finish` asks of a row of the table of jobs."""
-
-    @property
-    def number(self) -> int:
-        """Return its number, from 0."""
-
-    @property
-    def name(self) -> str:
-        """Return its name in files."""
-
-    @property
-    def error(self) -> str:
-        """Return why it failed; "" for a job that is done."""
 
 
 def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
@@ -139,9 +123,11 @@ class DataSet:
             else:
                 summary, made = {}, []
                 path = f"jobs/{name}/{one.file}" if self.format == "folder" else f"bags/{name}.mcap"
-                with gathered(place) as folder:
-                    (folder / path).parent.mkdir(parents=True)
-                    one.write(folder / path, cloud, sweeps)
+                with local_folder(Path(place.url) if place.is_local else place) as folder:
+                    (folder / path).parent.mkdir(parents=True, exist_ok=True)
+                    one.write(folder / path, cloud, sweeps, overwrite=True)
+                    if not place.is_local:
+                        place.put(folder / path, path)
             files = {job_file(self.format, name, SWEEPS_FILE): sweeps.packed()}
             if sweeps.actors:
                 if len(made) != len(sweeps):  # the format is not of single sweeps
@@ -180,7 +166,7 @@ class DataSet:
             for file in (SWEEPS_FILE, BOXES_FILE):
                 place.remove([job_file(self.format, name, file)])
 
-    def finish(self, jobs: Iterable[Done]) -> None:
+    def finish(self, jobs: Iterable[JobRow]) -> None:
         """Write the files that hold all jobs, from those that are done, in their order.
 
         One job is in memory at a time, and its number of sweeps. No job may be written meanwhile.
@@ -193,27 +179,33 @@ class DataSet:
         """
         with explained(f"{self.place} cannot be written"):
             self.place.remove([INDEX_FILE])
-            if self.place.is_local:
-                remove_left(Path(self.place.url))
-            self.place.tidy()
-            with gathered(self.place) as folder, (folder / INDEX_FILE).open("w") as file:
-                head = {"lidarpool": __version__, "version": _FORMAT}
+            self._tidy()
+            with self.place.writing(INDEX_FILE) as file:
+                head = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
-                file.write(f'{json.dumps(head)[:-1]}, "jobs": [')
+                file.write(f'{json.dumps(head)[:-1]}, "jobs": ['.encode())
                 summaries = self._indexed(jobs, file)
                 if self.format == "nuscenes":
-                    merge(folder, summaries)
+                    merge(self.place, summaries)
                 else:
                     deque(summaries, maxlen=0)
-                file.write("\n]}\n")
+                file.write(b"\n]}\n")
 
-    def _indexed(self, jobs: Iterable[Done], index: IO[str]) -> Iterator[dict[str, Any]]:
+    def _tidy(self) -> None:
+        """Remove what killed writers have left on this machine."""
+        self.place.tidy()
+        if self.place.is_local:
+            root = Path(self.place.url)
+            for folder in (*root.glob("bags"), *root.glob("jobs/*")):
+                remove_left(folder)
+
+    def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
         """Yield what each job that is done has left, and add it to the index."""
-        done = ((job.number, job.name) for job in jobs if not job.error)
+        done = ((job.number, job.name) for job in jobs if job.done)
         comma = ""
         for (number, name), summary in _ahead(self._summary, done):
             row = {"number": number, "name": name, "sensors": summary["sensors"]}
-            index.write(f"{comma}\n{json.dumps(row)}")
+            index.write(f"{comma}\n{json.dumps(row)}".encode())
             comma = ","
             yield summary
 
@@ -286,28 +278,3 @@ def _ahead(function: Callable[[T], U], items: Iterable[T]) -> Iterator[tuple[T, 
                 yield first, value.result()
         finally:
             pool.shutdown(cancel_futures=True)
-
-
-@contextmanager
-def gathered(place: Storage) -> Iterator[Path]:
-    """Temporary folder, whose files go to the same places in the storage when the body ends.
-
-    They appear one by one, each completely; a file with the name INDEX_FILE comes last.
-    """
-    staged = staging(Path(place.url), place) if place.is_local else local_folder(place)
-    place.prepare()
-    with staged as folder:
-        yield folder
-        files = sorted(path for path in folder.rglob("*") if path.is_file())
-        for path in sorted(files, key=lambda path: path.name == INDEX_FILE):
-            name = path.relative_to(folder).as_posix()
-            if not place.is_local:
-                place.put(path, name)
-                continue
-            target = Path(place.url, name)
-            target.parent.mkdir(parents=True, exist_ok=True)
-            if place.durable:
-                flush(path)
-            path.replace(target)
-            if place.durable:
-                flush(target.parent)

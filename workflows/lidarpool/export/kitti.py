@@ -10,7 +10,7 @@ import numpy as np
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
-from . import pieces
+from . import pieces, reading
 from .boxes import Boxes, type_of
 from .pieces import Data, Entry, as_data
 from .sweeps import Floats, Sweeps, plain_names
@@ -79,6 +79,30 @@ class Pieces(pieces.Pieces):
             lines = [f"P{camera}: {_row(np.eye(3))}\n" for camera in range(4)]
             files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(_CAMERA)}\n"]).encode()
         return files
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: intensity, class and object of each point."""
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the file of points."""
+        return self._file(sweep, "velodyne", "bin")
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep."""
+        rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 4)
+        file = self._file(sweep, "labels", "label")
+        labels = self.rows(file, np.dtype("<u4"))
+        reading.checked_length(len(labels), len(rows), file)
+        return np.ascontiguousarray(rows[:, :3]), {
+            "intensity": np.ascontiguousarray(rows[:, 3]),
+            "class": labels.astype(np.uint16),
+            "object": (labels >> 16).astype(np.int32) - 1,
+        }
+
+    def _file(self, sweep: int, folder: str, ending: str) -> str:
+        name = _names(self.sweeps, self.entry)[self.sweeps.sensor[sweep]]
+        return f"sequences/{name}/{folder}/{self.sweeps.numbers[sweep]:06}.{ending}"
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:

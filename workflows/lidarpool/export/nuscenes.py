@@ -6,16 +6,18 @@ import io
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import ExitStack
+from functools import cached_property
 from hashlib import md5
-from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 
 from ..base.fingerprint import fingerprint
+from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
-from . import pieces
+from . import pieces, reading
 from .boxes import Boxes, type_of
 from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
@@ -49,14 +51,8 @@ class Pieces(pieces.Pieces):
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
         self.channels = plain_names(name or "LIDAR_TOP" for name in sweeps.sensors)
-        below = "" if entry is None else f"{entry.name}/"
-        begins = sweeps.begins_ns[sweeps.sensor == 0]
-        self.sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
-        self.first = np.diff(self.sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
-        self.names = [
-            f"{'samples' if key else 'sweeps'}/{self.channels[sensor]}/{below}{number:06}.pcd.bin"
-            for key, sensor, number in zip(self.first, sweeps.sensor, sweeps.numbers, strict=True)
-        ]
+        self.sample, self.first = _samples(sweeps)
+        self.names = _files(sweeps, self.channels, self.first, entry)
         self.folders = [name.rpartition("/")[0] for name in self.names]
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
@@ -92,30 +88,64 @@ class Pieces(pieces.Pieces):
         return tables.rows
 
 
-def merge(folder: Path, jobs: Iterable[Mapping[str, Any]]) -> None:
-    """Write the tables of a data set into a folder, from the summaries of its jobs in turn."""
-    there = folder / VERSION
-    there.mkdir()
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: intensity and channel of each point."""
+
+    @cached_property
+    def _files(self) -> list[str]:
+        channels = plain_names(name or "LIDAR_TOP" for name in self.sweeps.sensors)
+        return _files(self.sweeps, channels, _samples(self.sweeps)[1], self.entry)
+
+    def file(self, sweep: int) -> str:
+        """Return the name of its file."""
+        return self._files[sweep]
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep."""
+        rows = self.rows(self.file(sweep), np.dtype(("<f4", 5)))
+        columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
+        return np.ascontiguousarray(rows[:, :3]), columns
+
+
+def _samples(sweeps: Sweeps) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Sample of each sweep, and whether the sweep is its sensor's first in that."""
+    begins = sweeps.begins_ns[sweeps.sensor == 0]
+    sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
+    return sample, np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
+
+
+def _files(
+    sweeps: Sweeps, channels: Sequence[str], first: NDArray[np.bool_], entry: Entry | None
+) -> list[str]:
+    """Names of the files of all sweeps."""
+    below = "" if entry is None else f"{entry.name}/"
+    return [
+        f"{'samples' if key else 'sweeps'}/{channels[sensor]}/{below}{number:06}.pcd.bin"
+        for key, sensor, number in zip(first, sweeps.sensor, sweeps.numbers, strict=True)
+    ]
+
+
+def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
+    """Write the tables of a data set, from the summaries of its jobs in turn."""
     shared: set[str] = set()  # tokens of rows that several jobs have
     with ExitStack() as stack:
-        files: dict[str, IO[str]] = {}
-        for name in _TABLES:
-            files[name] = stack.enter_context((there / f"{name}.json").open("w", encoding="utf-8"))
-            files[name].write("[")
-        rows = dict.fromkeys(files, 0)
+        files = {
+            name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
+        }
+        before = dict.fromkeys(files, b"[\n")  # what comes before the next row
         for job in jobs:
-            for name, own in job["tables"].items():
-                for row in own:
+            for name, rows in job["tables"].items():
+                for row in rows:
                     if name in _SHARED:
                         if row["token"] in shared:
                             continue
                         shared.add(row["token"])
-                    files[name].write(f"{',' if rows[name] else ''}\n{json.dumps(row)}")
-                    rows[name] += 1
-        for file in files.values():
-            file.write("\n]\n")
-    (folder / _MAP).parent.mkdir()
-    (folder / _MAP).write_bytes(_no_map())
+                    files[name].write(before[name] + json.dumps(row).encode())
+                    before[name] = b",\n"
+        for name, file in files.items():
+            file.write(b"[]\n" if before[name] == b"[\n" else b"\n]\n")
+    with place.writing(_MAP) as file:
+        file.write(_no_map())
 
 
 def _no_map() -> bytes:

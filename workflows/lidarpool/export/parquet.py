@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 from itertools import islice
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from ..columns.table import AXES, Column
-from . import pieces
+from ..columns.table import AXES, TABLE, Column
+from . import pieces, reading
 from .pieces import Entry
 from .sweeps import Sweeps
 
@@ -61,6 +64,34 @@ class Pieces(pieces.Pieces):
         pq.write_table(table, memory, row_group_size=_GROUP_ROWS if self.entry else None)
         name = f"part-{number:05}.parquet"
         return {"/".join([*self.folders, name]): memory.getvalue()}
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: all columns of each point, by their names in clouds."""
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the job's partition."""
+        return f"points/job={self.entry.number}"
+
+    @cached_property
+    def _table(self) -> Any:
+        if self.place.is_local:
+            return pyarrow.dataset.dataset(self.place.path(self.file(0)), format="parquet")
+        system, folder = self.place.file_system()
+        return pyarrow.dataset.dataset(
+            f"{folder}/{self.file(0)}", format="parquet", filesystem=system
+        )
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep, of which only groups of rows with its scans are read."""
+        first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
+        scan = pyarrow.dataset.field("scan")
+        # Threads of their own would be many beside those of the workers that load data.
+        rows = self._table.to_table(filter=(scan >= first) & (scan < stop), use_threads=False)
+        names = {column.in_files: column.name for column in TABLE.values()}
+        columns = {names.get(name, name): rows[name].to_numpy() for name in rows.column_names}
+        positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
+        return self.inside(sweep, Cloud(positions, columns))
 
 
 def _words(column: Column) -> dict[str, str]:

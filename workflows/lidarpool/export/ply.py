@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
@@ -13,9 +13,11 @@ from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from ..columns.table import AXES as POSITION
 from ..columns.table import TABLE, check_names
+from . import reading
 from .sweeps import SWEEPS_FILE, Sweeps
 
 # Positions are stored in single precision if the error is below this part of the precision.
@@ -72,6 +74,27 @@ def read_cloud(path: str | Path) -> Cloud:
     beside = path.with_name(SWEEPS_FILE)
     sweeps = partial(Sweeps.load, beside) if beside.exists() else None
     return Cloud(positions, columns, sweeps=sweeps)
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: all columns of each point."""
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the job's cloud."""
+        return f"jobs/{self.entry.name}/cloud.ply"
+
+    @cached_property
+    def _cloud(self) -> CloudFile:
+        return CloudFile(self.local(self.file(0)))
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep."""
+        first, stop = (self._cloud.row_of(scan) for scan in self.sweeps.scans[sweep : sweep + 2])
+        cloud = next(self._cloud.chunks(max(1, stop - first), first), None)
+        if cloud is None or first == stop:
+            kinds = {column.name: np.empty(0, column.dtype) for column in self._cloud.table}
+            cloud = Cloud(np.empty((0, 3)), kinds)
+        return self.inside(sweep, cloud)
 
 
 def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -23,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS
 from ..scene.colours import as_float
+from . import reading
 from .boxes import Boxes
 from .sweeps import Placed, Sweeps, plain_names
 
@@ -102,11 +104,10 @@ def _messages(
         for name, (kind, offset, *_) in (row.fields or {}).items()
     ]
     make = _Messages(types)
-    named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    _, _, *frames = plain_names((WORLD, CARRIER, *named))
+    frames = _frames(sweeps)
     actors = frames[len(sweeps.sensors) :]
     moving = [(CARRIER, sweeps.carrier), *zip(actors, sweeps.actor_poses, strict=True)]
-    start_ns = START_NS if sweeps.start_ns is None else sweeps.start_ns
+    start_ns = _start_ns(sweeps)
     on_carrier = [
         (CARRIER, frame, sweeps.mounts, number)
         for number, frame in enumerate(frames[: len(sweeps.sensors)])
@@ -115,7 +116,7 @@ def _messages(
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
         frame = frames[sweeps.sensor[sweep]]
-        topic = f"/{frame}/points" if sweeps.sensors[sweeps.sensor[sweep]] else "/points"
+        topic = _topic(sweeps, frames, sweep)
         rows = _rows(layout, row, points, sweeps, sweep)
         in_world = [
             (WORLD, name, placed, sweep)
@@ -134,6 +135,68 @@ def _messages(
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: intensity (0 to 1 with autoware) and channel of each point."""
+
+    def __init__(self, *given: Any) -> None:
+        super().__init__(*given)
+        self._opened: AnyReader | None = None
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the job's bag."""
+        return f"bags/{self.entry.name}.mcap"
+
+    @property
+    def _bag(self) -> AnyReader:
+        if self._opened is None:
+            store = get_typestore(Stores.ROS2_HUMBLE)
+            bag = AnyReader([self.local(self.file(0))], default_typestore=store)
+            bag.open()
+            self._opened = bag
+        return self._opened
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep."""
+        topic = _topic(self.sweeps, _frames(self.sweeps), sweep)
+        connections = [one for one in self._bag.connections if one.topic == topic]
+        time_ns = _start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
+        found = self._bag.messages(connections, time_ns, time_ns + 1)
+        connection, _, data = next(found, (None, 0, b""))
+        if connection is None:
+            raise ValueError(f"it has no message on {topic} at {time_ns} ns")
+        message: Any = self._bag.deserialize(data, connection.msgtype)
+        coloured = any(field.name == "rgb" for field in message.fields)
+        rows = message.data.view(_row(self.layout, coloured))
+        light = rows["intensity"].astype(np.float32)
+        columns = {
+            "intensity": light / 255 if self.layout == "autoware" else light,
+            "channel": rows["channel" if self.layout == "autoware" else "ring"].astype(np.uint16),
+        }
+        return np.stack([rows[axis] for axis in "xyz"], axis=1), columns
+
+    def close(self) -> None:
+        """Close the bag."""
+        if self._opened is not None:
+            self._opened.close()
+        super().close()
+
+
+def _frames(sweeps: Sweeps) -> list[str]:
+    """Frames of the sensors, then of the actors."""
+    named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
+    return plain_names((WORLD, CARRIER, *named))[2:]
+
+
+def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
+    """Topic of the points of a sweep."""
+    sensor = sweeps.sensor[sweep]
+    return f"/{frames[sensor]}/points" if sweeps.sensors[sensor] else "/points"
+
+
+def _start_ns(sweeps: Sweeps) -> int:
+    return START_NS if sweeps.start_ns is None else sweeps.start_ns
 
 
 def _row(layout: str, coloured: bool) -> np.dtype[np.void]:

@@ -83,7 +83,7 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
             "planning": round(result.planning_seconds, 3),
             "survey_and_planning_overlap": round(overlap_seconds(result.stages), 3),
         },
-        "stages": _stages(result.stages),
+        "stages": stage_figures(result.stages),
         "tasks": tasks,
         "placement_violations": sum(stage.violations for stage in result.stages),
         "misplaced_tasks": [asdict(record) for s in result.stages for record in s.misplaced][:20],
@@ -166,7 +166,7 @@ def _sensor(sensor: Sensor) -> dict[str, Any]:
     }
 
 
-def _stages(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
+def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
     """For each stage: tasks, items, seconds of work, and the span from first start to last stop."""
     return {
         stage.stage: {

@@ -71,7 +71,7 @@ def write_page(
     ordered = sorted(result.stages, key=lambda stage: list(STAGES).index(stage.stage))
     begun = min((stage.start for stage in ordered), default=math.inf)
     bars, rest = _object_bars(report["points_by_object"])
-    page = _environment().get_template("page.html")
+    page = environment().get_template("page.html")
     text = page.render(
         report=report,
         title=_title(report["parameters"]),
@@ -120,7 +120,7 @@ def _object_bars(counts: Mapping[str, int]) -> tuple[list[Bar], str]:
     return bars, "; ".join(rest)
 
 
-def _environment() -> Environment:
+def environment() -> Environment:
     """Jinja's environment: all values are escaped, and a missing value is an error."""
     environment = Environment(
         loader=PackageLoader(__package__ or ""),

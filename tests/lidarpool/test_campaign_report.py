@@ -1,0 +1,208 @@
+"""The card of a data set: README, page, figures, pictures, splits."""
+
+import html
+import json
+import re
+import tracemalloc
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from lidarpool import LidarpoolError
+from lidarpool.base.storage import Storage
+from lidarpool.export.jobs import JobRow
+from lidarpool.report.campaign_report import CampaignInfo, write_card
+
+NAMES = ("visibility", "model", "night")
+EVIL = '<script>alert(1)</script> | `x` $\\frac{1 [a](b) \u202e "'
+
+
+def row(number, **given):
+    models = ("vlp16", "os1-64")
+    values = {"visibility": 0.1 * 1.2**number, "model": models[number % 2], "night": number % 3 > 0}
+    split = ("train", "train", "val")[number % 3]
+    counts = {"scans": 20, "sweeps": 2, "rays": 2000, "hits": 1000 + number, "points": 500 + number}
+    more = {
+        "seconds": 0.1 * number,
+        "sha256": f"{number:064x}",
+        "classes": {0: 100, 6: 400 + number},
+    }
+    known = {"name": f"{number:02d}", "split": split, "values": values} | counts | more
+    return JobRow(number, **(known | given))
+
+
+ROWS = [row(k) for k in range(30)]
+ROWS[3] = JobRow(3, "03", "train", ROWS[3].values, "no <b>surface</b> | in range\nmove the sensor")
+
+
+def info(**given):
+    some = {
+        "title": "Drives", "count": 31, "seed": 7, "format": "kitti", "names": NAMES,
+        "sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "license": "CC-BY-4.0",
+        "versions": {"lidarpool": "1.2 (sources 01234567)"}, "classes": {6: "building"},
+    }  # fmt: skip
+    return CampaignInfo(**(some | given))
+
+
+@pytest.fixture(scope="module")
+def card(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("set")
+    picture = folder.parent / "one.png"
+    Image.new("RGB", (8, 4)).save(picture)
+    place = Storage.at(folder, durable=False)
+    return folder, write_card(place, info(picture=picture), iter(ROWS))
+
+
+def test_figures_are_those_of_done_jobs(card):
+    folder, report = card
+    assert json.loads((folder / "report.json").read_text()) == report
+    done = [one for one in ROWS if one.done]
+    assert report["jobs"] == {"described": 31, "done": 29, "failed": 1, "resumed": 0}
+    assert report["totals"]["points"] == sum(one.points for one in done)
+    assert report["classes"]["6"] == {
+        "name": "building", "points": sum(one.classes[6] for one in done), "jobs": 29,
+    }  # fmt: skip
+    assert report["of_a_job"]["points"]["median"] == np.median([one.points for one in done])
+    visibility, model, night = report["varied"]
+    assert visibility["rank_correlation_with_points"] == 1.0
+    assert visibility["lowest"] == 0.1 and visibility["jobs"] == 30
+    assert model["values"] == {"os1-64": 15, "vlp16": 15}
+    assert night["values"] == {"false": 10, "true": 20}
+    [failed] = report["failed"]
+    assert failed["number"] == 3 and failed["error"] == ROWS[3].error
+    assert [one["number"] for one in report["slowest"]] == list(range(29, 19, -1))
+
+
+def test_splits_name_the_jobs_that_are_there(card):
+    folder, report = card
+    train, val = ((folder / "splits" / f"{n}.txt").read_text().split() for n in ("train", "val"))
+    assert val == [one.name for one in ROWS if one.split == "val"]
+    assert "03" not in train and len(train) == 19
+    assert report["splits"]["train"]["jobs"] == 19
+
+
+def test_card_says_how_to_read_and_repeat(card):
+    folder, report = card
+    text = (folder / "README.md").read_text()
+    for part in (
+        "# Drives", 'lidarpool.sweeps(".", split="train")', "CC-BY-4.0", "velodyne/vlp16, 10 Hz",
+        "lidarpool run campaign.yaml --job 0 --out", "1.2 (sources 01234567)", report["sha256"],
+        "| 29 (1 failed) |", "| 6 building |", "`visibility` | 0.1 to 19.78", "os1-64, vlp16",
+    ):  # fmt: skip
+        assert part in text, part
+    pictures = re.findall(r"!\[.*?\]\((.*?)\)", text)
+    assert pictures == ["pictures/job.png", "pictures/varied.png", "pictures/results.png"]
+    assert all((folder / path).is_file() for path in pictures)
+
+
+def test_page_shows_what_failed_and_why(card):
+    folder, _ = card
+    page = (folder / "report.html").read_text()
+    assert page.startswith("<!DOCTYPE html>")
+    assert "1 failed job" in page and "no &lt;b&gt;surface&lt;/b&gt; | in range" in page
+    assert "1 job of the description is not in the table" in page
+    assert page.count("<figure>") == 2 and "var(--picture-ink" in page
+    assert "campaign.yaml --retry-failed" in page
+
+
+def test_same_jobs_make_the_same_files(card, tmp_path):
+    folder, _ = card
+    write_card(Storage.at(tmp_path, durable=False), info(), ROWS)
+    for name in ("report.html", "report.json", "splits/train.txt", "pictures/varied.png"):
+        assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
+
+
+def test_hash_tells_data_sets_apart(card, tmp_path):
+    _, report = card
+    place = Storage.at(tmp_path, durable=False)
+    slower = [row(k, seconds=9.0) if k != 3 else ROWS[3] for k in range(30)]
+    assert write_card(place, info(), slower)["sha256"] == report["sha256"]
+    other = [*ROWS[:-1], row(29, sha256="f" * 64)]
+    assert write_card(place, info(), other)["sha256"] != report["sha256"]
+
+
+def test_letters_of_users_are_escaped(tmp_path):
+    names = (EVIL, "a")
+    rows = [
+        row(k, name=f"{k} {EVIL}", values={EVIL: ("x", EVIL)[k % 2], "a": f"v{k}_$x^"})
+        for k in range(20)
+    ]
+    rows.append(JobRow(20, EVIL, "train", {EVIL: EVIL}, EVIL))
+    given = info(
+        title=EVIL, names=names, sensors={EVIL: EVIL}, license=EVIL, notes=[EVIL],
+        classes={6: EVIL}, versions={EVIL: EVIL, "lidarpool": EVIL}, file=EVIL,
+        description=EVIL, format=EVIL,
+    )  # fmt: skip
+    write_card(Storage.at(tmp_path, durable=False), given, rows)
+    page = (tmp_path / "report.html").read_text()
+    assert "<script" not in page and "\u202e" not in page
+    assert "&lt;script&gt;alert(1)" in html.unescape(html.escape(page))
+    card = re.sub(r"```.*?```", "", (tmp_path / "README.md").read_text(), flags=re.DOTALL)
+    assert "<script" not in card.replace(r"\<", "")
+    assert "[a](b)" not in card.replace(r"\[", "").replace(r"\]", "")
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [],
+        [JobRow(0, "0", "", {"visibility": 1.0}, "no scene")],
+        [row(0)],
+        [row(0, values={}), row(1, values={})],
+        [row(k, values={"visibility": v}) for k, v in enumerate([1, 2.5, "auto", True])],
+        [
+            row(k, values={"visibility": v})
+            for k, v in enumerate([float("inf"), float("nan"), -5.0])
+        ],
+        [row(k, points=0, hits=0, rays=0, seconds=0.0, classes={}) for k in range(4)],
+        [row(k, values={"model": f"city-{k:04d}.glb"}) for k in range(60)],
+    ],
+    ids=["none", "failed", "one", "same", "mixed", "not-finite", "empty", "many-labels"],
+)
+def test_any_jobs_have_a_card(tmp_path, rows):
+    report = write_card(Storage.at(tmp_path, durable=False), info(), rows)
+    assert report["jobs"]["done"] == sum(one.done for one in rows)
+    assert (tmp_path / "README.md").is_file() and (tmp_path / "report.html").is_file()
+    text = (tmp_path / "README.md").read_text()
+    assert all((tmp_path / path).is_file() for path in re.findall(r"\((pictures/.*?)\)", text))
+
+
+def test_a_url_has_a_card_too():
+    place = Storage.at("memory://test-campaign-report/set")
+    write_card(place, info(), ROWS)
+    assert {"README.md", "report.html", "report.json"} <= set(place.sizes())
+    assert place.read("splits/val.txt").startswith(b"02\n05\n")
+
+
+def test_an_earlier_report_goes_first(tmp_path):
+    """What has a report.json is complete."""
+
+    def broken():
+        yield ROWS[0]
+        raise LidarpoolError("the database cannot be read")
+
+    place = Storage.at(tmp_path, durable=False)
+    write_card(place, info(), ROWS)
+    with pytest.raises(LidarpoolError, match="database"):
+        write_card(place, info(), broken())
+    assert not (tmp_path / "report.json").exists()
+
+
+@pytest.mark.parametrize("split", ["../x", "a/b", "-", "a\nb"])
+def test_splits_are_names_of_files(tmp_path, split):
+    with pytest.raises(LidarpoolError, match="cannot be called"):
+        write_card(Storage.at(tmp_path), info(), [row(0, split=split)])
+
+
+def test_memory_is_bounded(tmp_path):
+    """Ten thousand jobs take no more than some numbers each."""
+    place = Storage.at(tmp_path, durable=False)
+    write_card(place, info(), ROWS)
+    peaks = []
+    for count in (1_000, 10_000):
+        tracemalloc.start()
+        write_card(place, info(), (row(k % 30) for k in range(count)))
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[1] - peaks[0] < 9_000 * 600

@@ -1,0 +1,66 @@
+"""What reads single sweeps of a job in a data set; each format has a `Reader` of its own."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..base.storage import Storage
+from ..columns.cloud import Cloud
+from .pieces import Entry
+from .sweeps import Sweeps
+
+# Points, float32 (n, 3), metres in the sensor's axes, and {column: (n,)}, as the format holds them.
+Points = tuple[NDArray[np.float32], dict[str, NDArray[Any]]]
+
+
+class Reader:
+    """Reads the points of a job's sweeps in any order, in one thread."""
+
+    def __init__(self, place: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
+        self.place, self.sweeps, self.entry, self.layout = place, sweeps, entry, layout
+        self._copies: tempfile.TemporaryDirectory[str] | None = None
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the file that has the points of a sweep."""
+        raise NotImplementedError
+
+    def read(self, sweep: int) -> Points:
+        """Return the points of a sweep; any exception if they cannot be read."""
+        raise NotImplementedError
+
+    def close(self) -> None:
+        """Close and remove what the reader has opened."""
+        if self._copies:
+            self._copies.cleanup()
+
+    def local(self, name: str) -> Path:
+        """Return the path of a file: of a copy until `close`, if the place is a URL."""
+        if self.place.is_local:
+            return Path(self.place.path(name))
+        self._copies = self._copies or tempfile.TemporaryDirectory(prefix="lidarpool-")
+        path = Path(self._copies.name, Path(name).name)
+        self.place.get(name, path)
+        return path
+
+    def rows(self, name: str, row: np.dtype[Any]) -> NDArray[Any]:
+        """Read a file of rows; ValueError if it ends within one."""
+        data = self.place.read(name)
+        if len(data) % row.itemsize:
+            raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
+        return np.frombuffer(bytearray(data), row)  # PyTorch wants arrays that it may write to
+
+    def inside(self, sweep: int, cloud: Cloud) -> Points:
+        """Return points of the cloud's coordinates and all their columns."""
+        places = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
+        return places, {name: np.array(array) for name, array in cloud.columns.items()}
+
+
+def checked_length(found: int, wanted: int, file: str) -> None:
+    """Check the number of points in a second file; ValueError names it."""
+    if found != wanted:
+        raise ValueError(f"{file} has {found:,} points, not {wanted:,}")

@@ -1,0 +1,325 @@
+"""Pictures of a data set: how its jobs were varied, and what came of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from numpy.typing import NDArray
+
+from ..base.choice import one_of_each_part
+from ..base.words import counted
+from ..render import theme
+from ..render.page import FONT, Page, shortened, without_common_prefix
+from .campaign_figures import Figures, Varied
+from .page.words import NARROW
+
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
+
+WIDTH = 1600
+MOST_VARIED = 8  # quantities in a picture
+ACROSS = 4  # of them side by side
+MOST_LABELS = 12  # bars; the rarest labels share the last one
+MOST_DOTS = 5_000
+DOT, BAR = "#5b8fd0", "#7aa5d8"
+LEFT, RIGHT, TOP = 118, 40, 186  # pixels around the charts
+BETWEEN = 78  # columns of charts
+COUNTS, GAP, AGAINST, BELOW = 120, 20, 340, 60  # heights: histogram, dots, and labels under them
+SLANTED = 56  # more below slanted labels
+ABOVE = 76  # from one row of charts to the next
+MOST_COLOURS = 6  # labels that have colours of their own
+_BINS = 24  # at most
+_GROUPS, _GROUP = 12, 8  # of jobs, by value, whose medians are drawn: so many, of at least so many
+_LETTER = 11.5  # width of a letter of a label, pixels
+
+
+@dataclass(frozen=True, eq=False)
+class Scale:
+    """Where the values of a quantity are in a chart, and its bins."""
+
+    places: Floats  # (n,): as drawn; NaN without a value
+    edges: Floats  # (bins + 1,)
+    labels: tuple[str, ...] = ()  # of bins; none for numbers
+    is_log: bool = False
+
+    @classmethod
+    def of(cls, varied: Varied) -> Scale:
+        """Choose bins for a quantity: of labels one each, of few whole numbers, or equal ones."""
+        if varied.labels:
+            return _of_labels(varied)
+        there = varied.there
+        low, high = (float(there.min()), float(there.max())) if len(there) else (0.0, 1.0)
+        if high - low <= 30 and (there == np.round(there)).all():
+            return cls(varied.values, np.arange(low - 0.5, high + 1))
+        bins = int(np.clip(2 * np.sqrt(len(there)), 6, _BINS))
+        if low == high:
+            return cls(varied.values, np.linspace(low - 0.5, high + 0.5, bins + 1))
+        # Half of a logarithmic distribution lies below the geometric mean of its limits.
+        median = float(np.median(there))
+        if low > 0 and high > 20 * low and median < (np.sqrt(low * high) * (low + high) / 2) ** 0.5:
+            edges = np.geomspace(low, high, bins + 1).astype(np.float64)
+            return cls(varied.values, edges, is_log=True)
+        return cls(varied.values, np.linspace(low, high, bins + 1))
+
+    @cached_property
+    def bin_of(self) -> NDArray[np.int64]:
+        """int64 (n,): bin of each value; -1 without one."""
+        found = np.searchsorted(self.edges, self.places, "right") - 1
+        found = found.clip(0, len(self.edges) - 2)
+        return np.where(np.isfinite(self.places), found, -1)
+
+
+def _of_labels(varied: Varied) -> Scale:
+    values, labels = varied.values, varied.labels
+    if len(labels) > MOST_LABELS:
+        counts = np.bincount(varied.there.astype(np.intp), minlength=len(labels))
+        kept = np.sort(np.argsort(-counts, kind="stable")[: MOST_LABELS - 1])
+        place = np.full(len(labels), MOST_LABELS - 1.0)
+        place[kept] = np.arange(len(kept))
+        known = np.isfinite(values)
+        values = values.copy()
+        values[known] = place[values[known].astype(np.intp)]
+        labels = (*(labels[k] for k in kept), f"{len(labels) - len(kept)} others")
+    return Scale(values, np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1), labels)
+
+
+def draw_varied(figures: Figures) -> Page | None:
+    """Draw a histogram of each varied quantity above the points of each job against it.
+
+    Jobs have the colours of the quantity of few labels that tells most about their points. None
+    where nothing was varied or no job has run.
+    """
+    shown = [varied for varied in figures.varied if len(varied.there)][:MOST_VARIED]
+    if not shown:
+        return None
+    scales = [Scale.of(varied) for varied in shown]
+    rows = -(-len(shown) // ACROSS)
+    across = -(-len(shown) // rows)
+    wide = (WIDTH - LEFT - RIGHT - BETWEEN * (across - 1)) / across
+    below = BELOW + SLANTED * any(_slanted(scale, wide) for scale in scales)
+    high = COUNTS + GAP + AGAINST + below
+    page = Page((WIDTH, TOP + rows * high + (rows - 1) * ABOVE))
+    points, failures = figures.each("points"), figures.failures
+    telling = _most_telling(scales, points, ~failures)
+    colours = np.tile(theme.rgb(DOT), (len(points), 1))
+    if telling is not None:
+        some = theme.object_colours(len(scales[telling].labels))
+        known = scales[telling].bin_of >= 0
+        colours[known] = some[scales[telling].bin_of[known]]
+    for number, (varied, scale) in enumerate(zip(shown, scales, strict=True)):
+        row, column = divmod(number, across)
+        left, top = LEFT + column * (wide + BETWEEN), TOP + row * (high + ABOVE)
+        upper = _chart(page, left, top, wide, COUNTS)
+        lower = _chart(page, left, top + COUNTS + GAP, wide, AGAINST)
+        bars = some if number == telling else theme.rgb(BAR)
+        _draw_counts(upper, scale, failures, bars)
+        _draw_points(page, lower, scale, points, failures, colours)
+        for axes in (upper, lower):
+            _set_scale(axes, scale)
+        _set_labels(page, lower, scale, wide)
+        upper.tick_params(which="both", labelbottom=False, bottom=False)
+        upper.set_title(
+            shortened(varied.name, int(wide / 13.8)), loc="left", fontsize=7.8 * page.unit,
+            color=theme.INK, family=FONT, weight="bold", pad=4 * page.unit, parse_math=False,
+        )  # fmt: skip
+        if column == 0:
+            upper.set_ylabel("jobs")
+            lower.set_ylabel("points of a job")
+            for axes in (upper, lower):
+                axes.yaxis.set_label_coords(-78 / wide, 0.5)
+        else:
+            lower.tick_params(labelleft=False)
+    page.title(
+        "What was varied, and the points that came of it",
+        "Above, the jobs by value. Below, a dot for each job; the median of jobs with near values, "
+        "and the range of their middle 80%.",
+        _remarks(figures, shown, None if telling is None else shown[telling]),
+    )
+    return page
+
+
+def _remarks(figures: Figures, shown: Sequence[Varied], telling: Varied | None) -> str:
+    """Sentence about colours, failures and what is not drawn."""
+    told = []
+    if telling is not None:
+        told.append(f"coloured by {shortened(telling.name, 40)}")
+    if failed := int(figures.failures.sum()):
+        told.append(f"red: {counted(failed, 'failed job')}")
+    if figures.done > MOST_DOTS:
+        told.append(f"{MOST_DOTS:,} of {figures.done:,} jobs have dots")
+    if more := sum(len(varied.there) > 0 for varied in figures.varied) - len(shown):
+        told.append(f"{counted(more, 'more quantity', 'more quantities')} in jobs.csv")
+    text = "; ".join(told)
+    return f"{text[:1].upper()}{text[1:]}." if text else ""
+
+
+def _most_telling(scales: Sequence[Scale], points: Floats, done: Bools) -> int | None:
+    """Which quantity of few labels has groups whose points differ most; None without any."""
+    best, most = None, 0.0
+    for number, scale in enumerate(scales):
+        known = done & (scale.bin_of >= 0)
+        if not 2 <= len(scale.labels) <= MOST_COLOURS or not known.any():
+            continue
+        groups, these = scale.bin_of[known], points[known]
+        sums, counts = np.bincount(groups, these), np.bincount(groups)
+        means = sums / np.maximum(counts, 1)
+        between = float(np.var(means[groups]))
+        if best is None or between > most:
+            best, most = number, between
+    return best
+
+
+def draw_results(figures: Figures) -> Page | None:
+    """Draw how points, hits and seconds of casting are distributed over jobs; None without any."""
+    done = ~figures.failures
+    if not done.any():
+        return None
+    points, rays, hits = (figures.each(name)[done] for name in ("points", "rays", "hits"))
+    with np.errstate(invalid="ignore"):
+        hit = 100 * hits / rays
+    quantities = (
+        ("points of a job", points),
+        ("rays that hit, per cent", hit[np.isfinite(hit)]),
+        ("casting a job, all its tasks, s", figures.each("seconds")[done]),
+    )
+    high, top = 250, 128
+    page = Page((WIDTH, top + high + 92))
+    wide = (WIDTH - LEFT - RIGHT - BETWEEN * 2) / 3
+    for column, (name, values) in enumerate(quantities):
+        axes = _chart(page, LEFT + column * (wide + BETWEEN), top, wide, high)
+        axes.set_xlabel(name)
+        axes.xaxis.set_major_locator(MaxNLocator(5))
+        axes.xaxis.set_major_formatter(FuncFormatter(_tick))
+        if len(values):
+            low, most = float(values.min()), float(values.max())
+            aside = 0.0 if most > low else abs(most) / 2 or 0.5
+            limits = low - aside, most + aside
+            counts, edges = np.histogram(values, min(40, 8 + len(values) // 8), limits)
+            axes.stairs(counts, edges, fill=True, color=BAR)
+            axes.axvline(float(np.median(values)), color=theme.INK, lw=1.1 * page.unit)
+            axes.set_ylim(0, 1.08 * counts.max())
+    page.figure.axes[0].set_ylabel("jobs")
+    page.title("What came of it", "Jobs by points, hits and time; the line is the median.")
+    return page
+
+
+def _chart(page: Page, left: float, top: float, wide: float, high: float) -> Axes:
+    """Axes at a place in pixels, with a quiet frame."""
+    width, height = page.size
+    axes = page.chart((left / width, 1 - (top + high) / height, wide / width, high / height))
+    axes.yaxis.set_major_locator(MaxNLocator(4 if high > COUNTS else 2, integer=True))
+    axes.yaxis.set_major_formatter(FuncFormatter(_tick))
+    axes.xaxis.grid(visible=False)
+    axes.tick_params(which="both", color=theme.LINE)
+    return axes
+
+
+def _tick(value: float, _: object = None) -> str:
+    """Write a number at an axis: «1.5 M»."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= 10 * size or (abs(value) >= size and letter != "k"):
+            return f"{value / size:.4g}{NARROW}{letter}"
+    return f"{value:,.6g}"
+
+
+def _draw_counts(axes: Axes, scale: Scale, failures: Bools, colours: Floats) -> None:
+    bins = len(scale.edges) - 1
+    known = scale.bin_of >= 0
+    counts = np.bincount(scale.bin_of[known], minlength=bins)
+    failed = np.bincount(scale.bin_of[known & failures], minlength=bins)
+    left, right = scale.edges[:-1], scale.edges[1:]
+    if scale.labels:  # apart, since they have no order
+        left, right = left + 0.15, right - 0.15
+    wide = right - left
+    axes.bar(left, counts - failed, wide, bottom=failed, align="edge", color=colours, lw=0)
+    axes.bar(left, failed, wide, align="edge", color=theme.SENSOR, lw=0)
+    axes.set_ylim(0, 1.1 * max(1, counts.max()))
+
+
+def _draw_points(
+    page: Page, axes: Axes, scale: Scale, points: Floats, failures: Bools, colours: Floats
+) -> None:
+    """Draw a dot for each job, the failed ones at the bottom, and percentiles."""
+    unit = page.unit
+    known = np.isfinite(scale.places)
+    done = np.flatnonzero(known & ~failures)
+    some = done[one_of_each_part(len(done), MOST_DOTS)]
+    places = scale.places.copy()
+    if scale.labels:  # spread over the bar, the same in each picture of the same jobs
+        places += 0.5 * (np.arange(len(places)) * 0.618034 % 1 - 0.5)
+    size = float(np.clip(300 / np.sqrt(max(len(some), 1)), 4, 30)) * unit**2
+    alpha = float(np.clip(16 / np.sqrt(max(len(some), 1)), 0.25, 0.85))
+    axes.scatter(
+        places[some], points[some], s=size, c=colours[some], alpha=alpha, linewidths=0,
+        clip_on=False, rasterized=True,
+    )  # fmt: skip
+    if scale.labels:
+        for number in np.unique(scale.bin_of[done]).tolist():
+            low, median, high = _percentiles(points[done[scale.bin_of[done] == number]])
+            near = np.array([number - 0.35, number + 0.35])
+            axes.fill_between(near, low, high, color=theme.MUTED, alpha=0.2, lw=0)
+            axes.plot(near, [median, median], color=theme.INK, lw=1.6 * unit)
+    elif (groups := min(_GROUPS, len(done) // _GROUP)) > 1:
+        ordered = np.array_split(done[np.argsort(places[done], kind="stable")], groups)
+        middles = [float(np.median(places[group])) for group in ordered]
+        lows, medians, highs = np.array([_percentiles(points[group]) for group in ordered]).T
+        axes.fill_between(middles, lows, highs, color=theme.MUTED, alpha=0.16, lw=0)
+        axes.plot(middles, medians, color=theme.INK, lw=1.6 * unit, solid_joinstyle="round")
+    failed = np.flatnonzero(known & failures)
+    failed = failed[one_of_each_part(len(failed), MOST_DOTS)]
+    axes.scatter(
+        places[failed], np.zeros(len(failed)), marker="x", s=18 * unit**2, color=theme.SENSOR,
+        linewidths=0.9 * unit, clip_on=False, zorder=5, rasterized=len(failed) > 200,
+    )  # fmt: skip
+    axes.set_ylim(0, 1.06 * max(1.0, float(points[done].max(initial=0))))
+
+
+def _percentiles(values: Floats) -> tuple[float, float, float]:
+    low, median, high = np.percentile(values, (10, 50, 90)).tolist()
+    return low, median, high
+
+
+def _set_scale(axes: Axes, scale: Scale) -> None:
+    if scale.is_log:
+        axes.set_xscale("log")
+    low, high = scale.edges[[0, -1]].tolist()
+    aside = 0.0 if scale.labels else 0.02
+    if scale.is_log:
+        ratio = (high / low) ** aside
+        axes.set_xlim(low / ratio, high * ratio)
+    else:
+        axes.set_xlim(low - aside * (high - low), high + aside * (high - low))
+
+
+def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
+    axis = axes.xaxis
+    if scale.is_log:
+        few = scale.edges[-1] < 1000 * scale.edges[0]
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
+        axis.set_major_formatter(FuncFormatter(_tick))
+        axis.set_minor_formatter(NullFormatter())
+    elif not scale.labels:
+        axis.set_major_locator(MaxNLocator(max(2, min(6, int(wide / 90)))))
+        axis.set_major_formatter(FuncFormatter(_tick))
+    else:
+        slanted = _slanted(scale, wide)
+        axis.set_ticks(range(len(scale.labels)), list(_short(scale.labels)))
+        for text in axes.get_xticklabels():
+            text.set(parse_math=False, fontsize=6.8 * page.unit, family=FONT)
+            if slanted:
+                text.set(rotation=28, ha="right", rotation_mode="anchor")
+
+
+def _short(labels: Sequence[str]) -> Iterator[str]:
+    return (shortened(label, 15) for label in without_common_prefix(labels))
+
+
+def _slanted(scale: Scale, wide: float) -> bool:
+    """Whether labels are too long to stand side by side."""
+    longest = max((len(label) for label in _short(scale.labels)), default=0)
+    return longest * _LETTER > wide / max(1, len(scale.labels))
