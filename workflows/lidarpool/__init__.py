@@ -7,6 +7,7 @@ from ._version import __version__
 from .base import ports
 
 if TYPE_CHECKING:
+    from .api.campaigns import Campaign
     from .api.result import Result
     from .api.simulation import simulate
     from .base.errors import LidarpoolError
@@ -16,7 +17,7 @@ if TYPE_CHECKING:
     from .pipeline import Frame
     from .plan import Plan, Planning
     from .run.store import remove_run
-    from .scenario.campaign import Campaign, CampaignJob
+    from .scenario.campaign import CampaignJob
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
@@ -81,6 +82,7 @@ __all__ = [
 # Where the names above are. They are imported when they are asked for, which takes a second:
 # the command has to see to its signals before (`__main__.py`).
 _MODULES = {
+    "api.campaigns": ("Campaign",),
     "api.result": ("Result",),
     "api.simulation": ("simulate",),
     "base.errors": ("LidarpoolError",),
@@ -90,7 +92,7 @@ _MODULES = {
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
     "run.store": ("remove_run",),
-    "scenario.campaign": ("Campaign", "CampaignJob"),
+    "scenario.campaign": ("CampaignJob",),
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),

@@ -11,9 +11,10 @@ from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..pipeline import Frame
+from ..pipeline import LIDAR, Frame
 from ..plan import Planning
 from ..run.bars import bars_here
+from ..run.checks import slots_needed
 from ..run.conductor import Page, conducted
 from ..run.connection import local_client
 from ..run.job import Job
@@ -146,7 +147,7 @@ def simulate(
             return nullcontext(client)
         return local_client(
             gpu_workers=gpu_workers,
-            collectors=collectors,
+            lidar_slots=slots_needed(job)[LIDAR],
             other_workers=other_workers,
             planning=planning is not None,
             tls=tls,

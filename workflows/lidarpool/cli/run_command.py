@@ -20,6 +20,7 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
+from ..pipeline import LIDAR
 from ..pipeline.database import FILE
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
@@ -83,8 +84,13 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     with shown_status("reading the scene", options.quiet, logged=False):
-        times = {"wait_s": options.wait_s, "patience_s": options.patience_s}
-        job = make_job(scenario, options.backend, options.no_plan, **times)
+        job = make_job(
+            scenario,
+            options.backend,
+            options.no_plan,
+            wait_s=options.wait_s,
+            patience_s=options.patience_s,
+        )
     if options.cluster is not None:
         options.cluster.require(slots_needed(job))
     if not options.quiet:
@@ -203,7 +209,7 @@ def _cluster(
         return _with_status(started, f"starting {options.cluster}", options)
     pool = scenario.pool
     local = local_client(
-        gpu_workers=pool.gpu, collectors=pool.collectors, other_workers=pool.other,
+        gpu_workers=pool.gpu, lidar_slots=slots_needed(job)[LIDAR], other_workers=pool.other,
         planning=job.planning is not None, tls=options.tls,
     )  # fmt: skip
     return _with_status(local, "starting the workers", options)

@@ -152,6 +152,11 @@ class Crew:
         return [*self._seats.values()]
 
     @property
+    def probe(self) -> tuple[str, bytes]:
+        """Name and content of a file, by which workers find out whether they see the storage."""
+        return self.stages.probe
+
+    @property
     def notes(self) -> list[str]:
         """Notes for the user."""
         return [*self.stages.notes, *self.workers.notes]

@@ -97,7 +97,7 @@ class LongStages:
         self._tasks: dict[str, _Task] = {}
         self._submitted = 0
         # A file in the storage, by which collectors find out whether they see it.
-        self._probe = (probe_name(mark, run), secrets.token_bytes(16))
+        self.probe = (probe_name(mark, run), secrets.token_bytes(16))
         self._scans = self._pipe("scans", queue_capacity)
         self._news = self._pipe("news", 64)  # from stages 3 and 4
         self._inbox: list[Message] = []
@@ -115,7 +115,7 @@ class LongStages:
         """Make the pipes; `look` starts the stages, and `finish` must be called after this."""
         with storing(self._storage):
             self._storage.prepare()
-            self._storage.write(*self._probe)
+            self._storage.write(*self.probe)
         for pipe in (self._scans, self._news):
             pipe.create()
 
@@ -333,7 +333,7 @@ class LongStages:
             return generate, me, inlet, self._scans
         if me.stage == SORT:
             return sort_frames, me, inlet, self._news
-        return collect, me, self._storage, self._probe, inlet, self._news
+        return collect, me, self._storage, self.probe, inlet, self._news
 
     # -- the end -----------------------------------------------------------------------------
 
@@ -390,7 +390,7 @@ class LongStages:
             # In one message: the answer to a second one could miss a client that leaves.
             self.client.cancel([*futures, *others])
             with suppress(OSError):
-                self._storage.remove([self._probe[0]])
+                self._storage.remove([self.probe[0]])
 
 
 def _forget_lock(name: str, dask_scheduler: Any = None) -> None:

@@ -42,12 +42,13 @@ def find_workers(
     advice: str = AUTO_TAKES,
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
+    needed: Mapping[str, int] | None = None,
 ) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
     """Find all workers, the casting ones among them, their backend and their software.
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
     software that a resumed run was cast with. Workers that are missing or just died are waited
-    for as long as `waiting` says.
+    for as long as `waiting` says. Slots `needed` are by default those of the job.
 
     LidarpoolError if workers, slots, memory or the backend are missing, or versions differ.
     """
@@ -57,7 +58,7 @@ def find_workers(
     while True:
         looked = time.monotonic()
         try:
-            pool = _survey_pool(client, slots_needed(job))
+            pool = _survey_pool(client, needed or slots_needed(job))
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             backend = common_backend(client, wanted, casting, advice)
             for worker in casting:

@@ -49,16 +49,16 @@ class TlsFiles(NamedTuple):
 def local_client(
     *,
     gpu_workers: int | None,
-    collectors: int,
+    lidar_slots: int,
     other_workers: int | None,
     planning: bool = True,
     tls: bool = False,
 ) -> AbstractContextManager[Client]:
     """Client of a cluster on this machine that lasts as long as the body.
 
-    Workers as of `local_cluster`, but by default none of OTHER without `planning`. LIDAR has slots
-    for stages 1 and 3 and the `collectors`. `tls` encrypts the traffic, with a certificate of its
-    own; PoolError if none can be made, or the workers do not start.
+    Workers as of `local_cluster`, but by default none of OTHER without `planning`. `tls` encrypts
+    the traffic, with a certificate of its own; PoolError if none can be made, or the workers do not
+    start.
     """
 
     @contextmanager
@@ -69,7 +69,7 @@ def local_client(
             closing(
                 local_cluster(
                     gpu_workers=gpu_workers,
-                    lidar_slots=2 + collectors,
+                    lidar_slots=lidar_slots,
                     other_workers=other_workers if planning or other_workers else 0,
                     security=tls,
                     dashboard_port=None,  # is never printed, and Bokeh takes half a second

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from pydantic import Field
@@ -54,10 +54,12 @@ def make_job(
     scenario: Scenario,
     backend: str | None = None,
     no_plan: bool = False,
+    *,
     kept: KeptScenes | None = None,
-    **options: Any,
+    wait_s: float = WAIT_S,
+    patience_s: float = PATIENCE_S,
 ) -> Job:
-    """Read the scene and make the job of a scenario; options override it.
+    """Read the scene and make the job of a scenario; arguments override it.
 
     What stands still in a scene may be `kept` from other scenarios.
 
@@ -73,7 +75,7 @@ def make_job(
     mistakes.tell()
     assert survey is not None, "a survey without mistakes"
     tasks = declared(scenario.pool, TaskOptions) | ({"backend": backend} if backend else {})
-    return Job(scene, survey, planning, **tasks, **options)
+    return Job(scene, survey, planning, **tasks, wait_s=wait_s, patience_s=patience_s)
 
 
 def _check_precision(scene: Scene, survey: Survey) -> None:

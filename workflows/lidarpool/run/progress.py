@@ -12,6 +12,7 @@ STAGES: tuple[tuple[str, str, str], ...] = (
     ("3 sort", "framed", "scans"),
     ("4 collect", "collected", "scans"),
     ("planning", "trials_done", "trials"),
+    ("jobs", "jobs_done", "jobs"),
 )
 
 # The first items are slow, because workers warm up: the time left is shown after this share of
@@ -34,6 +35,8 @@ class Progress:
     seconds: float  # since the start
     replayed: int = 0  # batches that were sent or cast once more
     waits_for: str = ""  # partition whose slots the survey needs and other runs hold
+    jobs: int = 0  # of a campaign, whose scans are not counted
+    jobs_done: int = 0
 
 
 Show = Callable[[Progress], None]

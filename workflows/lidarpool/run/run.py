@@ -37,7 +37,7 @@ from ..pipeline import (
 from ..pipeline.task_book import TaskBook
 from ..plan import best
 from ..simulator.memory import MB, scans_that_fit
-from .checks import find_workers, gpu_note
+from .checks import check_memory, find_workers, gpu_note
 from .job import Job
 from .progress import Show
 from .result import RunResult
@@ -91,11 +91,18 @@ class Cluster:
 
     `job` is what it is checked for, and `kept` says what earlier runs cast with. `tell` is called
     every few seconds with a message while the run waits, and `waiting` says how long to wait for
-    workers at the start. LidarpoolError if the cluster lacks something.
+    workers at the start. Slots `needed` are by default those of the job. LidarpoolError if the
+    cluster lacks something.
     """
 
     def __init__(
-        self, client: Client, job: Job, kept: Kept, tell: Callable[[str], None], waiting: Waiting
+        self,
+        client: Client,
+        job: Job,
+        kept: Kept,
+        tell: Callable[[str], None],
+        waiting: Waiting,
+        needed: Mapping[str, int] | None = None,
     ) -> None:
         self.client, self.job, self._tell, self._kept = client, job, tell, kept
         # For errors about a lost cluster; a client that was never connected is refused below.
@@ -108,6 +115,7 @@ class Cluster:
                 kept.advice,
                 kept.casting if kept.resumed else {},
                 waiting,
+                needed,
             )
             kept.backend, kept.casting = backend, software
         except LidarpoolError:
@@ -116,7 +124,7 @@ class Cluster:
             if client.status != "running" or isinstance(error, CommClosedError):
                 raise self._told_lost() from error
             raise
-        self._pool = pool
+        self._pool, self._casting = pool, casting
         names = sorted({name for worker in pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
         note = gpu_note(pool, casting, backend)
@@ -143,6 +151,13 @@ class Cluster:
             if self.client.status == "running":
                 with suppress(PoolError, *_CLUSTER_LOST):
                     self._pool.leave_page()
+
+    def check(self, job: Job) -> None:
+        """Check that the workers have memory for another job; LidarpoolError if not."""
+        for worker in self._casting:
+            if worker.memory:
+                each = worker.memory / max(1, worker.resources[GPU])
+                check_memory(job, self._kept.backend, each, f"the GPU worker at {worker.address}")
 
     def crew(self, storage: Storage, mark: str) -> Crew:
         """Make the crew of a run, which keeps parts in `storage`."""

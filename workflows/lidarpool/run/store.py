@@ -34,6 +34,7 @@ from .progress import Progress
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
+JOBS = "jobs"  # that of what a campaign keeps of each of its jobs
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
 SAMPLE_RAYS = 400  # of the pictures
 CHECKERS = 4  # threads that check parts; each holds one in memory, twice
@@ -127,7 +128,7 @@ class KeptRun:
                 fetch_database(self._remote.storage, self._folder)
             if path.exists():
                 db = RunDatabase(path, count, durable=durable)
-                if db.used:
+                if self._is_used(db):
                     return db
                 db.close()
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
@@ -149,6 +150,10 @@ class KeptRun:
                 path.unlink()
                 path.with_name(f"{FILE}-journal").unlink(missing_ok=True)  # SQLite 3.37 leaves it
             raise
+
+    def _is_used(self, db: RunDatabase) -> bool:
+        """Whether an earlier run has left something."""
+        return db.used
 
     def _claim(self, here: dict[str, str], resume: bool) -> None:
         """Find the parts, check them if there are any, and mark their folder as this run's."""
@@ -454,6 +459,10 @@ def _remove(place: str | Path, parts: Storage, mark: str | None) -> None:
     """
     _refuse_link(parts)
     with _removing(place):
+        jobs = Storage.at(f"{place}/{JOBS}")  # of a campaign
+        for name in jobs.entries() if not jobs.is_link else ():
+            remove_run(jobs.path(name))
+        jobs.remove_folder()
         parts.remove(own_files(parts, mark))
         parts.remove_folder()
         kept = Storage.at(place)

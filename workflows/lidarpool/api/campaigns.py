@@ -1,0 +1,104 @@
+"""Campaigns from Python: many jobs into one data set."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
+from pathlib import Path
+
+from distributed import Client
+
+from ..base.arguments import checked
+from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..export.folder import output_place
+from ..pipeline import LIDAR
+from ..report.campaign_output import Making, make_dataset
+from ..run.bars import bars_here
+from ..run.campaign import CampaignRun
+from ..run.checks import slots_needed
+from ..run.connection import local_client
+from ..run.job import Job
+from ..run.progress import Progress
+from ..run.watch import Waiting
+from ..scenario import campaign as described
+
+logger = logging.getLogger(__name__)
+
+
+class Campaign(described.Campaign):  # noqa: D101 - as there
+    __doc__ = described.Campaign.__doc__
+
+    @checked
+    def run(
+        self,
+        out: str | Path,
+        *,
+        client: Client | None = None,
+        backend: str | None = None,
+        on_progress: Callable[[Progress], None] | None = None,
+        gpu_workers: int | None = None,
+        parts: str | Path | None = None,
+        resume: bool = False,
+        fresh: bool = False,
+        retry_failed: bool = False,
+        wait_s: float = WAIT_S,
+        patience_s: float = PATIENCE_S,
+    ) -> CampaignRun:
+        """Do the jobs, several at a time, and write the data set.
+
+        Parameters
+        ----------
+        out
+            Its folder, or a URL that fsspec opens.
+        client
+            Client of a cluster whose workers declare the resources GPU and LIDAR; without one, a
+            local cluster is started. LIDAR needs a slot more than a survey does: jobs are written
+            in it.
+        backend
+            Ray-casting backend; by default that of the scenario.
+        on_progress
+            Called some ten times a second. Without it there are bars in a notebook and at a
+            terminal.
+        gpu_workers
+            Workers of a local cluster that cast.
+        parts
+            Place of the points during the run, as for `simulate`.
+        resume
+            Go on from what an earlier run has left in `out`, from the beginning if there is
+            nothing.
+        fresh
+            Remove first what an earlier run of a campaign has left in `out`.
+        retry_failed
+            Resume, and do the jobs that have failed again.
+        wait_s, patience_s
+            As for `simulate`.
+
+        Returns
+        -------
+        CampaignRun
+            What was done, and which jobs have failed: a job that fails does not stop the others.
+
+        Raises
+        ------
+        LidarpoolError
+            If the cluster lacks something, or `out` holds something else, or the unfinished run of
+            another campaign or version; one or two lines say which and what to do.
+        """
+
+        def cluster(_: Waiting, job: Job) -> AbstractContextManager[Client]:
+            if client is not None:
+                return nullcontext(client)
+            return local_client(
+                gpu_workers=gpu_workers,
+                lidar_slots=slots_needed(job)[LIDAR] + 1,
+                other_workers=None,
+                planning=False,
+            )
+
+        making = Making(
+            output_place(out), client is None, resume, fresh, retry_failed, parts, backend,
+            wait_s, patience_s,
+        )  # fmt: skip
+        progress = bars_here() if on_progress is None else nullcontext(on_progress)
+        return make_dataset(self, making, cluster, progress, logger.info)

@@ -1,0 +1,210 @@
+"""The data set of a campaign: conducts its run, and writes what all jobs share."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager, ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from distributed import Client
+
+from ..base.errors import LidarpoolError, explained
+from ..base.software import difference, software
+from ..base.storage import Storage
+from ..base.words import counted
+from ..export.dataset import INDEX_FILE, DataSet
+from ..export.folder import result_folder
+from ..export.jobs import JobRow, read_table, write_table
+from ..run.campaign import CampaignRun, described_job, run_campaign, run_result
+from ..run.campaign_store import CampaignStore
+from ..run.job import Job
+from ..run.progress import Show
+from ..run.store import RUN_FOLDER, remove_run
+from ..run.watch import Waiting
+from ..scenario.campaign import Campaign, Described
+from .campaign_figures import CampaignInfo
+from .campaign_report import write_card
+
+CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
+
+
+@dataclass(frozen=True)
+class Making:
+    """How a campaign is to be made into a data set.
+
+    `out` is its place; `own` says that the cluster is a local one for this run. `resume` continues
+    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again.
+    """
+
+    out: Path | Storage
+    own: bool
+    resume: bool = False
+    fresh: bool = False
+    retry_failed: bool = False
+    parts: str | Path | None = None
+    backend: str | None = None
+    wait_s: float = 0.0
+    patience_s: float = 60.0
+
+
+def make_dataset(
+    campaign: Campaign,
+    making: Making,
+    cluster: Callable[[Waiting, Job], AbstractContextManager[Client]],
+    progress: AbstractContextManager[Show],
+    tell: Callable[[str], None],
+) -> CampaignRun:
+    """Do the jobs of a campaign that are not done, and write the data set.
+
+    `cluster` starts a cluster or connects to one, for jobs such as the one it is given.
+
+    LidarpoolError if the place holds something else, the cluster lacks something, or what all jobs
+    need fails; its notes say what was kept.
+    """
+    out = Storage.at(str(making.out), durable=False)
+    dataset = DataSet(out, campaign.keep.format, campaign.keep.layout)
+    dataset.check_installed()
+    place = f"{out}/{RUN_FOLDER}"
+    with result_folder(making.out), ExitStack() as stack:
+        if making.fresh:
+            _remove_dataset(out, place)
+        there = set(out.entries())
+        if making.resume and INDEX_FILE in there and RUN_FOLDER not in there:
+            check_same(out, campaign)
+            tell(f"{out} is complete: nothing is left to do")
+            return run_result(read_table(out), time.monotonic())
+        if RUN_FOLDER not in there and (found := sorted(there)):
+            raise LidarpoolError(
+                f"{out} holds {found[0]}: a data set needs a folder of its own, give another with "
+                "--out."
+            )
+        store = CampaignStore(
+            campaign.identity,
+            campaign.count,
+            making.backend or "auto",
+            place,
+            making.parts,
+            resume=making.resume or making.retry_failed,
+        )
+        stack.enter_context(store.kept_on_error())
+        if making.retry_failed:
+            store.db.forget_failed_jobs()
+        store.tidy_jobs()
+        if store.left:
+            run = run_campaign(
+                lambda waiting, job: stack.enter_context(cluster(waiting, job)),
+                campaign,
+                store,
+                dataset,
+                tell,
+                Waiting(making.wait_s, tell),
+                own=making.own,
+                progress=progress,
+                backend=making.backend,
+                wait_s=making.wait_s,
+                patience_s=making.patience_s,
+            )
+        else:
+            run = run_result(store.rows(), time.monotonic(), store=store)
+        _finish(campaign, dataset, store, run)
+        if run.failed:
+            store.save(now=True)
+            store.db.close()
+        else:
+            store.remove()
+    return run
+
+
+def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: CampaignRun) -> None:
+    """Write what all jobs share, and last what says that the data set is complete."""
+    place = dataset.place
+    made = {"identity": dict(store.identity), "casting": store.casting, "backend": store.backend}
+    with explained(f"{place} cannot be written"):
+        place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
+    write_table(place, campaign.names, store.rows())
+    info = CampaignInfo(
+        title=campaign.title,
+        license=campaign.license,
+        count=campaign.count,
+        seed=campaign.seed,
+        format=dataset.format,
+        names=campaign.names,
+        sensors=run.sensors,
+        versions=store.casting or software(),
+        seconds=run.seconds,
+        resumed=run.resumed,
+        notes=run.notes,
+        stages=run.stages,
+    )
+    write_card(place, info, store.rows())
+    dataset.finish(store.rows())
+
+
+def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
+    """Check that a data set is of this campaign, and of the software here; returns its record.
+
+    LidarpoolError names what differs, there and here.
+    """
+    try:
+        made: dict[str, Any] = json.loads(place.read(CAMPAIGN_FILE))
+    except (OSError, ValueError) as error:
+        raise LidarpoolError(
+            f"{place} holds no finished data set, which has a {CAMPAIGN_FILE}: {error}."
+        ) from error
+    here = software(made["backend"])
+    there = made["casting"] or {"lidarpool": made["identity"]["lidarpool"]}
+    if differs := difference(there, {name: here.get(name, "none") for name in there}):
+        raise LidarpoolError(
+            f"{place} was made with {differs}: the bits of its jobs are the same only with that. "
+            "Install it, or make the job in a folder of its own with --out."
+        )
+    for name, value in campaign.identity.items():
+        if made["identity"].get(f"campaign: {name}") != value:
+            raise LidarpoolError(
+                f"{place} is of another campaign: its {name} differs. Make the job in a folder of "
+                "its own with --out."
+            )
+    return made
+
+
+def job_again(
+    campaign: Campaign, number: int, columns: tuple[str, ...], **options: Any
+) -> tuple[Described, Job]:
+    """Make a job of a campaign as it is for its data set."""
+    described = campaign.describe(number)
+    return described, described_job(described, columns, **options)
+
+
+def row_of(place: Storage, number: int) -> JobRow | None:
+    """Row of a job in the table of a data set; None if it is not there."""
+    return next((row for row in read_table(place) if row.number == number), None)
+
+
+def _remove_dataset(out: Storage, place: str) -> None:
+    """Remove an unfinished data set; LidarpoolError if there is none that is known to be one."""
+    there = set(out.entries())
+    if not there:
+        return
+    if RUN_FOLDER not in there and CAMPAIGN_FILE not in there:
+        raise LidarpoolError(
+            f"{out} holds {sorted(there)[0]} and no data set of a campaign: give another folder."
+        )
+    remove_run(place)
+    with explained(f"{out} cannot be removed"):
+        for name in sorted(there - {RUN_FOLDER}):
+            out.discard(name)
+
+
+def failures(run: CampaignRun, most: int = 5) -> str:
+    """Name the jobs that have failed, with their values and why."""
+    lines = [f"{counted(len(run.failed), 'job')} failed, the other {run.done:,} are done:"]
+    for row in run.failed[:most]:
+        values = ", ".join(f"{name} {value}" for name, value in row.values.items())
+        lines.append(f"job {row.name}{f' ({values})' if values else ''}: {row.error}")
+    if (more := len(run.failed) - most) > 0:
+        lines.append(f"and {counted(more, 'more')}, see jobs.csv")
+    return "\n".join(lines) + "\n--retry-failed does these jobs again."

@@ -1,0 +1,93 @@
+"""What a campaign keeps: which jobs have ended, and the stores of those that are under way."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import asdict
+from pathlib import Path
+
+from ..base.errors import LidarpoolError
+from ..base.software import software
+from ..base.storage import Storage
+from ..export.jobs import JobRow
+from ..pipeline.database import RunDatabase, parts_folder
+from .job import Job
+from .store import JOBS, KeptRun, RunStore, remove_run
+
+
+class CampaignStore(KeptRun):
+    """The database of a campaign, and the place of its parts.
+
+    `identity` is the campaign's, `count` how many jobs it has; others as of `KeptRun`.
+    """
+
+    def __init__(
+        self,
+        identity: Mapping[str, str],
+        count: int,
+        backend: str,
+        place: str | Path,
+        parts: str | Path | None = None,
+        *,
+        resume: bool = False,
+    ) -> None:
+        self.count = count
+        whole = software() | {f"campaign: {name}": value for name, value in identity.items()}
+        super().__init__(whole, 0, backend, place, parts, resume=resume)
+        self.resumed = len(self.db.jobs)  # jobs of an earlier run
+
+    @property
+    def kept(self) -> str:
+        """Jobs that have ended, in words; empty if none was begun."""
+        begun = self.db.jobs or self.remains()
+        return f"{len(self.db.jobs):,} of {self.count:,} jobs" if begun else ""
+
+    def _is_used(self, db: RunDatabase) -> bool:
+        return db.used or bool(self.remains())
+
+    @property
+    def left(self) -> list[int]:
+        """Numbers of the jobs that have not ended."""
+        return [number for number in range(self.count) if number not in self.db.jobs]
+
+    @property
+    def failed(self) -> int:
+        """How many jobs have failed."""
+        return sum(self.db.jobs.values())
+
+    def rows(self) -> Iterator[JobRow]:
+        """Yield the rows of the jobs that have ended, by number."""
+        for row in self.db.job_rows():
+            classes = {int(number): count for number, count in row.pop("classes").items()}
+            yield JobRow(classes=classes, **row)
+
+    def end(self, row: JobRow) -> None:
+        """Commit that a job has ended."""
+        self.db.end_job(row.number, asdict(row), failed=bool(row.error))
+
+    # -- jobs under way --------------------------------------------------------------------
+
+    def store_of(self, name: str, job: Job) -> RunStore:
+        """Open the store of a job, with what an earlier run has left of it."""
+        Storage.at(f"{self.place}/{JOBS}").prepare()
+        return RunStore(job, self._place_of(name), self.storage.url, resume=True)
+
+    def folder_of(self, store: RunStore) -> str:
+        """Folder of a job's parts in the storage of the campaign."""
+        return f"{parts_folder(store.db.meta['mark'])}/"
+
+    def tidy_jobs(self) -> None:
+        """Remove what a killed run has left of jobs that have ended."""
+        if remains := self.remains():
+            ended = {row.name for row in self.rows()}
+            for name in ended.intersection(remains):
+                with suppress(LidarpoolError):  # it does no harm
+                    remove_run(self._place_of(name))
+
+    def remains(self) -> list[str]:
+        """Names of the jobs of which there is something."""
+        return [*Storage.at(f"{self.place}/{JOBS}").entries()]
+
+    def _place_of(self, name: str) -> str:
+        return f"{self.place}/{JOBS}/{name}"
