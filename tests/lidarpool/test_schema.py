@@ -12,7 +12,7 @@ from jsonschema import Draft202012Validator
 
 from lidarpool import LidarpoolError
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import schema_text
+from lidarpool.scenario.schema import campaign_schema, scenario_schema, schema_text
 from lidarpool.scenario.template import scenario_template
 
 EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
@@ -60,7 +60,9 @@ BAD: list[dict[str, Any]] = [
 
 @pytest.fixture(scope="module")
 def validator() -> Draft202012Validator:
-    schema = json.loads(schema_text(), parse_constant=pytest.fail)  # NaN and Infinity: no JSON
+    schema = json.loads(
+        schema_text(scenario_schema()), parse_constant=pytest.fail
+    )  # NaN and Infinity: no JSON
     Draft202012Validator.check_schema(schema)
     return Draft202012Validator(schema)
 
