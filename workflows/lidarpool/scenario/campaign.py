@@ -191,7 +191,7 @@ class Campaign:
         cls,
         paths: Iterable[str | Path],
         *,
-        keep: str | Keep | Mapping[str, str] = "kitti",
+        keep: str | Keep | Mapping[str, str] = "folder",
         splits: Mapping[str, float] = MappingProxyType({}),
         seed: Seed = 0,
         license: str = "",  # noqa: A002 - as in the file
