@@ -19,7 +19,7 @@ from rosbags.typesys import Stores, get_typestore
 from lidarpool import Cloud, LidarpoolError, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud
 from lidarpool.base.storage import Storage
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.dataset import FORMATS, INDEX_FILE, DataSet
+from lidarpool.export.dataset import DATA_SETS, INDEX_FILE, DataSet
 from lidarpool.export.formats import Format
 from lidarpool.export.jobs import JobRow
 from lidarpool.export.sweeps import Sweeps
@@ -189,7 +189,7 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
     assert total == sum((job(number).object >= objects).sum() for number in (0, 1, 7))
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", DATA_SETS)
 def test_the_same_job_has_the_same_bytes_and_can_be_removed(written, job, sweeps, tmp_path, format):  # noqa: A002
     data, place = written(format)
     before = files_of(place)
@@ -215,7 +215,7 @@ def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
         data.write_job(3, "003", cloud, sweeps)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", DATA_SETS)
 def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # noqa: A002
     data = DataSet(Storage.at(tmp_path / "both"), format)
     context = multiprocessing.get_context("spawn")
@@ -243,7 +243,7 @@ def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeyp
 
 
 def test_boxes_are_kept_as_the_formats_have_them(written, job, sweeps):
-    for format in FORMATS:  # noqa: A001
+    for format in DATA_SETS:  # noqa: A001
         _, place = written(format, (4,))
         name = "jobs/004/boxes.npz" if format == "folder" else "boxes/004.npz"
         with np.load(place / name) as kept:

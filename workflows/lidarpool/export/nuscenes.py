@@ -102,7 +102,7 @@ class Reader(reading.Reader):
 
     def read(self, sweep: int) -> reading.Points:
         """Return the points of a sweep."""
-        rows = self.rows(self.file(sweep), np.dtype(("<f4", 5)))
+        rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
         columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
         return np.ascontiguousarray(rows[:, :3]), columns
 
