@@ -10,89 +10,43 @@ import sys
 import threading
 import types
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import chain, pairwise
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from tests.lidarpool.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
-from lidarpool import Cloud, LidarpoolError, Mounted, Pose, Scene, Sensor, Survey, Sweep, Track
-from lidarpool.base.storage import Storage
+from lidarpool import LidarpoolError, Scene, Sweep
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.dataset import DATA_SETS, INDEX_FILE, DataSet
-from lidarpool.export.jobs import JobRow, write_table
+from lidarpool.export.dataset import DATA_SETS, INDEX_FILE
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import Actor, box
 
-TURNS, SCANS, JOBS = 3, 36, 6
-SPLITS = ["train"] * 4 + ["val", "test"]
+JOBS = len(SPLITS)
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    far = replace(Scene.seed(), origin=np.array([300_000.0, 5_600_000.0, 40.0]))
-    track = Track([0, 2], [[5, 5, 0], [9, 5, 0]])
-    later = Track([0.15, 2], [[0, 5, 0], [0, 9, 0]])
-    cars = Actor(box("Car 1", (4, 2, 1.5)), track), Actor(box("Van 1", (5, 2, 2.5)), later)
-    return replace(far, actors=cars)
+    return the_scene()
 
 
 @pytest.fixture(scope="module")
 def all_sweeps(scene) -> Sweeps:
-    half = np.sqrt(0.5)
-    track = Track([0, 1], [[0, 0, 1], [10, 5, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
-    lidar = Sensor.grid(360, 4)
-    sensors = [Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front"), Mounted(lidar, name="rear/left")]
-    survey = Survey(sensors=sensors, trajectory=track, steps=TURNS * SCANS)
-    return Sweeps.of(survey, scene)
+    return the_sweeps(scene)
 
 
 @pytest.fixture(scope="module")
-def job(scene, all_sweeps) -> Callable[[int], Cloud]:
-    """Return the points of a job: none in its second sweep, actors hit at their boxes' middles."""
-
-    def make(number: int) -> Cloud:
-        rng = np.random.default_rng(number)
-        scan = np.sort(rng.integers(0, 2 * TURNS * SCANS, 900))
-        scan = scan[scan // SCANS != 1]
-        count = len(scan)
-        columns = {
-            "scan": scan,
-            "channel": rng.integers(0, 4, count),
-            "object": rng.integers(0, len(scene.names) + 1, count),
-            "intensity": rng.uniform(0, 1, count).astype(np.float32),
-            "class": rng.integers(0, 30, count),
-            "time": scan * 1000,
-            **dict.fromkeys(("range", "azimuth", "elevation", "reflectivity"), np.ones(count)),
-        }
-        places = scene.origin + rng.uniform(-60, 60, (count, 3))
-        return Cloud(np.round(places, 3), columns)
-
-    return make
-
-
-@pytest.fixture(scope="module")
-def written(tmp_path_factory, job, all_sweeps) -> Callable[..., Path]:
-    """Return data sets; the fourth job failed."""
+def written(tmp_path_factory, scene, all_sweeps) -> Callable[[str], Path]:
+    """Return data sets by format and layout."""
     made: dict[str, Path] = {}
 
     def write(name: str) -> Path:
         if name not in made:
             kind, _, layout = name.partition("-")
-            made[name] = place = tmp_path_factory.mktemp(name)
-            data = DataSet(Storage.at(place), kind, layout or "velodyne")
-            rows = [
-                JobRow(n, f"{n:02}", SPLITS[n], {"rain": n / 2}, "failed" if n == 3 else "")
-                for n in range(JOBS)
-            ]
-            for row in rows:
-                if row.done:
-                    data.write_job(row.number, row.name, job(row.number), all_sweeps)
-            data.finish(rows)
-            write_table(data.place, ["rain"], rows)
+            made[name] = tmp_path_factory.mktemp(name)
+            write_set(made[name], kind, scene, all_sweeps, layout or "velodyne")
         return made[name]
 
     return write
@@ -103,13 +57,13 @@ def identity(sweep: Sweep) -> tuple[int, str, int]:
 
 
 @pytest.mark.parametrize("name", [*DATA_SETS, "mcap-autoware", "mcap-ouster"])
-def test_a_sweep_is_what_was_written(written, job, all_sweeps, name, scene):
+def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
     data = lidarpool.sweeps(written(name))
     assert len(data) == (JOBS - 1) * 2 * TURNS
     for number in (0, 1, 2, 3, 5, len(data) - 1):
         sweep = data[number]
         inside = number % (2 * TURNS)
-        cloud = job(sweep.job_number)
+        cloud = points_of(scene, sweep.job_number)
         points = cloud.part(np.flatnonzero(cloud.scan // SCANS == inside))
         assert sweep.sensor == ("front", "rear/left")[inside // TURNS]
         assert sweep.number == inside % TURNS and len(sweep) == len(points)
