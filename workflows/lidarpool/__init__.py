@@ -12,6 +12,7 @@ if TYPE_CHECKING:
     from .base.errors import LidarpoolError
     from .columns.cloud import Cloud
     from .columns.table import Column
+    from .export.loader import Sweep, sweeps
     from .export.ply import read_cloud
     from .pipeline import Frame
     from .plan import Plan, Planning
@@ -68,6 +69,7 @@ __all__ = [
     "Sensor",
     "Spin",
     "Survey",
+    "Sweep",
     "Track",
     "__version__",
     "load_robot",
@@ -76,6 +78,7 @@ __all__ = [
     "read_cloud",
     "remove_run",
     "simulate",
+    "sweeps",
 ]
 
 # Where the names above are. They are imported when they are asked for, which takes a second:
@@ -86,6 +89,7 @@ _MODULES = {
     "base.errors": ("LidarpoolError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
+    "export.loader": ("Sweep", "sweeps"),
     "export.ply": ("read_cloud",),
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
