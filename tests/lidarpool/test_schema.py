@@ -1,4 +1,4 @@
-"""The schema says what `Scenario` takes: what one accepts or refuses, the other does."""
+"""The schemas say what `Scenario` and `Campaign` take: one accepts what the other does."""
 
 from __future__ import annotations
 
@@ -11,11 +11,14 @@ import yaml
 from jsonschema import Draft202012Validator
 
 from lidarpool import LidarpoolError
+from lidarpool.scenario.campaign import Campaign, is_campaign
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import schema_text
+from lidarpool.scenario.schema import campaign_schema, scenario_schema, schema_text
 from lidarpool.scenario.template import scenario_template
 
-EXAMPLES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
+FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
+CAMPAIGNS = [path for path in FILES if is_campaign(path)]
+EXAMPLES = [path for path in FILES if path not in CAMPAIGNS]
 
 GOOD: list[dict[str, Any]] = [
     {},
@@ -60,7 +63,9 @@ BAD: list[dict[str, Any]] = [
 
 @pytest.fixture(scope="module")
 def validator() -> Draft202012Validator:
-    schema = json.loads(schema_text(), parse_constant=pytest.fail)  # NaN and Infinity: no JSON
+    schema = json.loads(
+        schema_text(scenario_schema()), parse_constant=pytest.fail
+    )  # NaN and Infinity: no JSON
     Draft202012Validator.check_schema(schema)
     return Draft202012Validator(schema)
 
@@ -83,3 +88,70 @@ def test_the_examples_and_the_template_are_valid(validator):
     assert len(texts) >= 3
     for text in texts:
         assert list(validator.iter_errors(yaml.safe_load(text))) == []
+
+
+GOOD_CAMPAIGNS: list[dict[str, Any]] = [
+    {},
+    {"base": ["base.yaml", "base.yaml"], "title": "A", "license": "B"},
+    {"vary": None, "keep": None, "splits": None},
+    {"count": 3, "vary": {"steps": {"integer": [1, 3]}}},
+    {"count": 3, "vary": {"weather.visibility_km": {"normal": {"mean": 9, "std": 1}}}},
+    {"count": 3, "vary": {"steps": {"choice": {"few": 1, "many": 2}, "weights": [1, 2]}}},
+    {"count": 3, "vary": {"scene.copies": {"sample": {"from": "crates.csv", "count": 1}}}},
+    {"vary": {"cloud.columns": {"each": [[], ["time"], ["range", "intensity"]]}}},
+    {"keep": {"format": "mcap", "layout": "ouster"}, "splits": {"a": 0.5, "b": 0.5}},
+]
+BAD_CAMPAIGNS: list[dict[str, Any]] = [
+    {"base": 4},
+    {"counts": 4},
+    {"count": 0},
+    {"keep": {"format": "laz"}},
+    {"splits": {"a": 2}},
+    {"count": 3, "vary": {"steps": 3}},
+    {"count": 3, "vary": {"steps": {"choice": []}}},
+    {"count": 3, "vary": {"steps": {"integer": [1, 2, 3]}}},
+    {"count": 3, "vary": {"steps": {"integer": [1, 2], "weight": [1]}}},
+    {"count": 3, "vary": {"noise.range_m": {"normal": {"mean": 1, "std": 0}}}},
+    {"count": 3, "vary": {"scene.copies": {"sample": {"file": "crates.csv", "count": 1}}}},
+]
+
+
+@pytest.fixture(scope="module")
+def of_campaigns() -> Draft202012Validator:
+    schema = json.loads(schema_text(campaign_schema()), parse_constant=pytest.fail)
+    Draft202012Validator.check_schema(schema)
+    return Draft202012Validator(schema)
+
+
+@pytest.fixture
+def load(tmp_path) -> Any:
+    """Return a function that loads a campaign from its content."""
+    (tmp_path / "base.yaml").write_text("poses: [[0, 0, 1]]\n")
+    (tmp_path / "crates.csv").write_text('name,box,at\nA,"[1, 1, 1]","[[1, 2]]"\n')
+
+    def load(data):
+        (tmp_path / "campaign.yaml").write_text(yaml.safe_dump(data))
+        return Campaign.load(tmp_path / "campaign.yaml")
+
+    return load
+
+
+@pytest.mark.parametrize("data", GOOD_CAMPAIGNS, ids=str)
+def test_what_a_campaign_takes_is_valid(of_campaigns, load, data):
+    data = {"base": "base.yaml"} | data
+    load(data)
+    assert list(of_campaigns.iter_errors(data)) == []
+
+
+@pytest.mark.parametrize("data", BAD_CAMPAIGNS, ids=str)
+def test_what_a_campaign_refuses_is_not(of_campaigns, load, data):
+    data = {"base": "base.yaml"} | data
+    with pytest.raises(LidarpoolError):
+        load(data)
+    assert not of_campaigns.is_valid(data)
+
+
+def test_the_example_of_a_campaign_is_valid(of_campaigns):
+    assert CAMPAIGNS
+    for path in CAMPAIGNS:
+        assert list(of_campaigns.iter_errors(yaml.safe_load(path.read_text()))) == []

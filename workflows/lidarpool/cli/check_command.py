@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import shlex
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -18,6 +18,10 @@ if TYPE_CHECKING:
     from ..base.storage import Storage
     from ..run.connection import TlsFiles
     from ..run.job import Job
+    from ..scenario.campaign import Campaign, Described
+    from ..scenario.scenario import Scenario
+
+_LOOKED_AT = 5  # jobs of a campaign
 
 
 @click.command()
@@ -27,6 +31,7 @@ if TYPE_CHECKING:
 @options.cluster
 @options.backend
 @options.no_plan
+@options.job
 @options.as_json
 def check(
     scenario: Path,
@@ -36,11 +41,13 @@ def check(
     cluster: Path | None,
     backend: str | None,
     no_plan: bool,
+    number: int | None,
     as_json: bool,
 ) -> None:
     """Show what a run would do and need.
 
-    The scenario is checked; nothing is started.
+    The scenario is checked; nothing is started. Of a campaign, the values that vary, and five of
+    its jobs.
 
     Some scans are cast here to estimate the number of points. The exit code is 0 if it can run,
     and 2, with the reasons, if it cannot.
@@ -48,26 +55,44 @@ def check(
     \b
     Examples:
       lidarpool check scenario.yaml
+      lidarpool check campaign.yaml --job 17
       lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
     """  # noqa: D301 - click wants the character, not its name
     from ..run.cluster_file import ClusterFile
     from ..run.connection import connected
     from ..run.job import make_job
+    from ..scenario.campaign import Campaign, is_campaign
     from ..scenario.scenario import Scenario
     from .forecast import forecast
     from .run_command import formats_of
     from .terminal import shown_status
 
-    try:
-        file = None if cluster is None else ClusterFile.load(cluster)
-        read = Scenario.load(scenario)
+    file = None if cluster is None else ClusterFile.load(cluster)
+
+    def look(read: Scenario, plans: bool) -> tuple[Job, dict[str, Any]]:
         with shown_status("reading the scene", as_json, logged=False):
-            job = make_job(read, backend, no_plan)
+            job = make_job(read, backend, not plans)
         running = nullcontext() if scheduler is None else connected(scheduler, files)
         with running as client, shown_status("casting some rays", as_json):
             found = forecast(job, read.pool, out, client, formats_of(read), file)
         found["notes"] += read.advice(job.scene)
         found["sources"] = read.sources
+        return job, found
+
+    try:
+        described, campaign = None, Campaign.load(scenario) if is_campaign(scenario) else None
+        if campaign is None and number is not None:
+            raise LidarpoolError(f"{scenario} is no campaign, and has no job {number}.")
+        if campaign is not None and number is None:
+            found = _look_at_jobs(campaign, look)
+            lines = _of_campaign(campaign, found)
+        else:
+            described = None if campaign is None else campaign.describe(number or 0)
+            read = Scenario.load(scenario) if described is None else described.scenario
+            assert read is not None, "of a file"
+            job, found = look(read, not no_plan and described is None)
+            found |= {} if described is None else {"job": _figures(described, found)}
+            lines = told(job, found)
     except LidarpoolError as error:
         if as_json:
             found = {"can_run": False, "reasons": [str(error)], "notes": []}
@@ -76,16 +101,104 @@ def check(
     if as_json:
         click.echo(json.dumps(found, indent=1, allow_nan=False))
     else:
-        for line in told(job, found):
+        for line in lines:
             click.echo(line)
     if found["reasons"]:
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        given = {"out": out, "scheduler": scheduler, "cluster": cluster, "backend": backend}
+        given: dict[str, Any] = {
+            "out": out,
+            "scheduler": scheduler,
+            "cluster": cluster,
+            "backend": backend,
+        }
+        given["job"] = number
         for name, value in given.items():
-            words += [f"--{name}", str(value)] if value and str(value) != "lidarpool-out" else []
+            wanted = value is not None and str(value) != "lidarpool-out"
+            words += [f"--{name}", str(value)] if wanted else []
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
+
+
+def _look_at_jobs(
+    campaign: Campaign, look: Callable[[Scenario, bool], tuple[Job, dict[str, Any]]]
+) -> dict[str, Any]:
+    """Look at some jobs of a campaign, the first and the last among them; they plan no paths."""
+    from dataclasses import asdict
+
+    last = campaign.count - 1
+    jobs, notes, reasons = [], [], []
+    for number in dict.fromkeys(last * i // (_LOOKED_AT - 1) for i in range(_LOOKED_AT)):
+        try:
+            described = campaign.describe(number)
+            assert described.scenario is not None, "of a file"
+            _, found = look(described.scenario, False)
+        except LidarpoolError as error:
+            reasons.append(str(error))
+            continue
+        jobs.append(_figures(described, found))
+        notes += found["notes"]
+        reasons += found["reasons"]
+    return {
+        "can_run": not reasons,
+        "reasons": list(dict.fromkeys(reasons)),
+        "notes": list(dict.fromkeys(notes)),
+        "count": campaign.count,
+        "seed": campaign.seed,
+        "choices": dict(campaign.choices),
+        "splits": dict(campaign.splits),
+        "keep": asdict(campaign.keep),
+        "jobs": jobs,
+    }
+
+
+def _figures(described: Described, found: dict[str, Any]) -> dict[str, Any]:
+    """Return a job of a campaign and its figures, as plain data."""
+    names = ("objects", "triangles", "scans", "rays", "estimate")
+    job = {name: getattr(described, name) for name in ("number", "name", "split")}
+    return job | {"values": dict(described.values)} | {name: found[name] for name in names}
+
+
+def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
+    """Print what was found out of a campaign as lines of text."""
+    from ..base.words import counted
+
+    kept = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
+    yield f"campaign    {counted(campaign.count, 'job')}, seed {campaign.seed}, kept as {kept}"
+    for name, words in campaign.choices.items():
+        yield f"varied      {name}: {words}"
+    if campaign.splits:
+        shares = ", ".join(f"{name} {share:.4g}" for name, share in campaign.splits.items())
+        yield f"splits      {shares}"
+    for job in found["jobs"]:
+        yield f"job         {_in_words(job)}"
+        points = ""
+        if job["estimate"]:
+            points = f", about {job['estimate']['points']:,} points"
+        yield (
+            f"            {counted(job['objects'], 'object')}, {counted(job['scans'], 'scan')}, "
+            f"{job['rays']:,} rays{points}"
+        )
+    if found["jobs"]:
+        share = campaign.count / len(found["jobs"])
+        scans, rays = (round(share * sum(job[name] for job in found["jobs"])) for name in _SUMMED)
+        points = sum((job["estimate"] or {"points": 0})["points"] for job in found["jobs"])
+        yield (
+            f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
+            f"points, judged by {counted(len(found['jobs']), 'job')}"
+        )
+    for note in found["notes"]:
+        yield f"note: {note}"
+
+
+_SUMMED = ("scans", "rays")
+
+
+def _in_words(job: dict[str, Any]) -> str:
+    shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in job["values"].items()}
+    values = ", ".join(f"{name} {value}" for name, value in shown.items())
+    split = f" ({job['split']})" if job["split"] else ""
+    return f"{job['name']}{split}{': ' if values else ''}{values}"
 
 
 def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
@@ -95,6 +208,8 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     from ..base.words import counted
 
     sensor, estimate, disk = job.survey.sensor, found["estimate"], found["disk"]
+    if "job" in found:
+        yield f"job         {_in_words(found['job'])}"
     turn = f"{sensor.channels:,} a firing"
     if sensor.period is not None and sensor.cycle != "frame":
         turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"

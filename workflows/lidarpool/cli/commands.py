@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
 from dataclasses import asdict
 from functools import reduce
 from pathlib import Path
@@ -104,11 +105,13 @@ def demo(out: Path | Storage, **shown: Any) -> None:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    _run(None, out=out, resumable=False, **shown)
+    _run((), out=out, resumable=False, **shown)
 
 
 @cli.command()
-@click.argument("scenario", type=click.Path(path_type=Path))
+@click.argument(
+    "scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path(path_type=Path)
+)
 @options.out
 @options.scheduler
 @options.cluster
@@ -116,6 +119,14 @@ def demo(out: Path | Storage, **shown: Any) -> None:
 @options.no_plan
 @options.flag("--resume", help="Resume an unfinished run, if there is one.")
 @options.flag("--fresh", help="Delete an unfinished run.")
+@options.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
+@click.option(
+    "--job",
+    "number",
+    type=click.IntRange(min=0),
+    metavar="N",
+    help="Of a campaign: run job N alone, again, as a survey.",
+)
 @click.option(
     "--parts",
     metavar="PLACE",
@@ -138,8 +149,10 @@ def demo(out: Path | Storage, **shown: Any) -> None:
     f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
 @_shown
-def run(scenario: Path, **given: Any) -> None:
-    """Run the survey of a scenario or mesh file.
+def run(scenarios: tuple[Path, ...], **given: Any) -> None:
+    """Run the survey of a scenario or mesh file, or a campaign of many.
+
+    A campaign file, or several scenarios, make one data set.
 
     A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
     above if it is an object; every hit is kept, to 1 mm. For another sensor, pose or unit of
@@ -150,6 +163,7 @@ def run(scenario: Path, **given: Any) -> None:
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
+      lidarpool run examples/campaign.yaml --out dataset
     """  # noqa: D301 - click wants the character, not its name
     queued = given["cluster"] is not None
     for name, default in (("wait_s", WAIT_S), ("patience_s", PATIENCE_S)):
@@ -162,10 +176,12 @@ def run(scenario: Path, **given: Any) -> None:
         )
     if given["resume"] and given["fresh"]:
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
-    _run(scenario, **given)
+    _run(scenarios, **given)
 
 
-def _run(path: Path | None, **given: Any) -> None:
+def _run(
+    paths: Sequence[Path], retry_failed: bool = False, number: int | None = None, **given: Any
+) -> None:
     from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
     keep_freed_memory()
@@ -174,11 +190,25 @@ def _run(path: Path | None, **given: Any) -> None:
     try:
         with deferred_interrupts():  # an interrupted import cannot be repeated
             from ..run.cluster_file import ClusterFile
+            from ..scenario.campaign import Campaign, is_campaign
             from ..scenario.scenario import Scenario
             from .run_command import RunOptions, run_scenario
         if given.get("cluster") is not None:
             given["cluster"] = ClusterFile.load(given["cluster"])
-        run_scenario(Scenario.load(path) if path else Scenario(), RunOptions(**given))
+        told = RunOptions(**given)
+        if len(paths) > 1 or (paths and is_campaign(paths[0])):
+            from .campaign_command import run_campaign, run_job
+
+            several = len(paths) > 1
+            campaign = Campaign.of_scenarios(paths) if several else Campaign.load(paths[0])
+            if number is not None:
+                run_job(campaign, number, told)
+            else:
+                run_campaign(campaign, told, retry_failed)
+        elif retry_failed or number is not None:
+            raise click.UsageError("--job and --retry-failed are for campaigns.")
+        else:
+            run_scenario(Scenario.load(paths[0]) if paths else Scenario(), told)
     finally:
         stop_fork_server()
 

@@ -42,6 +42,9 @@ backend = click.option(
     type=click.Choice(BACKENDS),
     help="Ray caster of stage 2; by default the scenario's, else the fastest available.",
 )
+job = click.option(
+    "--job", "number", type=click.IntRange(0), metavar="N", help="Of a campaign: this job alone."
+)
 no_plan = flag("--no-plan", help="Leave out path planning.")
 cluster = click.option(
     "--cluster",

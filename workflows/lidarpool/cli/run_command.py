@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
-from ..pipeline import LIDAR
+from ..pipeline import LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..report.output import CLOUD, refuse_to_replace, write_result
 from ..report.report import summary
@@ -35,6 +35,7 @@ from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..run.watch import Waiting
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
+from ..scenario.sections import PoolSection
 from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
@@ -75,8 +76,15 @@ class RunOptions:
         return self.scheduler is None and self.cluster is None
 
 
-def run_scenario(scenario: Scenario, options: RunOptions) -> None:
+def run_scenario(
+    scenario: Scenario,
+    options: RunOptions,
+    job: Job | None = None,
+    judge: Callable[[RunResult], str] = lambda result: "",
+) -> None:
     """Run a scenario, write the result and print a summary.
+
+    The `job` is by default that of the scenario; `judge` returns a note on its result.
 
     LidarpoolError if the run fails; notes of the error say what was kept.
     """
@@ -84,7 +92,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
     if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     with shown_status("reading the scene", options.quiet, logged=False):
-        job = make_job(
+        job = job or make_job(
             scenario,
             options.backend,
             options.no_plan,
@@ -97,7 +105,7 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
         for note in scenario.advice(job.scene):
             tell(f"note: {note}")
     with ExitStack() as whole, _page(job, options.live) as page:
-        result, report = _run(scenario, job, options, page, whole)
+        result, report = _run(scenario, job, options, page, whole, judge)
         if options.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
         else:
@@ -108,7 +116,12 @@ def run_scenario(scenario: Scenario, options: RunOptions) -> None:
 
 
 def _run(
-    scenario: Scenario, job: Job, options: RunOptions, page: Page, whole: ExitStack
+    scenario: Scenario,
+    job: Job,
+    options: RunOptions,
+    page: Page,
+    whole: ExitStack,
+    judge: Callable[[RunResult], str],
 ) -> tuple[RunResult, dict[str, Any]]:
     """Run what is not done yet, write the result, and return it with its report.
 
@@ -131,14 +144,16 @@ def _run(
         store = _store(job, options, goes_on)
         with conducted(
             store,
-            lambda waiting: _cluster(scenario, job, options, waiting),
+            lambda waiting: cluster_of(scenario.pool, slots_needed(job), options, waiting),
             own=options.here,
             progress=shown_progress(options.quiet),
             page=nullcontext(page),
-            tell=_teller(options),
+            tell=teller(options),
             keep=any(one.in_pieces for one in formats),
         ) as (result, workers):
             page.finish(result)
+            if note := judge(result):
+                result = replace(result, notes=(*result.notes, note))
             only_cloud = options.only == "cloud"
             what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
             with shown_status(f"writing {what}", options.quiet):
@@ -198,19 +213,18 @@ def _store(job: Job, options: RunOptions, goes_on: bool) -> RunStore:
     return store
 
 
-def _cluster(
-    scenario: Scenario, job: Job, options: RunOptions, waiting: Waiting
+def cluster_of(
+    pool: PoolSection, slots: Mapping[str, int], options: RunOptions, waiting: Waiting
 ) -> AbstractContextManager[Client]:
-    """Client of the cluster that is to be started or connected to."""
+    """Client of the cluster that is to be started or connected to, for so many slots."""
     if options.scheduler is not None:
         return connected(options.scheduler, options.files, waiting)
     if options.cluster is not None:
-        started = started_client(options.cluster, _teller(options))
+        started = started_client(options.cluster, teller(options))
         return _with_status(started, f"starting {options.cluster}", options)
-    pool = scenario.pool
     local = local_client(
-        gpu_workers=pool.gpu, lidar_slots=slots_needed(job)[LIDAR], other_workers=pool.other,
-        planning=job.planning is not None, tls=options.tls,
+        gpu_workers=pool.gpu, lidar_slots=slots[LIDAR], other_workers=pool.other,
+        planning=OTHER in slots, tls=options.tls,
     )  # fmt: skip
     return _with_status(local, "starting the workers", options)
 
@@ -229,7 +243,8 @@ def _with_status(
         yield client
 
 
-def _teller(options: RunOptions) -> Callable[[str], None]:
+def teller(options: RunOptions) -> Callable[[str], None]:
+    """Return what prints a note, unless it is to be quiet."""
     return lambda words: None if options.quiet else tell(f"note: {words}")
 
 

@@ -46,7 +46,7 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
       lidarpool init surveys/hall --mesh hall.stl --unit mm
     """  # noqa: D301 - click wants the character, not its name
     from ..scenario.scenario import Scenario
-    from ..scenario.schema import SCHEMA_FILE, schema_text
+    from ..scenario.schema import SCHEMA_FILE, scenario_schema, schema_text
     from ..scenario.template import SCENARIO_FILE, scenario_template
 
     if not meshes and (unit or up_axis):
@@ -63,7 +63,9 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
         folder.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8", newline="\n") as file:
             file.write(scenario_template(entries, placing))
-        (folder / SCHEMA_FILE).write_text(schema_text(), encoding="utf-8", newline="\n")
+        (folder / SCHEMA_FILE).write_text(
+            schema_text(scenario_schema()), encoding="utf-8", newline="\n"
+        )
     except FileExistsError as error:
         raise LidarpoolError(
             f"{error.filename} exists, and is not overwritten: name another folder, "
@@ -94,7 +96,8 @@ def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> d
 
 
 @click.command()
-def schema() -> None:
+@click.option("--campaign", is_flag=True, help="Of campaign files.")
+def schema(campaign: bool) -> None:
     """Print the JSON Schema of scenario files.
 
     Editors complete and check scenarios with it.
@@ -106,8 +109,8 @@ def schema() -> None:
     \b
     Examples:
       lidarpool schema > scenario.schema.json
-      lidarpool schema | less
+      lidarpool schema --campaign > campaign.schema.json
     """  # noqa: D301 - click wants the character, not its name
-    from ..scenario.schema import schema_text
+    from ..scenario.schema import campaign_schema, scenario_schema, schema_text
 
-    click.echo(schema_text(), nl=False)
+    click.echo(schema_text(campaign_schema() if campaign else scenario_schema()), nl=False)

@@ -71,7 +71,9 @@ class CampaignStore(KeptRun):
     def store_of(self, name: str, job: Job) -> RunStore:
         """Open the store of a job, with what an earlier run has left of it."""
         Storage.at(f"{self.place}/{JOBS}").prepare()
-        return RunStore(job, self._place_of(name), self.storage.url, resume=True)
+        # The campaign keeps with which backend and software all of its jobs are cast.
+        place, parts = self._place_of(name), self.storage.url
+        return RunStore(job, place, parts, resume=True, backend="auto")
 
     def folder_of(self, store: RunStore) -> str:
         """Folder of a job's parts in the storage of the campaign."""

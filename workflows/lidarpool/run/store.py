@@ -322,7 +322,7 @@ class KeptRun:
 
 
 class RunStore(KeptRun):
-    """Database and parts of one job; `place`, `parts` and `resume` as of `KeptRun`."""
+    """Database and parts of one job; `backend` is by default the job's, others as of `KeptRun`."""
 
     def __init__(
         self,
@@ -331,10 +331,11 @@ class RunStore(KeptRun):
         parts: str | Path | None = None,
         *,
         resume: bool = False,
+        backend: str = "",
     ) -> None:
         self.job = job
         self.on_parts: Callable[[list[Receipt]], None] = lambda parts: None  # called with new ones
-        count, wanted = job.survey.scan_count, job.backend
+        count, wanted = job.survey.scan_count, backend or job.backend
         super().__init__(identity_of(job), count, wanted, place, parts, resume=resume)
 
     @property

@@ -191,7 +191,7 @@ class Campaign:
         cls,
         paths: Iterable[str | Path],
         *,
-        keep: str | Keep | Mapping[str, str] = "kitti",
+        keep: str | Keep | Mapping[str, str] = "folder",
         splits: Mapping[str, float] = MappingProxyType({}),
         seed: Seed = 0,
         license: str = "",  # noqa: A002 - as in the file
@@ -226,6 +226,7 @@ class Campaign:
         """
         return self._jobs.choices
 
+    @checked
     def describe(self, number: int) -> Described:
         """Return a job; the same number gives the same job.
 
@@ -421,7 +422,7 @@ class _Varied:
         drawn = [text for text, choice in section.vary.items() if choice.each is None]
         if section.count is None and drawn:
             raise LidarpoolError(
-                f"{path}: count is missing: how many jobs, as {drawn[0]} is drawn?"
+                f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
             )
         self.count = min(section.count or grid, COUNT_MOST)
         several = ("base",) if len(self._bases) > 1 else ()
@@ -506,11 +507,15 @@ class _Base:
         for i, one in enumerate(fields):
             for other in fields[:i]:
                 short, long = sorted((one, other), key=lambda field: len(field.keys))
-                added = self._vary[short.text].sample is not None and short.keys != long.keys
+                if short.keys == long.keys:
+                    raise LidarpoolError(
+                        f"vary: {other.text} and {one.text} lead to the same field: leave one out."
+                    )
+                added = self._vary[short.text].sample is not None
                 if long.keys[: len(short.keys)] == short.keys and not added:
                     raise LidarpoolError(
-                        f"vary: {short.text} and {long.text} choose the same: leave one out, or "
-                        f"write the second within the values of {short.text}."
+                        f"vary: {short.text} is chosen as a whole, and {long.text} is a part of "
+                        "it: leave one out."
                     )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
@@ -536,26 +541,22 @@ class _Base:
             self._take_files(found, source, mistakes)
         if together is None:
             return
-        before = len(mistakes.lines)
-        for text, ends in trials.items():
-            for value in ends:
-                with mistakes.noted():
-                    self._try(source, text, value)
-        if len(mistakes.lines) == before:
-            mistakes.lines += str(together).splitlines()
+        wrong = [f"{source}: vary: {line}" for text in trials for line in self._tried(text)[:1]]
+        mistakes.lines += wrong or str(together).splitlines()
 
-    def _try(self, source: str, text: str, value: Any) -> None:
-        try:
-            self.scenario_of({text: value}, {}, "")
-        except LidarpoolError as error:
-            keys = self._fields[text].keys
-            place = "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in keys)[1:]
-            lines = []
-            for line in str(error).removeprefix(": ").splitlines():
-                own = line.removeprefix(": ").removeprefix(f"{place} is ")
-                named = own if own != line.removeprefix(": ") else f"{shown(value)}: {own}"
-                lines.append(f"{source}: vary: {text}: {named}")
-            raise LidarpoolError("\n".join(lines)) from error
+    def _tried(self, text: str) -> list[str]:
+        """Lines on the values of a path that are not valid in the base."""
+        choice, place = self._vary[text], self._fields[text].place
+        lines = []
+        for value in choice.ends:
+            try:
+                self.scenario_of({text: value}, {}, "")
+            except LidarpoolError as error:
+                told = str(error).partition("\n")[0].removeprefix(": ")
+                own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
+                given = f"{text} can be {shown(value)}"
+                lines.append(f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}")
+        return lines
 
     def _take_files(self, scenario: Scenario, source: str, mistakes: Mistakes) -> None:
         with mistakes.noted():

@@ -7,14 +7,15 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from math import isclose, lcm
+from math import inf, isclose, isfinite, lcm
 from pathlib import Path
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
-from pydantic import Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from ..base.arguments import checked_fields
+from ..base.arguments import shown as given
 from ..base.declared import Seed, Text, TextOrTexts, is_text, short
 from ..export.table import FORMATS, LAYOUTS
 from .draws import SHARE_LEAST, SIGMAS, Draw
@@ -25,14 +26,28 @@ KEPT = ("kitti", "nuscenes", "mcap", "parquet", "folder")
 Value = bool | int | float | str  # in the table of jobs
 
 _SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
-_WHOLE_MOST = 2**62
 
-Number = Annotated[float, Field(ge=-1e300, le=1e300)]
-Interval = Annotated[tuple[Number, Number], Strict(False)]
-Whole = Annotated[int, Field(ge=-_WHOLE_MOST, le=_WHOLE_MOST)]
-Wholes = Annotated[tuple[Whole, Whole], Strict(False)]
-Options = Annotated[tuple[Any, ...], Strict(False), Field(min_length=1)]
-NamedOptions = Annotated[dict[Text, Any], Field(min_length=1)]
+Interval = Annotated[tuple[float, float], Strict(False)]
+Wholes = Annotated[tuple[int, int], Strict(False)]
+
+
+def _options(value: Any) -> Any:
+    if value is not None and not (isinstance(value, (list, tuple, dict)) and value):
+        raise ValueError(
+            f"give a list of values, or a mapping of names to values; given is {given(value)}."
+        )
+    return value
+
+
+Options = Annotated[
+    Annotated[tuple[Any, ...], Strict(False)] | dict[Text, Any] | None,
+    BeforeValidator(
+        _options,
+        json_schema_input_type=Annotated[list[Any], Field(min_length=1)]
+        | Annotated[dict[str, Any], Field(min_length=1)]
+        | None,
+    ),
+]
 Weight = Annotated[float, Field(ge=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, le=1)]
 
@@ -40,8 +55,8 @@ Share = Annotated[float, Field(ge=0, le=1)]
 class Normal(Section):
     """A normal distribution; outside `limits` numbers are drawn again."""
 
-    mean: Annotated[Number, told("mean")]
-    std: Annotated[float, told("standard deviation", gt=0, le=1e300)]
+    mean: Annotated[float, told("mean")]
+    std: Annotated[float, told("standard deviation", gt=0)]
     limits: Annotated[
         Interval | None, told("least and largest number; by default 6 standard deviations", [0, 1])
     ] = None
@@ -51,11 +66,13 @@ class Normal(Section):
         if self.limits is not None:
             low, high = self.limits
             of = NormalDist(self.mean, self.std)
-            if low > high or of.cdf(high) - of.cdf(low) < SHARE_LEAST:
+            if not low <= high or of.cdf(high) - of.cdf(low) < SHARE_LEAST:
                 raise ValueError(
                     f"limits are [least, largest], with at least {SHARE_LEAST:.0%} of the "
                     "distribution between them."
                 )
+        if not isfinite(self.ends[1] - self.ends[0]):
+            raise ValueError("its numbers are too large.")
         return self
 
     @property
@@ -109,14 +126,14 @@ class Choice(Section):
         None
     )
     choice: Annotated[
-        Options | NamedOptions | None,
+        Options,
         told("one of a list, or of a mapping of names to values", ["velodyne/vlp16", "my.yaml"]),
     ] = None
     weights: Annotated[
         tuple[Weight, ...] | None, Strict(False), told("of choice: how likely each is", [3, 1])
     ] = None
     each: Annotated[
-        Options | NamedOptions | None,
+        Options,
         told("all of a list in turn; several of these make a grid, the first changes fastest"),
     ] = None
     sample: Annotated[
@@ -131,7 +148,7 @@ class Choice(Section):
             raise ValueError(f"give one of {', '.join(_KINDS)}.")
         for name in ("uniform", "log_uniform", "integer"):
             ends = getattr(self, name)
-            if ends is not None and ends[0] > ends[1]:
+            if ends is not None and not 0 <= ends[1] - ends[0] < inf:
                 raise ValueError(f"{name} is [least, largest].")
         if self.log_uniform is not None and self.log_uniform[0] <= 0:
             raise ValueError("log_uniform is [least, largest], both above 0.")
@@ -185,6 +202,12 @@ class Choice(Section):
             return value, list(given)[position]
         return value, _in_table(value, position)
 
+    def hint(self, error: str) -> str:
+        """Advice on an end that a field does not take."""
+        if self.integer is None and "integer" in error and not self.listed:
+            return " Take integer: [least, largest]."
+        return " Give limits." if self.normal is not None and self.normal.limits is None else ""
+
     @property
     def words(self) -> str:
         """The values that there are: «0.2 to 20, log_uniform»."""
@@ -204,6 +227,18 @@ class Choice(Section):
 
 
 _KINDS = tuple(name for name in Choice.model_fields if name != "weights")
+
+
+def _choice(value: Any) -> Any:
+    if not isinstance(value, (dict, Choice)):
+        raise ValueError(
+            f"say how it is chosen, {{uniform: [0, 1]}} or {{choice: [1, 4]}}; given is "
+            f"{given(value)}."
+        )
+    return value
+
+
+ChoiceEntry = Annotated[Choice, BeforeValidator(_choice, json_schema_input_type=Choice)]
 
 
 def _in_table(value: Any, position: int) -> Value | None:
@@ -241,7 +276,19 @@ class KeepSection(Section, Keep):
     """The format of the data set; in YAML also just its name."""
 
 
-KeepEntry = Annotated[KeepSection, short(is_text, lambda v: {"format": v}, Text | KeepSection)]
+KeepEntry = Annotated[
+    KeepSection,
+    short(
+        lambda v: v is None or is_text(v),
+        lambda v: {"format": v} if v else {},
+        Text | KeepSection | None,
+    ),
+]
+
+
+def _or_empty(kind: Any) -> Any:
+    """Take a field whose lines are all commented out."""
+    return short(lambda v: v is None, lambda v: {}, kind | None)
 
 
 class CampaignSection(Section):
@@ -265,7 +312,8 @@ class CampaignSection(Section):
     ] = None
     seed: Annotated[Seed, told("another seed draws other values")] = 0
     vary: Annotated[
-        dict[Text, Choice],
+        dict[Text, ChoiceEntry],
+        _or_empty(dict[Text, Choice]),
         told(
             "{path: how its value is chosen}; a path has keys, numbers of entries, or their names",
             {"weather.visibility_km": {"log_uniform": [0.2, 20]}},
@@ -275,6 +323,7 @@ class CampaignSection(Section):
     keep: Annotated[KeepEntry, told("format of the data set")] = KeepSection()
     splits: Annotated[
         dict[str, Share],
+        _or_empty(dict[str, Share]),
         told(
             "{name: share of the jobs}; they add up to 1", {"train": 0.8, "val": 0.1, "test": 0.1}
         ),

@@ -39,9 +39,9 @@ class FieldPath:
         return tuple(key for key, _ in self.steps)
 
     @property
-    def value(self) -> Any:
-        """What the scenario has there; None if nothing."""
-        return self.steps[-1][1]
+    def place(self) -> str:
+        """As errors of a scenario write it: ``scene.files[0].file``."""
+        return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in self.keys)[1:]
 
 
 def find_field(scenario: Scenario, text: str) -> FieldPath:
@@ -83,7 +83,7 @@ def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
     fields = {field.alias or own: own for own, field in type(node).model_fields.items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
-        raise LidarpoolError(f"{name} is not {place}.{did_you_mean(name, fields)}")
+        raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
     field = type(node).model_fields[fields[name]]
     return name, getattr(node, fields[name], None), field.annotation
 

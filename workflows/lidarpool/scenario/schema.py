@@ -1,4 +1,4 @@
-"""The JSON Schema of scenario files, for editors that complete and check them."""
+"""The JSON Schemas of scenario and campaign files, for editors that complete and check them."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Any
 
 from pydantic.json_schema import GenerateJsonSchema
 
+from .choices import CampaignSection
 from .scenario import Scenario
 
 SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
@@ -44,6 +45,18 @@ def scenario_schema() -> dict[str, Any]:
     }
 
 
-def schema_text() -> str:
-    """Return the schema as JSON, with a line break at its end."""
-    return json.dumps(scenario_schema(), indent=2, allow_nan=False) + "\n"
+def campaign_schema() -> dict[str, Any]:
+    """Return the JSON Schema of campaign files.
+
+    `Campaign.load` also checks that paths lead to fields, and that these take the values.
+    """
+    return {
+        "$schema": GenerateJsonSchema.schema_dialect,
+        **CampaignSection.model_json_schema(schema_generator=_Plain),
+        "title": "lidarpool campaign",
+    }
+
+
+def schema_text(schema: dict[str, Any]) -> str:
+    """Return a schema as JSON, with a line break at its end."""
+    return json.dumps(schema, indent=2, allow_nan=False) + "\n"

@@ -17,9 +17,9 @@ from ..base.allowance import check_fits
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.yamlfile import load_yaml
 from ..sensor.calibrations import said
-from ..sensor.trajectory_files import head_of_table
 from .validation_errors import models_in, validation_errors
 
+_MARKS = ",;\t"  # between cells
 _WHOLE = re.compile(r"[-+]?[0-9]+")
 _REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS = {"true": True, "false": False}
@@ -37,7 +37,7 @@ def read_rows(path: Path, kind: Any) -> list[Row]:
     """Read a table whose columns are fields of an entry, with dots where they are nested.
 
     A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty one
-    leaves the field out.
+    leaves the field out. Lines that begin with # are remarks.
 
     Parameters
     ----------
@@ -56,17 +56,19 @@ def read_rows(path: Path, kind: Any) -> list[Row]:
     try:
         check_fits(path)
         lines = path.read_text("utf-8-sig").splitlines()
-        if not any(line.strip() for line in lines):
-            raise ValueError("it is empty")
-        first, mark, head = head_of_table(lines)
-        if twice := next((name for name in head if head.count(name) > 1), None):
-            raise ValueError(f"it has the column {twice!r} twice")
-        reader = csv.reader(lines[first + 1 :], delimiter=mark)
+        first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
+        mark = max(_MARKS, key=first.count)
+        reader = csv.reader(lines, delimiter=mark)
         cells = [
-            (first + 1 + reader.line_num, row)
+            (reader.line_num, [cell.strip() for cell in row])
             for row in reader
             if any(cell.strip() for cell in row) and not row[0].lstrip().startswith("#")
         ]
+        if not cells:
+            raise ValueError("it is empty")
+        (_, head), *cells = cells
+        if twice := next((name for name in head if head.count(name) > 1), None):
+            raise ValueError(f"it has the column {twice!r} twice")
     except FileNotFoundError as error:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
     except (OSError, ValueError, csv.Error, LidarpoolError) as error:
@@ -89,13 +91,13 @@ def read_rows(path: Path, kind: Any) -> list[Row]:
 
 
 def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
-    values = {name: _value(cell.strip()) for name, cell in cells.items() if cell.strip()}
+    values = {name: _value(cell) for name, cell in cells.items() if cell}
     try:
         return adapter.validate_python(_nested(values))
     except ValidationError as error:
         # A field that takes text may have a number: the name of a car is 7.
         wrong = {".".join(map(str, detail["loc"])) for detail in error.errors()}
-        text = {name: cells[name].strip() for name in wrong & values.keys()}
+        text = {name: cells[name] for name in wrong & values.keys()}
         if not text:
             raise
         try:

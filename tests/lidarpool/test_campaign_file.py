@@ -1,0 +1,585 @@
+"""Campaign files: the jobs that they describe, and a message for each way to get one wrong."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from lidarpool import Campaign, CampaignJob, LidarpoolError, Noise, Scene, Survey
+from lidarpool.base.fingerprint import fingerprint
+from lidarpool.scenario.campaign import is_campaign
+from lidarpool.scenario.draws import Draw
+from lidarpool.scenario.scenario import Scenario
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+BASE = """
+scene:
+  files: [hall.glb]
+  copies:
+    - {name: Crate, box: [1, 1, 1], at: [[4, 5, 0]]}
+sensors:
+  roof: {model: velodyne/vlp16, mount: {position: [0, 0, 2]}}
+  front.left: {model: velodyne/vlp16}
+trajectory:
+  points:
+    - {time_s: 0, position: [0, 0, 0]}
+    - {time_s: 9, position: [9, 0, 0]}
+actors:
+  - name: Van
+    box: [5, 2, 2]
+    trajectory: {points: [{time_s: 0, position: [9, 3, 0]}, {time_s: 9, position: [0, 3, 0]}]}
+steps: 4
+"""
+TRAFFIC = """# Name and place.
+name,box,class,trajectory.points.0.time_s,trajectory.points.0.position,trajectory.points
+7,"[4, 2, 1.5]",10,,,"[{time_s: 0, position: [0, 1, 0]}, {time_s: 9, position: [9, 1, 0]}]"
+Car #8,"[4, 2, 1.5]",,,,"[{time_s: 0, position: [0, 5, 0]}, {time_s: 9, position: [9, 5, 0]}]"
+"""
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Return a folder with a base, a table of actors, and mesh files that are not read."""
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "traffic.csv").write_text(TRAFFIC)
+    for name in ("hall.glb", "yard.glb"):
+        (tmp_path / name).write_bytes(name.encode())
+    return tmp_path
+
+
+@pytest.fixture
+def campaign(folder):
+    """Return a function that loads a campaign of what is varied, and other fields."""
+
+    def load(vary=None, **fields):
+        path = folder / "campaign.yaml"
+        given = {"base": "base.yaml", "count": 40, "seed": 7} | fields
+        given = {k: v for k, v in given.items() if v is not None}
+        path.write_text(yaml.safe_dump(given | {"vary": vary or {}}, sort_keys=False))
+        return Campaign.load(path)
+
+    return load
+
+
+ALWAYS = [
+    18.853258822,
+    0.551838115172,
+    0.45439467202,
+    229826611260,
+    4,
+    [11, 30, 67, 70],
+    [2, 3, 0, 1, 4, 5],
+    7817553027339740253,
+]
+OF_THE_EXAMPLE = {
+    "sensors.roof.model": "ouster/os1-32",
+    "sensors.roof.mount.position.2": 1.68921121921,
+    "weather.visibility_km": 6.5876689241,
+    "noise.range_m": 0.0213501171904,
+    "scene.files.0.rotation_deg.2": "back",
+    "actors": 8,
+}
+
+
+def values(found, name):
+    return [found.describe(number).values.get(name) for number in range(found.count)]
+
+
+# --- what is varied ----------------------------------------------------------------------------
+
+
+def test_each_kind_of_choice_comes_to_where_its_path_leads(campaign):
+    found = campaign({
+        "weather.visibility_km": {"log_uniform": [0.2, 20]},
+        "noise.range_m": {"normal": {"mean": 0.02, "std": 0.01, "limits": [0, 0.03]}},
+        "sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]},
+        "sensors.front.left.mount.position.2": {"uniform": [0.5, 1]},
+        "scene.files.0.file": {"choice": ["hall.glb", "yard.glb"]},
+        "scene.copies.Crate.box.0": {"uniform": [1, 2]},
+        "steps": {"integer": [2, 4]},
+        "actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}},
+        "returns.subrays": {"each": [1, 7, 19]},
+    })  # fmt: skip
+    jobs = [found.describe(number) for number in range(40)]
+    assert [job.name for job in jobs[:2]] == ["0000", "0001"]
+    for number, job in enumerate(jobs):
+        assert (job.number, tuple(job.values)) == (number, found.names)
+        made = job.scenario
+        read = (
+            made.weather.visibility_km,
+            made.noise.range_m,
+            made.sensors["roof"].model,
+            made.sensors["front.left"].mount.position[2],
+            made.scene.files[0].file,
+            made.scene.copies[0].box[0],
+            made.steps,
+            len(made.actors) - 1,
+            made.returns.subrays,
+        )
+        assert read == tuple(job.values.values())
+        assert made.sensors["roof"].mount.position == (0, 0, 2)  # the rest is the base's
+    each = list(zip(*(job.values.values() for job in jobs), strict=True))
+    for column, (low, high) in {0: (0.2, 20), 1: (0, 0.03), 3: (0.5, 1), 5: (1, 2)}.items():
+        assert low <= min(each[column]) < max(each[column]) <= high
+        assert len({*each[column]}) == 40
+    assert {*each[6]} == {2, 3, 4} and {*each[7]} == {0, 1, 2}
+    assert {*each[2]} == {"velodyne/vlp16", "ouster/os1-64"}
+    assert each[8][:6] == (1, 7, 19, 1, 7, 19)
+
+
+def test_numbers_are_distributed_as_they_say():
+    draw = Draw(1, 2, "test")
+    count = 4000
+    uniform = np.array([draw.uniform(2, 4) for _ in range(count)])
+    assert uniform.mean() == pytest.approx(3, abs=0.04) and uniform.std() == pytest.approx(
+        2 / 12**0.5, abs=0.02
+    )
+    logs = np.log([draw.log_uniform(1, np.e**2) for _ in range(count)])
+    assert logs.mean() == pytest.approx(1, abs=0.04)
+    normal = np.array([draw.normal(5, 2) for _ in range(count)])
+    assert normal.mean() == pytest.approx(5, abs=0.15) and normal.std() == pytest.approx(2, abs=0.1)
+    cut = np.array([draw.normal(0, 1, (1, 2)) for _ in range(500)])
+    assert cut.min() >= 1 and cut.max() <= 2
+    assert Counter(draw.integer(-1, 1) for _ in range(3000)).keys() == {-1, 0, 1}
+    weighted = Counter(draw.position(3, (1, 0, 3)) for _ in range(count))
+    assert weighted[1] == 0 and weighted[2] / count == pytest.approx(0.75, abs=0.03)
+    subsets = Counter(tuple(draw.subset(4, 2)) for _ in range(count))
+    assert len(subsets) == 6 and min(subsets.values()) > count / 6 * 0.8
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.floats(1e-9, 1e9), st.floats(1, 1e6), st.integers(0, 10**6))
+def test_numbers_stay_within_their_ends(low, factor, number):
+    draw, high = Draw(0, number, "test"), low * factor
+    for drawn in (draw.uniform(low, high), draw.log_uniform(low, high)):
+        assert low <= drawn <= high
+
+
+def test_the_values_are_those_of_always():
+    """Written down in November 2026: another machine or year must not draw others."""
+    draw = Draw(7, 417, "weather.visibility_km")
+    drawn = [
+        *(draw.uniform(0.2, 20), draw.log_uniform(0.2, 20), draw.normal(1, 0.5)),
+        *(draw.integer(-(10**12), 10**12), draw.position(5, (1, 2, 3, 4, 5))),
+        *(draw.subset(100, 4), draw.order(6), draw.bits(63)),
+    ]
+    assert drawn == ALWAYS
+    found = Campaign.load(EXAMPLES / "campaign.yaml").describe(17)
+    assert (found.name, found.split, dict(found.values)) == ("0017", "val", OF_THE_EXAMPLE)
+    made = Campaign(
+        lambda number, rng: job(rng.bit_generator.random_raw() % 2**60), count=9, seed=7
+    ).describe(5)
+    assert made.values == {"drawn": 720261597643068392}
+
+
+def test_other_quantities_do_not_change_a_value(campaign):
+    visible = {"weather.visibility_km": {"log_uniform": [0.2, 20]}}
+    model = {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}}
+    alone = values(campaign(visible), "weather.visibility_km")
+    assert values(campaign(visible | model), "weather.visibility_km") == alone
+    assert values(campaign(model | visible), "weather.visibility_km") == alone
+    assert values(campaign(visible, count=10), "weather.visibility_km") == alone[:10]
+    assert not {*values(campaign(visible, seed=8), "weather.visibility_km")} & {*alone}
+
+
+def test_a_job_is_the_same_in_whatever_order_it_is_asked_for(campaign):
+    found = campaign({"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}})
+    first = [fingerprint(found.describe(n).scenario.model_dump()) for n in range(10)]
+    again = [fingerprint(found.describe(n).scenario.model_dump()) for n in reversed(range(10))]
+    assert first == again[::-1]
+
+
+def test_rows_of_a_table_become_entries(campaign):
+    found = campaign({"actors": {"sample": {"from": "traffic.csv", "count": 2}}}, count=1)
+    van, *rows = found.describe(0).scenario.actors
+    assert (van.name, found.describe(0).values) == ("Van", {"actors": 2})
+    assert [row.name for row in rows] == ["7", "Car #8"]  # text, though one is a number
+    assert [row.semantic_class for row in rows] == [10, None]
+    assert rows[1].trajectory.points[1].position == (9, 5, 0)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        'name;box.0;box.1;box.2;at\nA;1;2;3;"[[1, 2]]"\n',
+        'name\tbox\tat\nA\t"[1, 2, 3]"\t[[1, 2]]\n',
+        '\n# Crates, in metres\nname,box,at.0.position\nA,"[1, 2, 3]","[1, 2]"\n\n',
+    ],
+)
+def test_tables_may_be_written_in_several_ways(campaign, folder, text):
+    (folder / "crates.csv").write_text(text)
+    found = campaign({"scene.copies": {"sample": {"from": "crates.csv", "count": 1}}})
+    crate = found.describe(0).scenario.scene.copies[1]
+    assert (crate.name, crate.box, crate.at[0].position) == ("A", (1, 2, 3), (1, 2))
+
+
+def test_names_may_be_given_to_values(campaign):
+    found = campaign(
+        {
+            "scene": {"choice": {"in": "hall.glb", "out": {"files": ["yard.glb"]}}},
+            "cloud.columns": {"each": [["time"], ["range", "time"]]},
+            "weather.visibility_km": {"each": [None, 5.0]},
+        },
+        count=12,
+    )
+    files = {"in": "hall.glb", "out": "yard.glb"}
+    for number in range(12):
+        made = found.describe(number)
+        assert made.scenario.scene.files[0].file == files[made.values["scene"]]
+        assert made.scenario.weather.visibility_km == made.values.get("weather.visibility_km")
+    assert values(found, "cloud.columns")[:2] == ['["time"]', '["range", "time"]']
+    assert values(found, "weather.visibility_km")[:4] == [None, None, 5, 5]
+
+
+def test_a_grid_has_each_pair_of_values_once(campaign):
+    found = campaign(
+        {"steps": {"each": [1, 2, 3]}, "returns.subrays": {"each": [1, 7]}}, count=None
+    )
+    pairs = [tuple(found.describe(number).values.values()) for number in range(found.count)]
+    assert pairs == [(1, 1), (2, 1), (3, 1), (1, 7), (2, 7), (3, 7)]
+
+
+def test_bases_are_taken_in_turn(campaign, folder):
+    other = yaml.safe_load(BASE) | {"weather": {"visibility_km": 1}}
+    (folder / "other").mkdir()
+    (folder / "other" / "fog.yaml").write_text(yaml.safe_dump(other))
+    (folder / "other" / "hall.glb").touch()
+    found = campaign({"steps": {"each": [1, 2]}}, base=["base.yaml", "other/fog.yaml"], count=None)
+    assert found.names == ("base", "steps")
+    jobs = [found.describe(number) for number in range(found.count)]
+    assert [tuple(job.values.values()) for job in jobs] == [
+        ("base.yaml", 1), ("fog.yaml", 1), ("base.yaml", 2), ("fog.yaml", 2),
+    ]  # fmt: skip
+    assert [job.scenario.weather.visibility_km for job in jobs] == [None, 1, None, 1]
+    # Files are beside the base that names them.
+    assert [*jobs[1].scenario.files] == [folder / "other" / "hall.glb"]
+
+
+def test_a_section_that_the_base_lacks_is_made(campaign, folder):
+    (folder / "base.yaml").write_text("poses: [[0, 0, 1]]\n")
+    found = campaign({
+        "mount.position.2": {"choice": [3.5]},
+        "scene.ground.height_m": {"choice": [-1]},
+        "poses.0.yaw_deg": {"choice": [90]},
+    })  # fmt: skip
+    made = found.describe(0).scenario
+    assert (made.mount.position, made.scene.ground.height_m) == ((0, 0, 3.5), -1)
+    assert made.poses[0].pose().yaw_deg == 90
+
+
+def test_a_mesh_file_may_be_the_base(campaign):
+    found = campaign({"scene.files.0.scale": {"uniform": [1, 2]}}, base="hall.glb")
+    scales = [found.describe(n).scenario.scene.files[0].scale for n in range(3)]
+    assert [(value,) * 3 for value in values(found, "scene.files.0.scale")[:3]] == scales
+
+
+# --- noise, splits, what is kept ----------------------------------------------------------------
+
+
+def test_each_job_has_its_own_noise(campaign, folder):
+    def seeds(found):
+        return [found.describe(number).scenario.noise.seed for number in range(5)]
+
+    own = seeds(campaign())
+    assert len({*own}) == 5 and min(own) > 0
+    assert seeds(campaign({"noise.range_m": {"uniform": [0, 1]}})) == own
+    assert seeds(campaign({"noise.seed": {"choice": [0]}})) == [0] * 5
+    (folder / "base.yaml").write_text(BASE + "noise: {seed: 0}\n")  # as lidarpool init writes it
+    assert seeds(campaign()) == own
+    (folder / "base.yaml").write_text(BASE + "noise: {seed: 5}\n")
+    assert seeds(campaign()) == [5] * 5
+
+
+def test_splits_have_their_shares_in_each_block(campaign):
+    found = campaign(splits={"train": 0.8, "val": 0.1, "test": 0.1}, count=200)
+    names = [found.describe(number).split for number in range(200)]
+    for begin in range(0, 200, 10):
+        assert Counter(names[begin : begin + 10]) == {"train": 8, "val": 1, "test": 1}
+    assert len({*(names[begin : begin + 10].index("val") for begin in range(0, 200, 10))}) > 4
+    more = campaign(splits={"train": 0.8, "val": 0.1, "test": 0.1}, count=2000)
+    assert [more.describe(number).split for number in range(200)] == names
+    odd = campaign(splits={"a": 0.3333333, "b": 0.6666667}, count=1000)
+    assert Counter(odd.describe(number).split for number in range(1000))["a"] == 333
+    assert campaign().describe(0).split == ""
+
+
+def test_what_is_kept_and_what_the_card_says(campaign):
+    found = campaign(keep={"format": "mcap", "layout": "ouster"}, license="CC0", title="Halls")
+    assert (found.keep.format, found.keep.layout) == ("mcap", "ouster")
+    assert (found.license, found.title) == ("CC0", "Halls")
+    plain = campaign(keep="folder")
+    assert (plain.keep.format, plain.title, plain.keep.needs) == ("folder", "campaign", ())
+    assert "class" in campaign().keep.needs  # kitti
+
+
+def test_identity_is_that_of_the_content(campaign, folder):
+    vary = {"scene.files.0.file": {"choice": ["hall.glb", "yard.glb"]}}
+    vary |= {"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}}
+    first = campaign(vary).identity
+    assert all(len(value) == 64 for value in first.values())
+    (folder / "campaign.yaml").write_text(
+        "# another remark\n" + (folder / "campaign.yaml").read_text()
+    )
+    assert Campaign.load(folder / "campaign.yaml").identity == first
+
+    def changed(*given, **fields):
+        return {k for k, v in campaign(*given, **fields).identity.items() if v != first[k]}
+
+    assert changed(vary, license="CC0", title="T") == set()
+    assert changed(vary, count=50) == {"count"}
+    assert changed(vary, seed=8) == {"seed"}
+    assert changed(vary, splits={"a": 1}) == {"splits"}
+    assert changed(vary, keep="parquet") == {"keep"}
+    assert changed(vary | {"steps": {"integer": [1, 2]}}) == {"vary"}
+    (folder / "yard.glb").write_bytes(b"another")  # which not every job reads
+    assert changed(vary) == {"files"}
+    (folder / "yard.glb").write_bytes(b"yard.glb")
+    (folder / "traffic.csv").write_text(TRAFFIC.replace("1.5", "1.6"))
+    assert changed(vary) == {"files"}
+    (folder / "traffic.csv").write_text(TRAFFIC)
+    (folder / "base.yaml").write_text(BASE + "pool: {gpu: 2}\n")
+    assert changed(vary) == set()
+    (folder / "base.yaml").write_text(BASE + "weather: {visibility_km: 2}\n")
+    assert changed(vary) == {"base"}
+
+
+# --- given scenarios, and functions -------------------------------------------------------------
+
+
+def test_scenarios_as_they_are(folder):
+    (folder / "a").mkdir()
+    for name in ("a/base.yaml", "my hall.yaml"):
+        (folder / name).write_text("noise: {range_m: 0.1}\n")
+    paths = [folder / name for name in ("base.yaml", "a/base.yaml", "my hall.yaml", "hall.glb")]
+    found = Campaign.of_scenarios(paths, keep="folder", splits={"a": 0.5, "b": 0.5})
+    jobs = [found.describe(number) for number in range(found.count)]
+    assert [job.name for job in jobs] == ["base", "base-2", "my_hall", "hall"]
+    assert {job.split for job in jobs} == {"a", "b"}
+    assert all(not job.values for job in jobs) and found.names == ()
+    assert [job.scenario.model_dump() for job in jobs] == [
+        Scenario.load(path).model_dump() for path in paths
+    ]
+    before = found.identity
+    (folder / "hall.glb").write_bytes(b"another")
+    assert (
+        Campaign.of_scenarios(paths, keep="folder", splits={"a": 0.5, "b": 0.5}).identity != before
+    )
+
+
+def job(*drawn, **options):
+    survey = Survey(poses=[(0, 0, 1)], **options)
+    return CampaignJob(Scene.seed(), survey, {"drawn": int(*drawn)} if drawn else {})
+
+
+def test_a_function_makes_jobs():
+    def make(number, rng):
+        noise = Noise(range_m=rng.uniform(0.01, 0.02))
+        made = job(noise=noise)
+        values = {"number": np.int64(number), "sigma": noise.range_m, "fog": None}
+        return CampaignJob(made.scene, made.survey, values)
+
+    found = Campaign(make, count=20, seed=3, keep="kitti", splits={"a": 1})
+    assert (found.names, dict(found.choices)) == (("number", "sigma", "fog"), {})
+    jobs = [found.describe(number) for number in (0, 7, 7)]
+    assert [made.values["number"] for made in jobs] == [0, 7, 7]
+    assert type(jobs[1].values["number"]) is int and "fog" not in jobs[1].values
+    assert jobs[1].values == jobs[2].values != jobs[0].values
+    assert jobs[1].name == "0007" and jobs[1].scenario is None and jobs[1].split == "a"
+    seeds = [made.made.survey.noise.seed for made in jobs]
+    assert 0 != seeds[0] != seeds[1] == seeds[2]
+    other = Campaign(lambda number, rng: make(number + 1, rng), count=20, seed=3)
+    assert other.identity["make"] != found.identity["make"]
+
+
+def test_noise_of_a_function_that_has_a_seed_or_no_effect_is_kept():
+    for noise in (Noise(), Noise(range_m=1, seed=4)):
+        made = Campaign(lambda number, rng, noise=noise: job(noise=noise), count=3).describe(1)
+        assert made.made.survey.noise == noise
+
+
+@pytest.mark.parametrize(
+    ("make", "says"),
+    [
+        (lambda number, rng: 5, "job 1: the function returned 5; it must return a CampaignJob"),
+        (lambda number, rng: 1 / 0, "job 1: the function raised ZeroDivisionError: division"),
+        (lambda number, rng: job(keep_every=0), "job 1: keep_every is 0"),
+        (
+            lambda number, rng: job(*[3] * number),
+            "job 1 has the value 'drawn', which job 0 has not",
+        ),
+        (
+            lambda number, rng: CampaignJob(job().scene, job().survey, {"a": [1]}),
+            "job 1 has the value 'a': [1]; values are numbers, text",
+        ),
+    ],
+    ids=["no job", "raises", "refused", "other names", "a list"],
+)
+def test_a_function_that_makes_no_job(make, says):
+    with pytest.raises(LidarpoolError) as raised:
+        Campaign(make, count=3).describe(1)
+    assert says in str(raised.value)
+
+
+# --- errors -------------------------------------------------------------------------------------
+
+KM = "weather.visibility_km"
+WRONG = {
+    "no section": ({"wether.visibility_km": {"uniform": [1, 2]}}, "Did you mean 'weather'?"),
+    "no field": ({"weather.visibility": {"uniform": [1, 2]}}, "Did you mean 'visibility_km'?"),
+    "no name": ({"sensors.rof.model": {"choice": ["a"]}}, "Did you mean 'roof'?"),
+    "no actor": ({"actors.Vam.box.0": {"uniform": [1, 2]}}, "Did you mean 'Van'?"),
+    "no entry": ({"scene.files.3.file": {"choice": ["a"]}}, "has 1 entry, counted from 0, and no"),
+    "no list": ({"poses.0.yaw_deg": {"uniform": [1, 2]}}, "the base has no poses"),
+    "in a number": ({"steps.x": {"uniform": [1, 2]}}, "steps has no fields of its own"),
+    "low": ({KM: {"uniform": [0, 2]}}, f"{KM} can be 0.0; input should be greater"),
+    "high": ({KM: {"log_uniform": [1, 1e7]}}, "can be 10000000.0; input should be less"),
+    "tail": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "can be -5.0; input should be"),
+    "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Give limits."),
+    "far": ({KM: {"normal": {"mean": 1, "std": 1, "limits": [9, 10]}}}, "at least 1% of the"),
+    "not whole": ({"steps": {"uniform": [1, 9]}}, "steps can be 1.0; input should be a valid int"),
+    "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m can be 'a'; input should be"),
+    "model": (
+        {"sensors.roof.model": {"choice": ["velodyne/vlp15"]}},
+        "Did you mean 'velodyne/vlp16",
+    ),
+    "together": ({"sensors.roof.layers": {"integer": [8, 9]}}, "leave out layers"),
+    "file": (
+        {"scene.files.0.file": {"choice": ["hall.glb", "hut.glb"]}},
+        "hut.glb' does not exist",
+    ),
+    "descending": ({KM: {"uniform": [2, 1]}}, f"vary.{KM}: uniform is [least, largest]"),
+    "log of 0": ({KM: {"log_uniform": [0, 1]}}, "both above 0"),
+    "two kinds": ({KM: {"uniform": [1, 2], "choice": [1]}}, "give one of uniform, log_uniform"),
+    "none": ({KM: {}}, "give one of uniform, log_uniform"),
+    "a value": ({KM: 3}, "say how it is chosen"),
+    "misspelt": ({KM: {"unifrom": [1, 2]}}, "Did you mean 'uniform'?"),
+    "no values": ({KM: {"choice": []}}, "give a list of values"),
+    "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "as many weights as"),
+    "zeros": ({KM: {"choice": [1, 2], "weights": [0, 0]}}, "must not all be 0"),
+    "twice": (
+        {"actors.0.box.0": {"uniform": [1, 2]}, "actors.Van.box.0": {"uniform": [1, 2]}},
+        "actors.0.box.0 and actors.Van.box.0 lead to the same field",
+    ),
+    "within": (
+        {"scene": {"choice": ["hall.glb"]}, "scene.files.0.file": {"choice": ["hall.glb"]}},
+        "scene is chosen as a whole",
+    ),
+    "no table": ({"actors": {"sample": {"from": "no.csv", "count": 1}}}, "no.csv does not exist"),
+    "few rows": ({"actors": {"sample": {"from": "traffic.csv", "count": 3}}}, "has 2 rows"),
+    "rows of no list": (
+        {"steps": {"sample": {"from": "traffic.csv", "count": 1}}},
+        "and this is no",
+    ),
+    "other rows": (
+        {"scene.copies": {"sample": {"from": "traffic.csv", "count": 1}}},
+        "traffic.csv, line 3: trajectory is not a field.",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_it_is_told_what_is_wrong(campaign, name):
+    vary, says = WRONG[name]
+    with pytest.raises(LidarpoolError) as raised:
+        campaign(vary)
+    told = str(raised.value)
+    assert says in told
+    assert "campaign.yaml: vary" in told or name == "file"
+    assert len(told.splitlines()) <= 2 or name == "other rows"
+
+
+@pytest.mark.parametrize(
+    ("fields", "says"),
+    [
+        ({"base": None}, "base is missing"),
+        ({"base": "bse.yaml"}, "bse.yaml does not exist"),
+        ({"base": "campaign.yaml"}, "'campaign.yaml' is a campaign; give a scenario"),
+        ({"count": 0}, "count is 0"),
+        ({"cont": 5}, "Did you mean 'count'?"),
+        ({"keep": "kiti"}, "Did you mean 'kitti'?"),
+        ({"splits": {"train": 0.8, "val": 0.1}}, "splits add up to 0.9; they must add up to 1"),
+        ({"splits": {"a/b": 1}}, "the split 'a/b' gets a file of its name"),
+    ],
+)
+def test_fields_that_cannot_be_meant(campaign, fields, says):
+    with pytest.raises(LidarpoolError) as raised:
+        campaign(**fields)
+    assert says in str(raised.value) and "campaign.yaml" in str(raised.value)
+    assert len(str(raised.value).splitlines()) == 1
+
+
+def test_a_count_is_needed_where_something_is_drawn(campaign):
+    with pytest.raises(LidarpoolError, match=r"count is missing: steps is drawn"):
+        campaign({"steps": {"integer": [1, 2]}}, count=None)
+    assert campaign(count=None).count == 1
+
+
+@pytest.mark.parametrize("number", [-1, 40])
+def test_a_job_that_is_not_there(campaign, number):
+    with pytest.raises(LidarpoolError, match=r"no job -?\d+: the campaign has jobs 0 to 39"):
+        campaign().describe(number)
+
+
+def test_values_that_do_not_fit_together_are_told_with_the_job(campaign):
+    found = campaign({"returns.subrays": {"integer": [1, 7]}})  # of which only the ends are
+    wrong = next(n for n in range(40) if 1 < Draw(7, n, "returns.subrays").integer(1, 7) < 7)
+    with pytest.raises(LidarpoolError) as raised:
+        found.describe(wrong)
+    assert f"campaign.yaml: job {wrong}: returns.subrays is " in str(raised.value)
+    assert "\nIts values are returns.subrays: " in str(raised.value)
+
+
+def test_given_files_that_cannot_be_used(folder):
+    (folder / "wrong.yaml").write_text("stepps: 3\n")
+    (folder / "campaign.yaml").write_text("base: base.yaml\n")
+    names = ("none.yaml", "wrong.yaml", "none.glb", "campaign.yaml", "base.yaml")
+    with pytest.raises(LidarpoolError) as raised:
+        Campaign.of_scenarios([folder / name for name in names])
+    lines = str(raised.value).splitlines()
+    says = (
+        "none.yaml does not exist",
+        "Did you mean 'steps'?",
+        "none.glb' does not",
+        "is a campaign",
+    )
+    assert len(lines) == 4 and all(map(str.__contains__, lines, says))
+
+
+def test_which_files_are_campaigns(folder):
+    texts = {
+        "a.yaml": ("base: x.yaml\n", True),
+        "b.yml": ("# remark\ncount: 3\n'base': x.yaml\n", True),
+        "c.yaml": ("{base: x.yaml, count: 4}", True),
+        "d.yaml": ("vary: {}\n", True),
+        "e.yaml": (BASE, False),
+        "f.yaml": ("scene:\n  base: 3\n", False),
+        "g.txt": ("base: x.yaml\n", False),
+        "h.yaml": ("base: [\n", False),
+    }
+    for name, (text, is_one) in texts.items():
+        (folder / name).write_text(text)
+        assert is_campaign(folder / name) is is_one, name
+    assert not is_campaign(folder / "none.yaml")
+    assert not is_campaign(folder)
+
+
+def test_a_campaign_goes_to_another_process(campaign, folder):
+    vary = {"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}}
+    here = [sorted(job.values.items()) for job in map(campaign(vary).describe, range(5))]
+    code = (
+        "import sys; from lidarpool import Campaign; c = Campaign.load(sys.argv[1]);"
+        "print([sorted(c.describe(n).values.items()) for n in range(5)])"
+    )
+    command = [sys.executable, "-c", code, str(folder / "campaign.yaml")]
+    env = {"PYTHONPATH": ":".join(sys.path), "PYTHONHASHSEED": "5"}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    assert done.stdout.strip() == str(here)
