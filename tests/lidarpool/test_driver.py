@@ -15,14 +15,13 @@ from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError, Scene, Sensor, Survey
 from lidarpool.base.storage import Storage
-from lidarpool.pipeline import Crew, JobError, RigPlan, driver, policies
+from lidarpool.pipeline import Crew, RigPlan, driver, policies
 from lidarpool.pipeline.batches import PIECES, Place
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.driver import STALL_S, SurveyDriver
 from lidarpool.pipeline.long_stages import StageChanges
 from lidarpool.pipeline.messages import (
     ColumnsLost,
-    Failed,
     Receipt,
     ScanRange,
     Summaries,
