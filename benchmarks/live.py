@@ -22,9 +22,11 @@ from distributed import Client
 
 from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.run_page import live_run
+from lidarpool.run.conductor import Page
 from lidarpool.run.job import Job
 from lidarpool.run.local import local_cluster
-from lidarpool.run.run import Run
+from lidarpool.run.result import RunResult
+from lidarpool.run.run import drive
 from lidarpool.run.store import RunStore
 from lidarpool.run.watch import Waiting
 
@@ -41,8 +43,7 @@ def job(poses: int) -> Job:
 
 def plain(client: Client, work: Job) -> float:
     """Seconds of a survey without a page."""
-    run = Run(client, RunStore(work), print, Waiting())
-    return run.drive(lambda frame: None, lambda progress: None).survey_seconds
+    return driven(client, RunStore(work), Page()).survey_seconds
 
 
 def watched(client: Client, work: Job) -> tuple[float, int]:
@@ -50,11 +51,24 @@ def watched(client: Client, work: Job) -> tuple[float, int]:
     with live_run(work, port=0, browser=False) as live, looking(live.page.url) as taken:
         store = RunStore(work)
         live.follow(store)
-        run = Run(client, store, print, Waiting())
-        show = live.with_progress(lambda progress: None, run.partitions)
-        result = run.drive(live.on_frame, show)
+        result = driven(client, store, live)
         live.finish(result)
     return result.survey_seconds, sum(taken)
+
+
+def driven(client: Client, store: RunStore, page: Page) -> RunResult:
+    """Do a run that tells a page."""
+    result, _ = drive(
+        client,
+        store,
+        print,
+        Waiting(),
+        own=True,
+        on_frame=lambda frame: page.on_frame(frame, lambda _: None),
+        watched=page.with_progress,
+        show=lambda progress: None,
+    )
+    return result
 
 
 @contextmanager

@@ -12,7 +12,7 @@ from lidarpool import Scene, Survey
 from lidarpool.live.run_page import live_run
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
-from lidarpool.run.run import Run
+from lidarpool.run.run import drive
 from lidarpool.run.store import RunStore
 from lidarpool.run.watch import Waiting
 
@@ -50,7 +50,7 @@ class Driven:
 
     def __init__(self, client, live, store, most=1):
         self.error, self.most = None, most
-        run, begun = Run(client, store, print, Waiting()), time.monotonic()
+        begun = time.monotonic()
 
         def on_frame(frame):
             live.on_frame(frame)
@@ -59,14 +59,17 @@ class Driven:
                 live.on_progress(now)  # KeyboardInterrupt if somebody has stopped it
                 time.sleep(0.05)
 
-        def drive():
+        def run():
             try:
-                tell = live.with_progress(lambda progress: None, run.partitions)
-                live.finish(run.drive(on_frame, tell))
+                result, _ = drive(
+                    client, store, print, Waiting(), own=True, on_frame=on_frame,
+                    watched=live.with_progress, show=lambda progress: None,
+                )  # fmt: skip
+                live.finish(result)
             except BaseException as error:
                 self.error = error
 
-        self.thread = threading.Thread(target=drive)
+        self.thread = threading.Thread(target=run)
         self.thread.start()
 
     def ended(self):

@@ -186,7 +186,7 @@ def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeyp
     tasks = []
     for name in (backend, "numpy"):
         rig = Rig(scenes["both"], survey, name)
-        monkeypatch.setattr(cast, "rig_of", lambda handle, rig=rig: rig)
+        monkeypatch.setattr(cast, "rig_of", lambda *_, rig=rig: rig)
         tasks.append(pickle.loads(pickle.dumps(cast.intersect("a run", spans), protocol=5)))
     for mine, other in zip(*tasks, strict=True):
         assert pack(mine.part) == pack(other.part)

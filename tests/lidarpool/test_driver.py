@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections import Counter, deque
+from dataclasses import replace
 from itertools import chain
 from types import SimpleNamespace
 
@@ -12,9 +13,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarpoolError, Sensor, Survey
+from lidarpool import LidarpoolError, Scene, Sensor, Survey
 from lidarpool.base.storage import Storage
-from lidarpool.pipeline import driver, policies
+from lidarpool.pipeline import Crew, RigPlan, driver, policies
 from lidarpool.pipeline.batches import PIECES, Place
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.driver import STALL_S, SurveyDriver
@@ -33,6 +34,7 @@ from poolpart import TaskRecord, Whereabouts
 
 SCANS = 60
 SURVEY = Survey(Sensor.grid(rays_per_revolution=SCANS, layers=1, step_deg=6), [(0, 0, 1)], SCANS)
+PLAN = RigPlan(Scene.seed(), SURVEY, "numpy")
 SUMMARY = summary_type(samples_of_scan(SCANS))
 GONE = "tcp://gone:1"
 
@@ -43,12 +45,12 @@ class Workers:
     notes = futures = pending = ()
 
     def __init__(self):
+        self.jobs = {}  # {job: plan}
         self.slots = {"tcp://a:1": 1, "tcp://b:1": 1}
         self.silent = set()
         self.casts = {}  # {key: (spans, worker, outcome)}
         self.tried = Counter()  # {(first, stop): casting tasks}
         self.most = 0  # batches of a task
-        self.dropped = []
         self.released = False
         self._joined = 0
 
@@ -56,26 +58,33 @@ class Workers:
     def slot_count(self):
         return max(1, sum(self.slots.values()))
 
-    def look(self):
+    @property
+    def seen(self):
         free = {a: n for a, n in self.slots.items() if a not in self.silent}
         return Whereabouts(frozenset(self.slots), frozenset(self.silent), free)
 
-    def cast(self, spans, worker):
-        assert worker in self.slots
+    def look(self):
+        return self.seen
+
+    def add(self, job, plan):
+        self.jobs[job] = plan
+
+    def remove(self, job):
+        del self.jobs[job]
+
+    def cast(self, job, spans, worker):
+        assert worker in self.slots and job in self.jobs
         self.tried.update(spans)
         self.most = max(self.most, len(spans))
-        key = f"{spans[0][0]}.{sum(self.tried.values())}"
+        key = f"{job}.{spans[0][0]}.{sum(self.tried.values())}"
         self.casts[key] = (spans, worker, Outcome.PENDING)
         return key
 
-    def outcome(self, key):
+    def outcome(self, job, key, worker):
         return self.casts[key][-1]
 
     def forget(self, key):
         self.casts.pop(key, None)
-
-    def drop(self, worker):
-        self.dropped.append(worker)
 
     def words_on_memory(self, worker):
         return ""
@@ -103,8 +112,10 @@ class Stages:
     """Long stages that do something when they are told to."""
 
     run, collector_count, waiting, notes = "0a1b2c3d", 2, False, ()
+    closed = False
 
     def __init__(self, storage, workers):
+        self.described = deque()  # what stage 1 has to do
         self.collectors = {"collect-0": "tcp://a:2", "collect-1": "tcp://c:2"}
         self.orders = {name: deque() for name in self.collectors}  # what collectors have to do
         self.unsorted = []
@@ -117,20 +128,19 @@ class Stages:
         self.wanted = True  # whether scans are taken
         self.changes = StageChanges(started=["generate", "sort", *self.collectors])
         self._storage, self._workers = storage, workers
-        self._sent = self._following = self._generated = self._framed = 0
+        self._following = Counter()  # {job: the scan that the sorter waits for}
 
-    # what the driver asks for
+    # what the crew asks for
 
-    def open(self, probe):
-        self.probe = probe
+    def open(self):
+        pass
 
-    def look(self, progress, generated, framed):
-        self._generated, self._framed = generated, framed
+    def look(self, progress):
         changes, self.changes = self.changes, StageChanges()
         if "generate" in changes.started:
-            self._sent = generated
+            self.described.clear()
         if "sort" in changes.started:
-            self.unsorted, self._following = [], framed
+            self.unsorted, self._following = [], Counter()
         return changes
 
     def wait(self, seconds, keys, *, scans):
@@ -141,7 +151,8 @@ class Stages:
         return messages
 
     def send(self, name, messages):
-        (self.unsorted if name == "sort" else self.orders[name]).extend(messages)
+        known = {"generate": self.described, "sort": self.unsorted}
+        (known[name] if name in known else self.orders[name]).extend(messages)
 
     def advise(self, scans):
         pass
@@ -150,7 +161,7 @@ class Stages:
         return self.held.pop(receipt.name, None)
 
     def close(self):
-        self.ended = True
+        self.closed = self.ended = True
 
     def stop(self, reason):
         self.failure = reason
@@ -161,21 +172,24 @@ class Stages:
     # what they do
 
     def generate(self):
-        if self.wanted and self._sent < SCANS:
-            stop = min(SCANS, self._sent + self.advice)
-            self.inbox.append(ScanRange(self._sent, stop))
-            self._sent = stop
+        """Describe some scans of the first survey that is left."""
+        if self.wanted and self.described:
+            one = self.described.popleft()
+            stop = min(one.scan_count, one.first + self.advice)
+            self.inbox.append(ScanRange(one.first, stop, one.job))
+            if stop < one.scan_count:
+                self.described.appendleft(replace(one, first=stop))
 
     def collect(self, order, held_at=""):
         """Write the parts of an order, or hold them; a task that is not there is reported."""
         there = order.worker in self._workers.slots and order.key in self._workers.casts
         return (
-            [self._part(*span, name, held_at) for span, name in order.parts]
+            [self._part(order.job, *span, name, held_at) for span, name in order.parts]
             if there
-            else [ColumnsLost(order.key)]
+            else [ColumnsLost(order.key, order.job)]
         )
 
-    def _part(self, first, stop, name, held_at):
+    def _part(self, job, first, stop, name, held_at):
         data = f"scans {first} to {stop}".encode()
         if held_at:
             self.held[name] = data
@@ -185,14 +199,16 @@ class Stages:
         summaries["hits"] = range(first, stop)
         record = TaskRecord("intersect", "GPU", "a", ("GPU",), 0.0, self.seconds, stop - first)
         return Receipt(
-            first, stop, name, 1, len(data), 1, (), summaries.tobytes(), record, held_at,
+            first, stop, name, 1, len(data), 1, (), summaries.tobytes(), record, held_at, job,
         )  # fmt: skip
 
     def sort(self):
         """Send on what follows, each part for itself."""
-        while found := [s for s in self.unsorted if self._following in s.scans]:
+        for one in self.unsorted:
+            self._following[one.job] = max(self._following[one.job], one.framed)
+        while found := [s for s in self.unsorted if self._following[s.job] in s.scans]:
             self.inbox.append(found[0])
-            self._following = found[0].stop
+            self._following[found[0].job] = found[0].stop
 
     def die(self, name):
         """Kill the worker of a stage, which is started again; returns what it had to do."""
@@ -207,22 +223,31 @@ class Stages:
 class Run:
     """A driver with what it talks to."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, beside=None, job="0"):
         self.storage = Storage.at(folder / "parts", durable=False)
         self.db = RunDatabase(folder / "run.db", SCANS, durable=False)
-        self.workers = Workers()
-        self.stages = Stages(self.storage, self.workers)
+        self.workers = beside.workers if beside else Workers()
+        self.stages = beside.stages if beside else Stages(self.storage, self.workers)
+        self.crew = beside.crew if beside else Crew(self.workers, self.stages)
         self.frames = []
         self.committed = []
-        self.driver = SurveyDriver(
-            self.workers, self.stages, SURVEY, self.db, self.storage, None,
+        self.driver = self.drive(job)
+        self.all = [*beside.all, self] if beside else [self]
+        if not beside:
+            self.crew.open()
+
+    def drive(self, job="0"):
+        seat = self.crew.seat(job, PLAN, f"{job}/" if job != "0" else "")
+        return SurveyDriver(
+            seat, SURVEY, self.db, self.storage, None,
             self.frames.append, self.committed.extend, SCANS,
         )  # fmt: skip
-        self.driver.start()
 
     def step(self):
-        self.driver.step()
-        self.driver.wait(0.0)
+        self.crew.look(self.driver.progress)
+        for run in self.all:
+            run.driver.step()
+        self.crew.wait(0.0)
 
     def until(self, condition, *, idle=""):
         """Let everybody work, but for those who are idle, until something is so."""
@@ -243,7 +268,10 @@ class Run:
     def end(self):
         """Let everybody work to the end, and check that each scan has come once, in order."""
         self.until(lambda: self.driver.finished)
-        self.driver.finish()
+        self.crew.leave(self.driver.seat)
+        self.crew.close()
+        assert self.crew.ended
+        self.crew.finish()
         assert [frame.scan for frame in self.frames] == list(range(SCANS))
         assert [frame.hits for frame in self.frames] == list(range(SCANS))
         spans = sorted((part.first, part.stop) for part in self.committed)
@@ -251,7 +279,7 @@ class Run:
         for part in self.committed:
             assert self.storage.read(part.name) == f"scans {part.first} to {part.stop}".encode()
         assert not self.driver.batches and not self.workers.casts and self.workers.released
-        assert self.stages.probe[0] not in self.storage.sizes()
+        assert not self.workers.jobs and not self.crew.seats
 
     def at(self, place):
         return self.driver.batches.at(place)
@@ -283,15 +311,12 @@ def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
     run.until(lambda: len(run.committed) >= 4)
     done = [(part.first, part.stop) for part in run.committed]
     framed = len(run.frames)
-    later = SurveyDriver(
-        run.workers, run.stages, SURVEY, run.db, run.storage, None,
-        run.frames.append, run.committed.extend, SCANS,
-    )  # fmt: skip
+    run.crew.leave(run.driver.seat)
     run.workers.tried.clear()
-    run.workers.casts.clear()
     run.stages.__init__(run.storage, run.workers)
-    run.driver = later
-    later.start()
+    run.crew = Crew(run.workers, run.stages)
+    run.crew.open()
+    run.driver = run.drive()
     run.end()
     assert framed > 0 and run.workers.tried.keys().isdisjoint(done)
 
@@ -307,15 +332,13 @@ def test_the_batches_of_a_worker_that_dies_are_offered_to_others(run):
     assert [n for n in run.workers.tried.values() if n > 1] == [2, 2]
 
 
-def test_a_worker_without_its_scene_gets_it_again(run):
+def test_a_batch_whose_worker_has_no_scene_is_offered_again(run):
     run.until(lambda: run.at(Place.CASTING), idle="cast")
     batch = run.at(Place.CASTING)[0]
-    worker = batch.worker
     run.workers.end(batch.key, Outcome.NO_RIG)
-    run.step()
-    assert run.workers.dropped == [worker]
     run.end()
     assert run.workers.tried[batch.first, batch.stop] == 2
+    assert not batch.deaths
 
 
 def test_the_batches_of_a_collector_that_dies_are_collected_by_another_without_a_cast(run):
@@ -342,7 +365,7 @@ def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(
     before = len(run.committed)
     written = run.storage.read(name)
     run.storage.write(name, written)  # as its collector does when it wakes up
-    run.stages.inbox += [*first, *first, ColumnsLost(order.key)]
+    run.stages.inbox += [*first, *first, ColumnsLost(order.key, order.job)]
     run.step()
     assert len(run.committed) == before and run.db.part_of(span[0]).name == name
     run.end()
@@ -356,7 +379,7 @@ def test_what_is_lost_on_its_way_is_cast_again(run, how):
     ((span, _),) = order.parts
     answers = run.stages.collect(order, held_at=GONE)
     run.stages.held.clear()  # the worker has died
-    run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key)]
+    run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key, order.job)]
     run.step()
     assert span[0] not in run.db.parts
     run.end()
@@ -383,7 +406,9 @@ def test_a_sorter_that_dies_gets_again_what_was_not_handed_out(run):
     assert min(s.first for s in run.stages.unsorted) == handed_out
     assert max(s.stop for s in run.stages.unsorted) >= handed_out + 20
     one = bytes(SUMMARY.itemsize)
-    run.stages.inbox += [Summaries(at, at + 1, one) for at in (0, handed_out + 1)]
+    run.stages.inbox += [
+        Summaries(at, at + 1, one, 0, SCANS, "0") for at in (0, handed_out + 1)
+    ]
     run.step()
     assert len(run.frames) == handed_out, "only the next frame is handed out"
     run.end()
@@ -400,7 +425,7 @@ def test_a_sorter_that_says_nothing_gets_all_again(run, clock):
 
 def test_a_generator_that_is_started_again_repeats_nothing(run):
     run.until(lambda: run.driver.generated > 20)
-    run.stages.inbox.append(ScanRange(10, 22))
+    run.stages.inbox.append(ScanRange(10, 22, "0"))
     run.stages.die("generate")
     run.end()
     assert set(run.workers.tried.values()) == {1}
@@ -498,10 +523,10 @@ def test_batches_under_way_are_bounded_whoever_is_slow(run):
 
 def test_a_run_that_is_stopped_leaves_nothing(run):
     run.until(lambda: run.at(Place.CASTING) and run.committed)
-    run.driver.stop("enough")
+    run.crew.stop("enough")
     assert run.stages.failure == "enough" and not run.workers.casts
-    run.driver.finish()
-    assert run.workers.released and run.stages.probe[0] not in run.storage.sizes()
+    run.crew.finish()
+    assert run.workers.released
 
 
 @settings(max_examples=100, deadline=None)
@@ -548,3 +573,15 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
         wake()
         run.end()
     run.db.close()
+
+
+# -- several surveys on one crew -------------------------------------------------------------------
+
+
+@pytest.fixture
+def two(run, tmp_path):
+    """Return two surveys on one crew."""
+    other = Run(tmp_path / "other", beside=run, job="other")
+    run.all = other.all
+    yield run, other
+    other.db.close()

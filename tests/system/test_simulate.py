@@ -157,7 +157,7 @@ def raise_at(scan: int | str | None, scan_of=None):
         (
             "lidarpool.pipeline.stages.pack",
             raise_at(None),
-            r"stage collect-\d failed: scan \d+: FloatingPointError",
+            r"stage collect failed: scan \d+: FloatingPointError",
         ),
         (
             "lidarpool.pipeline.messages.StageStart.trace",

@@ -85,6 +85,10 @@ class Batches:
         """Remove a batch, which must be there."""
         del self._batches[batch.first]
 
+    def postpone(self, batch: Batch) -> None:
+        """Put a batch behind the others."""
+        self._batches[batch.first] = self._batches.pop(batch.first)
+
     def within(self, first: int, stop: int) -> list[Batch]:
         """Batches whose scans are all among these."""
         return [b for b in self._batches.values() if first <= b.first and b.stop <= stop]

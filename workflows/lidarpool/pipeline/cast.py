@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,7 +19,7 @@ from ..simulator.rig import Rig
 from .failures import naming_scans
 from .messages import Span, samples_of_scan, summary_type
 from .names import GPU, INTERSECT
-from .rigs import rig_of
+from .rigs import drop, rig_of
 
 
 @dataclass(frozen=True)
@@ -32,12 +32,16 @@ class CastBatch:
 
 
 def intersect(
-    handle: str, spans: Sequence[Span], plan: bytes | None = None, scene: bytes | None = None
+    handle: str,
+    spans: Sequence[Span],
+    unneeded: Collection[str] = (),
+    plan: bytes | None = None,
+    scene: bytes | None = None,
 ) -> list[CastBatch]:
     """Cast the rays of batches and make their columns; runs on a GPU worker.
 
     `spans` are the first scan and the end of each. `handle` is that of the survey's rig, which is
-    made of `plan` and `scene` if the worker has none.
+    made of `plan` and `scene` if the worker has none; `unneeded` ones are dropped before.
 
     Raises
     ------
@@ -45,9 +49,10 @@ def intersect(
         If the worker has no such rig, and nothing to make it of.
     RigFailed
         If the rig cannot be made.
-    RuntimeError
+    ScanError
         If casting or a column fails, naming the scans.
     """
+    drop(unneeded)
     rig = rig_of(handle, plan, scene)
     return [_cast(rig, handle, first, stop) for first, stop in spans]
 

@@ -6,13 +6,25 @@ from collections import deque
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
+import cloudpickle
+
 from poolpart import TaskRecord, Whereabouts
 
 from ..sensor import Survey
 from .batches import Batch, Batches
+from .failures import sending
 from .long_stages import LongStages, Order, StageChanges
-from .messages import CollectOrder, Description, Message, Receipt, Span
-from .names import GENERATE
+from .messages import (
+    CollectOrder,
+    Description,
+    Failed,
+    Message,
+    Receipt,
+    ScanRange,
+    Span,
+    Summaries,
+)
+from .names import GENERATE, SORT
 from .rigs import RigPlan
 from .workers import CastingWorkers, Outcome
 
@@ -98,8 +110,11 @@ class Seat:
         return changes
 
     def describe(self, survey: Survey, first: int) -> None:
-        """Have stage 1 describe the scans from `first` on."""
-        self._stages.send(GENERATE, [Description(survey, first, self.job)])
+        """Have stage 1 describe the scans from `first` on; JobError if it cannot be sent there."""
+        with sending():
+            packed = cloudpickle.dumps(survey, protocol=5)
+        self._crew.described(self.job, survey.scan_count)
+        self._stages.send(GENERATE, [Description(packed, first, survey.scan_count, self.job)])
 
     def receive(self) -> list[Message]:
         """Messages since the last call."""
@@ -145,6 +160,7 @@ class Crew:
         self._seats: dict[str, Seat] = {}
         self.seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._running: list[str] = []  # stages that were started
+        self._described: dict[str, int] = {}  # {job: scans}, in the order of stage 1, until taken
 
     @property
     def seats(self) -> list[Seat]:
@@ -179,6 +195,13 @@ class Crew:
             self.workers.forget(batch.key)
         self.workers.remove(seat.job)
         self._seats.pop(seat.job, None)
+        # The sorter forgets what it has of a survey that has failed.
+        self.stages.send(SORT, [Summaries(0, 0, b"", framed=1, scan_count=1, job=seat.job)])
+
+    def described(self, job: str, scan_count: int) -> None:
+        """Note that stage 1 was told to describe a survey."""
+        self._described.pop(job, None)
+        self._described[job] = scan_count
 
     def look(self, progress: int) -> None:
         """Take messages, and look after workers and stages; `progress` as of `LongStages.look`.
@@ -186,10 +209,14 @@ class Crew:
         LidarpoolError if a stage has failed, or workers or slots are missing for too long.
         """
         for message in self.stages.receive():
+            if self._is_last_of_stage_1(message):
+                self._described.pop(message.job, None)
             if (seat := self._seats.get(message.job)) is not None:  # else of one that has failed
                 seat.take(message)
         seen = self.workers.look()
         changes = self.stages.look(progress)
+        if GENERATE in changes.started:
+            self._described.clear()  # it is told again
         self._running = [*dict.fromkeys([*self._running, *changes.started])]
         for seat in self.seats:
             seat.seen = seen or seat.seen
@@ -201,8 +228,20 @@ class Crew:
         if self.stages.closed:
             self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
-            wanted = any(seat.wants_scans for seat in self.seats)
-            self.stages.wait(max(seconds, WAIT_S), self.workers.pending, scans=wanted)
+            self.stages.wait(max(seconds, WAIT_S), self.workers.pending, scans=self._wants_scans)
+
+    @property
+    def _wants_scans(self) -> bool:
+        """Whether the next survey of stage 1 wants scans, or is none any more."""
+        # Those of others are behind them in the pipe: a survey gets no more than it has room for.
+        for job in self._described:
+            return job not in self._seats or self._seats[job].wants_scans
+        return False
+
+    def _is_last_of_stage_1(self, message: Message) -> bool:
+        if isinstance(message, ScanRange):
+            return message.stop == self._described.get(message.job)
+        return isinstance(message, Failed)
 
     # -- the end -----------------------------------------------------------------------------
 

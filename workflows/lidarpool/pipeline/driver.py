@@ -32,6 +32,7 @@ from .failures import JobError, storing
 from .messages import (
     CollectOrder,
     ColumnsLost,
+    Failed,
     Frame,
     Receipt,
     ScanRange,
@@ -81,6 +82,7 @@ class SurveyDriver:
         self.offered_again = 0
         self._seconds = seat.seconds  # casting times of batches
         self._condemned: list[str] = []  # why scans cannot be done
+        self._first_deaths: list[Batch] = []  # tried alone, each with a worker that died
         self._hidden: set[str] = set()  # addresses of LIDAR workers that do not see the storage
         self._sorted_at = time.monotonic()  # when the last frames came
         with storing(storage):
@@ -113,7 +115,7 @@ class SurveyDriver:
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
 
-        JobError if a task of stage 2 has failed, naming the scans.
+        JobError if a stage has failed with its scans, naming them, or they kill workers.
         """
         moved = self._receive()
         moved |= self._check_casts()
@@ -134,6 +136,8 @@ class SurveyDriver:
         self._commit([m for m in messages if isinstance(m, Receipt) and self._is_stored(m)])
         for message in messages:
             match message:
+                case Failed():
+                    raise JobError(message.reason)
                 case ScanRange():
                     self._take_scans(message)
                 case Summaries():
@@ -234,6 +238,8 @@ class SurveyDriver:
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
         """Count the death of a worker against its batches, see `policies.verdict`."""
         batch.deaths[stage] += 1
+        if stage == INTERSECT and not self.cast and policies.was_alone(batch, stage):
+            self._blame_scene(batch, worker)
         judged = policies.verdict(batch.deaths[stage], len(batch))
         if judged is Verdict.SPLIT:
             self._forget(batch)
@@ -247,6 +253,23 @@ class SurveyDriver:
                 "that stage"
                 f"{self.seat.words_on_memory(worker)}. Look into the logs of the "
                 f"{partition} workers."
+            )
+
+    def _blame_scene(self, batch: Batch, worker: str) -> None:
+        """Count a death with a batch alone, before any was cast: it may be the scene that kills.
+
+        The next to be tried is another batch. JobError once several have killed.
+        """
+        others = [o for o in self._first_deaths if o.stop <= batch.first or batch.stop <= o.first]
+        self._first_deaths = [*others, batch]
+        self.batches.postpone(batch)
+        if len(self._first_deaths) >= policies.KILLS_MOST:
+            names = ", ".join(one.name for one in self._first_deaths)
+            raise JobError(
+                f"GPU workers die whatever they cast first: {len(self._first_deaths)} died, one "
+                f"after the other, with nothing but {names}"
+                f"{self.seat.words_on_memory(worker)}. The scene may need more memory than they "
+                "have: look into their logs, or try another backend."
             )
 
     # -- stage 4: collecting -----------------------------------------------------------------

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
@@ -20,12 +21,25 @@ class JobError(LidarpoolError):
     """A survey cannot be made; others on the same workers can."""
 
 
+class ScanError(RuntimeError):
+    """Scans cannot be described, cast or packed; the message names them."""
+
+
+@contextmanager
+def sending() -> Iterator[None]:
+    """Turn errors of pickling what a user has defined into a JobError."""
+    try:
+        yield
+    except (pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError) as error:
+        raise JobError(f"The survey cannot be sent to the workers: {error}") from error
+
+
 @contextmanager
 def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     """Prefix the message of any error with the current scans.
 
-    It becomes a RuntimeError, because that can always be sent through Dask; but a WorkerLeft
-    passes, since the scans are not its cause.
+    It becomes a ScanError, because that can always be sent through Dask; but a WorkerLeft passes,
+    since the scans are not its cause.
     """
     try:
         yield
@@ -33,7 +47,7 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
         raise
     except Exception as error:
         span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
-        raise RuntimeError(f"{span}: {type(error).__name__}: {error}") from error
+        raise ScanError(f"{span}: {type(error).__name__}: {error}") from error
 
 
 def storing(storage: Storage) -> AbstractContextManager[None]:

@@ -339,7 +339,8 @@ class LongStages:
 
     def close(self) -> None:
         """Let all stages end: everything is committed."""
-        for pipe in self._inlets:
+        # Stage 1 may still describe a survey that has failed.
+        for pipe in (*self._inlets, self._scans):
             pipe.close()
         self._closed_at = time.monotonic()
 

@@ -15,7 +15,7 @@ from poolpart import TaskRecord
 
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
-from ..sensor import Pose, Survey
+from ..sensor import Pose
 
 Span = tuple[int, int]  # the first scan of a batch, and its end
 
@@ -53,8 +53,9 @@ class StageStart:
 class Description:
     """To stage 1: describe the scans of a survey from `first` on."""
 
-    survey: Survey
+    survey: bytes  # pickled: if a worker cannot unpickle it, others can be described
     first: int
+    scan_count: int
     job: str = ""
 
 
@@ -74,8 +75,8 @@ class Summaries:
     first: int
     stop: int
     data: bytes  # of an array of `summary_type`
-    framed: int = 0  # scans that had been handed out when it was sent, from the first on
-    scan_count: int = 0  # of the survey
+    framed: int  # scans that had been handed out when it was sent, from the first on
+    scan_count: int  # of the survey
     job: str = ""
 
     @property
@@ -119,8 +120,16 @@ class Receipt:
     job: str = ""
 
 
+@dataclass(frozen=True, slots=True)
+class Failed:
+    """From stages 1 and 4: scans of a survey cannot be described, or made a part of."""
+
+    reason: str
+    job: str = ""
+
+
 # To the driver.
-Message = ScanRange | Summaries | ColumnsLost | Receipt
+Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 
 @dataclass(frozen=True)

@@ -78,6 +78,11 @@ def suspect(batch: Batch, stage: str) -> bool:
     return batch.deaths[stage] >= SUSPECT_DEATHS
 
 
+def was_alone(batch: Batch, stage: str) -> bool:
+    """Whether a batch was tried alone when a worker of a stage died with it last."""
+    return batch.deaths[stage] > SUSPECT_DEATHS
+
+
 def offers(
     batches: Sequence[Batch],
     slots: Mapping[str, int],
@@ -92,15 +97,19 @@ def offers(
     a task for itself, or its neighbours would share the blame for the next one. A suspect batch
     gets a worker for itself, and is waited for: the others must not occupy all workers. `slots`
     says how many tasks each worker runs at a time; `beside` are batches of other surveys, which
-    are under way on the same workers.
+    are under way on the same workers. For a suspect among those that wait a worker is left alone.
     """
     under_way = [*batches, *(b for b in beside if b.place is not Place.WAITING)]
     casting = [b for b in under_way if b.place is Place.CASTING]
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
+    waiting = deque(b for b in batches if b.place is Place.WAITING)
+    if not any(suspect(b, INTERSECT) for b in waiting):  # else both would wait for each other
+        for _ in range(sum(b.place is Place.WAITING and suspect(b, INTERSECT) for b in beside)):
+            open_ones = slots.keys() - alone
+            alone |= {min(open_ones, key=lambda a: (load[a], a))} if open_ones else set()
     left = most - sum(b.place in (Place.CAST, Place.COLLECTING) for b in under_way)
     left -= sum(b.worker in slots for b in casting)
-    waiting = deque(b for b in batches if b.place is Place.WAITING)
     backlog = any(b.place is Place.CAST for b in under_way)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
     size = per_task if backlog else min(per_task, -(-len(waiting) // max(1, idle)))
@@ -138,12 +147,14 @@ def handovers(
     Those with which a collector has died come alone. A collector on the host of the columns is
     preferred. A suspect batch is collected while there is no other in stage 4: several collectors
     may share a process. `collectors` has the address of the worker of each; `beside` are batches of
-    other surveys.
+    other surveys, for whose suspects stage 4 is left to empty.
     """
     ready = [b for b in batches if b.place is Place.CAST]
     busy = [b for b in (*batches, *beside) if b.place is Place.COLLECTING]
     if suspects := [b for b in ready if suspect(b, COLLECT)]:
         ready = [] if busy else suspects[:1]
+    elif any(b.place is Place.CAST and suspect(b, COLLECT) for b in beside):
+        return []
     if any(suspect(b, COLLECT) for b in busy):
         return []
     load = Counter(name for _, name in {(b.key, b.collector) for b in busy})

@@ -11,7 +11,8 @@ from __future__ import annotations
 import pickle
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Collection
+from dataclasses import dataclass, fields
 
 import cloudpickle
 from distributed import get_worker
@@ -24,8 +25,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.rig import Rig
 
-UNUSED_S = 600.0  # a rig unused for so long is dropped when another is made
-RIGS, SCENES = 32, 4  # of one run that are kept at most
+UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,8 +52,8 @@ class RigPlan:
     @property
     def still(self) -> tuple[int, ...]:
         """Identity of the scene's still part while it exists: surveys of it share their trees."""
-        scene = self.scene
-        return id(scene.vertices), id(scene.faces), id(scene.instances)
+        still = [field.name for field in fields(self.scene) if field.name != "actors"]
+        return tuple(id(getattr(self.scene, name)) for name in still)
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
@@ -69,6 +69,7 @@ class _Kept:
     """A rig, or a scene with one of its rigs, and when it was asked for."""
 
     rig: Rig
+    scene: str  # handle
     used_at: float
 
 
@@ -83,15 +84,20 @@ def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -
     RigMissing if it is not there, or its scene is not, and nothing to make it of; RigFailed if it
     cannot be made.
     """
-    with _lock:
-        kept = _rigs.get(handle)
-        if kept is None:
-            kept = _rigs[handle] = _Kept(_made(handle, plan, scene), 0.0)
-        kept.used_at = time.monotonic()
-        return kept.rig
+    kept = _rigs.get(handle)
+    if kept is None:
+        with _lock:
+            kept = _rigs.get(handle)
+            if kept is None:
+                kept = _rigs[handle] = _made(handle, plan, scene)
+    now = time.monotonic()
+    kept.used_at = now
+    if (its_scene := _scenes.get(kept.scene)) is not None:
+        its_scene.used_at = now
+    return kept.rig
 
 
-def _made(handle: str, plan: bytes | None, scene: bytes | None) -> Rig:
+def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
@@ -99,15 +105,15 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> Rig:
         found = _scenes.get(name)
         if found is None and scene is None:
             raise RigMissing(f"This worker has no scene {name!r}.")
-        _make_room(handle, name)
+        _drop_unused(name)
         rig = _assembled(found, scene, actors, survey, backend)
     except RigMissing:
         raise
     except Exception as error:
         raise RigFailed(str(error) or type(error).__name__) from error
-    _scenes[name] = _Kept(rig, time.monotonic())
+    _scenes[name] = _Kept(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
-    return rig
+    return _Kept(rig, name, time.monotonic())
 
 
 def _assembled(
@@ -125,24 +131,23 @@ def _assembled(
     return Rig(still.with_actors(actors), survey, backend, threads, own_device())
 
 
-def _make_room(handle: str, scene: str) -> None:
-    """Drop rigs and scenes that nobody has used for long, and the oldest of this run beyond some.
-
-    Rigs of surveys that follow each other are not used again.
-    """
-    run = handle.partition(".")[0]
-    for kept, most, new in ((_rigs, RIGS, handle), (_scenes, SCENES, scene)):
-        now = time.monotonic()
-        ours = sorted((one.used_at, h) for h, one in kept.items() if h.partition(".")[0] == run)
-        oldest = [h for _, h in ours[: max(0, len(ours) + (new not in kept) - most)]]
-        unused = [h for h, one in kept.items() if now - one.used_at > UNUSED_S]
-        for one in {*oldest, *unused} - {new}:
-            kept.pop(one, None)
+def _drop_unused(scene: str) -> None:
+    """Drop rigs and scenes that nobody has used for long, but for a scene."""
+    now = time.monotonic()
+    for kept in (_rigs, _scenes):
+        for handle, one in list(kept.items()):
+            if now - one.used_at > UNUSED_S and handle != scene:
+                kept.pop(handle, None)
 
 
-def drop_rigs(run: str) -> None:
+def drop(handles: Collection[str]) -> None:
+    """Drop rigs and scenes; those that are not there are skipped."""
+    for handle in handles:
+        _rigs.pop(handle, None)
+        _scenes.pop(handle, None)
+
+
+def drop_all(run: str) -> None:
     """Drop the rigs and scenes of a run."""
-    with _lock:
-        for kept in (_rigs, _scenes):
-            for handle in [h for h in kept if h.partition(".")[0] == run]:
-                del kept[handle]
+    # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
+    drop([h for h in (*_rigs, *_scenes) if h.partition(".")[0] == run])

@@ -6,10 +6,11 @@ four LIDAR slots runs all four. A failed pipe ends a stage silently: the driver 
 
 from __future__ import annotations
 
+import pickle
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 from distributed import secede
@@ -28,12 +29,14 @@ from poolpart import (
 
 from ..base.storage import Storage
 from ..columns.parts import pack
+from ..sensor import Survey
 from .cast import CastBatch
-from .failures import naming_scans, storing
+from .failures import ScanError, naming_scans, storing
 from .messages import (
     CollectOrder,
     ColumnsLost,
     Description,
+    Failed,
     Receipt,
     ScanRange,
     StageStart,
@@ -50,7 +53,7 @@ def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 1: describe the scans of surveys, one after the other, the advised number in one item.
 
     From the driver come lists of `Description`. An item is a `ScanRange`: the survey describes the
-    scans equally on every worker.
+    scans equally on every worker. A survey that cannot be described is reported as `Failed`.
     """
     secede()
     recorder = Recorder(GENERATE, LIDAR)
@@ -59,13 +62,19 @@ def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     with suppress(PipeClosed, PipeFailed):
         while True:
             for one in chain.from_iterable(inlet.get_all()):
-                _describe(me, one, outlet)
-                scans += one.survey.scan_count - one.first
+                try:
+                    _describe(me, one, outlet)
+                except ScanError as error:  # others can be described
+                    failed = Failed(f"stage {GENERATE} failed: {error}", one.job)
+                    outlet.put_many([failed], unbounded=True)
+                scans += one.scan_count - one.first
     return recorder.done(scans)
 
 
 def _describe(me: StageStart, one: Description, outlet: Pipe) -> None:
-    survey, sent = one.survey, one.first
+    sent = one.first
+    with naming_scans(sent):
+        survey: Survey = pickle.loads(one.survey)  # noqa: S301 - of the run's own driver
     while sent < survey.scan_count:
         items: list[ScanRange] = []
         until = time.monotonic() + TELL_EVERY_S
@@ -88,39 +97,48 @@ def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """Stage 3: put the summaries of the scans of each survey into scan order.
 
     From the driver come lists of `Summaries`, and to it goes each of them once those before it
-    went, or had been handed out already, as they say.
+    went, or had been handed out already, as they say. A survey is forgotten after its last scan.
     """
     secede()
     recorder = Recorder(SORT, LIDAR)
-    following: dict[str, int] = {}  # {job: the scan that comes next}
-    waiting: dict[str, dict[int, Summaries]] = {}  # {job: {first scan that is wanted: summaries}}
+    orders: dict[str, _Order] = {}  # {job: where its survey is}
     count = 0
     me.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
-            jobs: dict[str, int] = {}  # those with news, and where they were
+            ready = []
             for item in chain.from_iterable(inlet.get_all()):
                 me.trace("get", item.scans)
-                at = max(following.get(item.job, 0), item.framed)
-                following[item.job] = jobs[item.job] = at
-                if item.stop > at:
-                    waiting.setdefault(item.job, {})[max(item.first, at)] = item
-            ready = []
-            for job in jobs:
-                while (item := waiting.get(job, {}).pop(following[job], None)) is not None:
-                    ready.append(item)
-                    following[job] = item.stop
-                    if item.stop == item.scan_count:  # nothing follows
-                        waiting.pop(job)
+                order = orders.setdefault(item.job, _Order())
+                ready += order.take(item)
+                if order.following >= item.scan_count:
+                    del orders[item.job]
             if ready:
                 scans = [*chain.from_iterable(item.scans for item in ready)]
                 me.trace("put", scans)
                 outlet.put_many(ready, unbounded=True)
                 me.trace("sent", scans)
                 count += len(scans)
-            for job in [job for job in jobs if job not in waiting]:
-                del following[job]
     return recorder.done(count)
+
+
+@dataclass(eq=False)
+class _Order:
+    """Where the sorter is in a survey."""
+
+    following: int = 0  # the scan that comes next
+    waiting: dict[int, Summaries] = field(default_factory=dict)  # {first scan: summaries}
+
+    def take(self, item: Summaries) -> list[Summaries]:
+        """Take summaries; returns those that can go on now."""
+        self.following = max(self.following, item.framed)
+        if item.stop > self.following:
+            self.waiting[max(item.first, self.following)] = item
+        ready = []
+        while (found := self.waiting.pop(self.following, None)) is not None:
+            ready.append(found)
+            self.following = found.stop
+        return ready
 
 
 @telling_departure()
@@ -131,7 +149,7 @@ def collect(
 
     `probe` is a file in the storage, name and content: a worker that does not see it holds its
     parts in memory, and the driver fetches them. From the driver come lists of `CollectOrder`, to
-    it go `Receipt` and `ColumnsLost`.
+    it go `Receipt`, `ColumnsLost` and `Failed`.
     """
     secede()
     recorder = Recorder(COLLECT, LIDAR)
@@ -140,7 +158,7 @@ def collect(
         me.trace("start")
         there = storage if storage.sees(*probe) else None
         while True:
-            answers: list[Receipt | ColumnsLost] = []
+            answers: list[Receipt | ColumnsLost | Failed] = []
             told = time.monotonic()
             orders = [*chain.from_iterable(inlet.get_all())]
             for answer in chain.from_iterable(_collected(me, there, o) for o in orders):
@@ -154,7 +172,7 @@ def collect(
     return recorder.done(scans)
 
 
-def _send(me: StageStart, outlet: Pipe, answers: Sequence[Receipt | ColumnsLost]) -> int:
+def _send(me: StageStart, outlet: Pipe, answers: Sequence[Receipt | ColumnsLost | Failed]) -> int:
     """Send messages to the driver; returns how many scans are stored."""
     outlet.put_many(answers, unbounded=True)  # the driver limits its orders
     stored = [range(a.first, a.stop) for a in answers if isinstance(a, Receipt)]
@@ -165,7 +183,7 @@ def _send(me: StageStart, outlet: Pipe, answers: Sequence[Receipt | ColumnsLost]
 
 def _collected(
     me: StageStart, storage: Storage | None, order: CollectOrder
-) -> Iterator[Receipt | ColumnsLost]:
+) -> Iterator[Receipt | ColumnsLost | Failed]:
     """Make the parts of a casting task; gives the messages to the driver."""
     found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
     if order.key not in found:
@@ -174,7 +192,10 @@ def _collected(
     batches: dict[int, CastBatch] = {batch.part.first: batch for batch in found[order.key]}
     for (first, stop), name in order.parts:
         me.trace("get", range(first, stop))
-        yield replace(_stored(me, storage, batches[first], stop, name), job=order.job)
+        try:
+            yield replace(_stored(me, storage, batches[first], stop, name), job=order.job)
+        except ScanError as error:
+            yield Failed(f"stage {COLLECT} failed: {error}", order.job)
 
 
 def _stored(

@@ -22,17 +22,19 @@ from .failures import (
     raise_if_failed,
     rig_has_failed,
     rig_is_missing,
+    sending,
     was_killed,
     words_on_memory,
 )
 from .messages import Span
 from .names import INTERSECT
-from .rigs import SCENES, RigPlan, drop_rigs
+from .rigs import RigPlan, drop_all
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
 ANSWER_S = 1.0  # longest wait for a checked worker's answer without a sign of life
 RELEASE_S = 3.0  # for workers to drop their rigs
+SPARE_SCENES = 2  # of which no survey is under way, kept for the next one
 INLINE_BYTES = 1 << 17  # larger things are sent to a worker once, and fetched from there by others
 CHECKING, PREPARING = "checking the GPU workers", "preparing the scene on the GPU workers"
 
@@ -85,8 +87,9 @@ class CastingWorkers:
         self._client, self._partition, self.run = client, partition, run
         self.backend, self._software = backend, dict(software)
         self._surveys: dict[str, _Survey] = {}  # by job
-        # Those that surveys had last; their plans keep what they are known by.
+        # Of surveys, and those used last; their plans keep what they are known by.
         self._scenes: dict[tuple[int, ...], tuple[RigPlan, _Packed]] = {}
+        self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
         self._setups: dict[str, Future] = {}  # {address: task that checks the worker}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = self._offered = 0
@@ -105,10 +108,14 @@ class CastingWorkers:
     @property
     def futures(self) -> list[Future]:
         """All tasks."""
-        rigs = (one.rig.data for one in self._surveys.values())
-        scenes = (scene.data for _, scene in self._scenes.values())
-        brought = [data for data in (*rigs, *scenes) if isinstance(data, Future)]
+        brought = [one.data for one in self._packed_things if isinstance(one.data, Future)]
         return [*self._casts.values(), *self._setups.values(), *brought]
+
+    @property
+    def _packed_things(self) -> list[_Packed]:
+        """What tasks bring."""
+        rigs = [one.rig for one in self._surveys.values()]
+        return [*rigs, *(scene for _, scene in self._scenes.values())]
 
     @property
     def pending(self) -> list[str]:
@@ -119,19 +126,28 @@ class CastingWorkers:
     # -- surveys ---------------------------------------------------------------------------
 
     def add(self, job: str, plan: RigPlan) -> None:
-        """Let a survey be cast."""
+        """Let a survey be cast; JobError if it cannot be sent to workers."""
         _, scene = self._scenes.pop(plan.still, (plan, None))
-        if scene is None:
-            scene = self._packed("scene", plan.packed_scene())
+        with sending():
+            if scene is None:
+                scene = self._packed("scene", plan.packed_scene())
+            rig = self._packed(job, plan.packed(scene.name))
         self._scenes[plan.still] = (plan, scene)  # the last used
-        while len(self._scenes) > SCENES:
-            del self._scenes[next(iter(self._scenes))]
-        rig = self._packed(job, plan.packed(scene.name))
         self._surveys[job] = _Survey(plan, rig, scene)
 
     def remove(self, job: str) -> None:
-        """Cast nothing more of a survey; its tasks must have been forgotten."""
-        self._surveys.pop(job, None)
+        """Cast nothing more of a survey; its tasks must have been forgotten.
+
+        With the next task of another, the workers drop its rig, and scenes that were not used last.
+        """
+        if (left := self._surveys.pop(job, None)) is None:
+            return
+        used = [one.scene for one in self._surveys.values()]
+        spare = [key for key, (_, scene) in self._scenes.items() if scene not in used]
+        old = [self._scenes.pop(key)[1] for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
+        for address in self.slots:
+            names = self._unneeded.setdefault(address, [])
+            names += [packed.name for packed in (left.rig, *old)]
 
     def _packed(self, what: str, data: bytes) -> _Packed:
         self._count += 1
@@ -154,8 +170,9 @@ class CastingWorkers:
         brought = [
             None if worker in packed.there else packed.data for packed in (one.rig, one.scene)
         ]
+        unneeded = self._unneeded.pop(worker, [])
         self._casts[key] = self._partition.submit(
-            intersect, one.rig.name, spans, *brought, key=key, workers=worker
+            intersect, one.rig.name, spans, unneeded, *brought, key=key, workers=worker
         )
         return key
 
@@ -172,9 +189,12 @@ class CastingWorkers:
             return Outcome.NO_RIG
         if future.status == "error" and was_killed(future):
             return Outcome.KILLED
+        what = PREPARING if rig_has_failed(future) else f"stage {INTERSECT}"
         try:  # the error names the scans
-            raise_if_failed(future, PREPARING if rig_has_failed(future) else f"stage {INTERSECT}")
+            raise_if_failed(future, what)
         except LidarpoolError as error:
+            if future.status != "error":  # cancelled, and so are those of the others
+                raise
             raise JobError(str(error)) from error.__cause__
         return Outcome.PENDING
 
@@ -222,8 +242,9 @@ class CastingWorkers:
         for one in self._surveys.values():
             if _is_gone(one.rig.data):
                 one.rig.data = self._shared(one.rig.name, one.plan.packed(one.scene.name))
-            if _is_gone(one.scene.data):
-                one.scene.data = self._shared(one.scene.name, one.plan.packed_scene())
+        for plan, scene in self._scenes.values():
+            if _is_gone(scene.data):
+                scene.data = self._shared(scene.name, plan.packed_scene())
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
@@ -233,7 +254,7 @@ class CastingWorkers:
             # Dask tries for half a minute to reach a worker that is ending.
             with suppress(TimeoutError):
                 self._client.run(
-                    drop_rigs,
+                    drop_all,
                     self.run,
                     workers=addresses,
                     on_error="ignore",
@@ -274,9 +295,9 @@ class CastingWorkers:
         """Remove a worker that has gone."""
         future = self._setups.pop(address)
         self._refused.pop(address, None)
-        for one in self._surveys.values():
-            one.rig.there.discard(address)
-            one.scene.there.discard(address)
+        self._unneeded.pop(address, None)
+        for packed in self._packed_things:
+            packed.there.discard(address)
         if self.slots.pop(address, None) is not None:
             return
         place = self.seen.tasks.get(future.key)
