@@ -64,7 +64,11 @@ WRONG = {
         (print, "4", "count is '4'; it must be a whole number"),
     ],
     Campaign.load: [(3, "path is 3"), (["a.yaml"], "text or a path"), ("a.yaml", "not exist")],
-    Campaign.of_scenarios: [("a.yaml", "a list of text or a path"), (3, "paths is 3"), ([], "name one")],
+    Campaign.of_scenarios: [
+        ("a.yaml", "paths is 'a.yaml'; it must be a list of text or a path"),
+        (3, "paths is 3"),
+        ([], "name one"),
+    ],
     CampaignJob: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
         (Scene.seed(), GRID, "survey is a Sensor"),
