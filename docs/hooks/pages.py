@@ -14,7 +14,13 @@ from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
 
 # MkDocs puts this folder on the path while it loads hooks.
-from reference_pages import columns_page, command_page, members_page, scenario_page
+from reference_pages import (
+    campaign_page,
+    columns_page,
+    command_page,
+    members_page,
+    scenario_page,
+)
 
 ROOT = Path(__file__).parents[2]
 
@@ -43,6 +49,7 @@ def on_files(files: Files, config: Any) -> Files:
     }
     pages["reference/command.md"] = command_page()
     pages["reference/scenario.md"] = scenario_page()
+    pages["reference/campaign.md"] = campaign_page()
     pages["reference/columns.md"] = columns_page()
     for package in ("lidarpool", "poolpart", "raybeam"):
         pages[f"reference/{package}.md"] = members_page(package)

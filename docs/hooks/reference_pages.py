@@ -16,7 +16,7 @@ from pydantic.warnings import UnsupportedFieldAttributeWarning
 from lidarpool.cli.commands import cli
 from lidarpool.columns.ply_format import held_type
 from lidarpool.columns.table import ALWAYS, AXES, OPTIONAL, SCAN, Column
-from lidarpool.scenario.schema import scenario_schema
+from lidarpool.scenario.schema import campaign_schema, scenario_schema
 
 # Sections in the order of a scenario file, and what stands in the sections of another.
 _SECTIONS = {
@@ -46,6 +46,13 @@ _SECTIONS = {
     "planning": "PlanningSection",
     "planning: obstacles": "Obstacle",
     "pool": "PoolSection",
+}
+
+_OF_CAMPAIGNS = {
+    "vary": "Choice",
+    "vary: normal": "Normal",
+    "vary: sample": "Sample",
+    "keep": "KeepSection",
 }
 
 # What a reader of a package looks for first; the rest follows by the alphabet.
@@ -109,24 +116,38 @@ def _commands(command: click.Command, path: str) -> Iterator[tuple[str, click.Co
 def scenario_page() -> str:
     """Tables of the fields of a scenario file, from its JSON Schema."""
     schema = scenario_schema()
-    parts = [
+    head = (
         "# Scenario files\n\n"
         f"{schema['description']} All of it may be left out: an empty file is the default survey. "
         "Fields that are not in these tables are refused. `lidarpool init` writes a file with all "
-        "of them, and `lidarpool schema` prints this as JSON Schema.\n",
-        "## The file\n",
-        _table(schema["properties"]),
-    ]
-    for heading, name in _SECTIONS.items():
+        "of them, and `lidarpool schema` prints this as JSON Schema.\n"
+    )
+    return _schema_page(head, schema, _SECTIONS)
+
+
+def campaign_page() -> str:
+    """Tables of the fields of a campaign file, from its JSON Schema."""
+    schema = campaign_schema()
+    head = (
+        f"# Campaign files\n\n{schema['description']}\n\nHow to write one: "
+        "[Campaigns](../how-to/campaign.md). `lidarpool schema --campaign` prints this as JSON "
+        "Schema.\n"
+    )
+    return _schema_page(head, schema, _OF_CAMPAIGNS)
+
+
+def _schema_page(head: str, schema: dict[str, Any], sections: dict[str, str]) -> str:
+    parts = [head, "## The file\n", _table(schema["properties"], schema.get("required", []))]
+    for heading, name in sections.items():
         section = schema["$defs"][name]
         # Of a section with short forms, the one with fields.
         fields = next(c for c in section.get("anyOf", [section]) if "properties" in c)
         required = fields.get("required", [])
         words = f"{section['description']}\n".replace("`Sensor`", "[Sensor][lidarpool.Sensor]")
         parts += [f"## `{heading}`\n", words, _table(fields["properties"], required)]
-    missing = set(schema["$defs"]) - set(_SECTIONS.values())
+    missing = set(schema["$defs"]) - set(sections.values())
     if missing:
-        raise ValueError(f"sections of a scenario that its page does not show: {missing}")
+        raise ValueError(f"sections that the page of their file does not show: {missing}")
     return "\n".join(parts)
 
 
@@ -174,7 +195,7 @@ def _table(fields: dict[str, Any], required: tuple[str, ...] | list[str] = ()) -
 
 def _default(content: dict[str, Any]) -> str:
     value = content.get("default")
-    return "" if value is None else f"`{value}`"
+    return "" if value is None or value == "" else f"`{value}`"
 
 
 def _kinds(content: dict[str, Any]) -> str:
@@ -190,16 +211,22 @@ def _kinds(content: dict[str, Any]) -> str:
         return f"`{content['const']}`"
     if "$ref" in content:
         return _section(content["$ref"].rpartition("/")[2])
+    if "type" not in content:
+        return "anything"
     kind = content["type"]
     if kind == "array":
         return _list(content)
+    if kind == "object":
+        inner = content.get("additionalProperties")
+        return f"mapping: {_kinds(inner)}" if isinstance(inner, dict) else "mapping"
     words = {"integer": "whole number", "string": "text", "boolean": "true or false"}
     return words.get(kind, kind) + _limits(content)
 
 
 def _section(name: str) -> str:
     """Link to the table of a section of this page, by its name in the schema."""
-    heading = next(heading for heading, section in _SECTIONS.items() if section == name)
+    both = _SECTIONS | _OF_CAMPAIGNS
+    heading = next(heading for heading, section in both.items() if section == name)
     return f"[{heading}](#{heading.replace(': ', '-')})"
 
 
@@ -207,7 +234,7 @@ def _list(content: dict[str, Any]) -> str:
     prefix = content.get("prefixItems")
     if prefix:
         return f"list of {len(prefix)}: {_kinds(prefix[0])}"
-    return f"list: {_kinds(content['items'])}"
+    return f"list: {_kinds(content['items'])}" if content["items"] else "list"
 
 
 def _limits(content: dict[str, Any]) -> str:

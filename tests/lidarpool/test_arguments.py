@@ -38,6 +38,7 @@ from lidarpool import (
     read_cloud,
     remove_run,
     simulate,
+    sweeps,
 )
 
 POINTS, FACES, OWNERS = np.eye(3), np.array([[0, 1, 2]]), np.zeros(1, int)
@@ -180,6 +181,7 @@ WRONG = {
         (Scene.seed(), GRID, "survey is a Sensor; it must be a Survey, such as"),
         (Scene.seed(), Survey(poses=AT), (25, 25), "Planning(("),
     ],
+    sweeps: [(3, "place is 3"), (None, "text or a path"), ("nowhere", "no data set of lidarpool")],
 }  # fmt: skip
 
 
@@ -211,7 +213,16 @@ def test_options_of_a_survey_are_checked_too():
 
 def test_nothing_public_is_left_out():
     """But for what only runs make, or a reader of files."""
-    made = {"Frame", "Plan", "Result", "Robot", "ScanSpec", "LidarpoolError", "__version__"}
+    made = {
+        "Frame",
+        "Plan",
+        "Result",
+        "Robot",
+        "ScanSpec",
+        "LidarpoolError",
+        "Sweep",
+        "__version__",
+    }
     public = {getattr(lidarpool, name) for name in {*lidarpool.__all__} - made}
     assert public <= {*WRONG}
     assert all(len(calls) >= 3 for calls in WRONG.values())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import pickle
 import subprocess
 import sys
 from collections import Counter
@@ -574,6 +575,8 @@ def test_which_files_are_campaigns(folder):
 
 def test_a_campaign_goes_to_another_process(campaign, folder):
     vary = {"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}}
+    sent = pickle.loads(pickle.dumps(campaign(vary)))
+    assert sent.describe(3).scenario.actors == campaign(vary).describe(3).scenario.actors
     here = [sorted(job.values.items()) for job in map(campaign(vary).describe, range(5))]
     code = (
         "import sys; from lidarpool import Campaign; c = Campaign.load(sys.argv[1]);"

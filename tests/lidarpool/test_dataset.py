@@ -7,6 +7,7 @@ import multiprocessing
 import pickle
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -15,65 +16,30 @@ import pyarrow.parquet
 import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
+from tests.lidarpool.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
-from lidarpool import Cloud, LidarpoolError, Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud
+from lidarpool import Cloud, LidarpoolError, Scene, read_cloud
 from lidarpool.base.storage import Storage
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.dataset import FORMATS, INDEX_FILE, DataSet
+from lidarpool.export.dataset import DATA_SETS, INDEX_FILE, DataSet
 from lidarpool.export.formats import Format
 from lidarpool.export.jobs import JobRow
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.actors import Actor, box
-
-TURNS, SCANS = 3, 36  # of a sensor, of a turn
-KEPT = ("intensity", "class", "time")
 
 
 @pytest.fixture(scope="module")
 def scene() -> Scene:
-    track = Track([0, 2], [[5, 5, 0], [9, 5, 0]])
-    gone = Track([0.1, 2], [[0, 5, 0], [0, 9, 0]])
-    cars = Actor(box("Car 1", (4, 2, 1.5)), track), Actor(box("Van 1", (5, 2, 2.5)), gone)
-    return replace(Scene.seed(), actors=cars)
+    return the_scene()
 
 
 @pytest.fixture(scope="module")
-def survey() -> Survey:
-    """Two sensors, three turns each, on a carrier that moves and turns."""
-    half = np.sqrt(0.5)
-    track = Track([0, 1], [[100, 0, 1], [110, 5, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
-    lidar = Sensor.grid(360, 4)
-    front = Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front")
-    steps = TURNS * SCANS
-    sensors = [front, Mounted(lidar, name="rear/left")]
-    return Survey(sensors=sensors, trajectory=track, steps=steps, columns=KEPT)
+def sweeps(scene) -> Sweeps:
+    return the_sweeps(scene)
 
 
 @pytest.fixture(scope="module")
-def sweeps(survey, scene) -> Sweeps:
-    return Sweeps.of(survey, scene)
-
-
-@pytest.fixture(scope="module")
-def job(survey, scene, sweeps) -> Callable[[int], Cloud]:
-    """Return the points of a job: others for each, none in the second sweep of all."""
-
-    def make(number: int) -> Cloud:
-        rng = np.random.default_rng(number)
-        scan = np.sort(rng.integers(0, survey.scan_count, 900))
-        scan = scan[scan // SCANS != 1]
-        count = len(scan)
-        columns = {
-            "scan": scan,
-            "channel": rng.integers(0, 4, count),
-            "object": rng.integers(0, len(scene.names) + 2, count),
-            "intensity": rng.uniform(0, 1, count).astype(np.float32),
-            "class": rng.integers(0, 30, count),
-            "time": scan * 1000,
-        }
-        return Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
-
-    return make
+def job(scene) -> Callable[[int], Cloud]:
+    return partial(points_of, scene)
 
 
 @pytest.fixture
@@ -189,7 +155,7 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
     assert total == sum((job(number).object >= objects).sum() for number in (0, 1, 7))
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", DATA_SETS)
 def test_the_same_job_has_the_same_bytes_and_can_be_removed(written, job, sweeps, tmp_path, format):  # noqa: A002
     data, place = written(format)
     before = files_of(place)
@@ -215,7 +181,7 @@ def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
         data.write_job(3, "003", cloud, sweeps)
 
 
-@pytest.mark.parametrize("format", FORMATS)
+@pytest.mark.parametrize("format", DATA_SETS)
 def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # noqa: A002
     data = DataSet(Storage.at(tmp_path / "both"), format)
     context = multiprocessing.get_context("spawn")
@@ -243,7 +209,7 @@ def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeyp
 
 
 def test_boxes_are_kept_as_the_formats_have_them(written, job, sweeps):
-    for format in FORMATS:  # noqa: A001
+    for format in DATA_SETS:  # noqa: A001
         _, place = written(format, (4,))
         name = "jobs/004/boxes.npz" if format == "folder" else "boxes/004.npz"
         with np.load(place / name) as kept:

@@ -1,7 +1,6 @@
 """The table of a data set's jobs: what was varied and what came of it, with types kept."""
 
 import dataclasses
-import doctest
 import hashlib
 import tracemalloc
 from itertools import pairwise
@@ -14,7 +13,6 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, LidarpoolError
 from lidarpool.base.storage import Storage
-from lidarpool.export import jobs
 from lidarpool.export.jobs import JobRow, Tally, read_table, write_table
 
 DONE = JobRow(
@@ -196,7 +194,3 @@ def test_points_of_other_columns_are_refused():
     tally = Tally.of(cloud_of(5))
     with pytest.raises(LidarpoolError, match="give all the same"):
         tally.add(Cloud(np.zeros((1, 3)), {}))
-
-
-def test_example():
-    assert doctest.testmod(jobs, extraglobs={"np": np}) == (0, 6)

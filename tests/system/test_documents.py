@@ -34,6 +34,7 @@ from distributed.cli import dask_scheduler, dask_worker
 import lidarpool.api.simulation
 from lidarpool import Cloud
 from lidarpool.cli.commands import cli
+from lidarpool.scenario.choices import CampaignSection
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.models import SensorModel
 
@@ -213,6 +214,8 @@ def test_yaml_is_what_it_is_for(block):
             dask.config.get(re.sub(r"(?<=\.pre-spawn-environ)\..*", "", key))
     elif "cluster" in data:
         assert (ROOT / block.title).read_text("utf-8").endswith(f"\n{block.code}")
+    elif data.keys() & {"base", "vary"}:
+        CampaignSection.model_validate({"base": "base.yaml"} | data)
     elif "beams" in data:
         SensorModel.model_validate(data)
     else:

@@ -11,14 +11,18 @@ from hashlib import sha256
 from typing import Any
 
 import fsspec
+import numpy as np
 import pytest
 from fsspec.registry import _registry
+from tests.lidarpool.drives import the_scene, the_sweeps, write_set
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_resume import DRIVERS, SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
+import lidarpool as package
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, unpack
+from lidarpool.export.dataset import DATA_SETS
 from lidarpool.run.store import RunStore
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
@@ -153,6 +157,36 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     assert f"Writing {url}/nuscenes failed: the worker" in failed.err
     assert "Access Denied" in failed.err and "--resume" in failed.err
     assert not Storage.at(url).has("nuscenes") and not Storage.at(url).has("report.json")
+
+
+@pytest.mark.parametrize("format", DATA_SETS)
+def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, format):  # noqa: A002
+    scene, url, here = the_scene(), f"{BUCKET}/sets/{format}", tmp_path / "here"
+    sweeps = the_sweeps(scene)
+    data = write_set(url, format, scene, sweeps)
+    write_set(here, format, scene, sweeps)
+    system, folder = fsspec.url_to_fs(url)
+
+    def files() -> dict[str, bytes]:
+        system.invalidate_cache()
+        names = system.find(folder)
+        return {name.removeprefix(f"{folder}/"): system.cat(name) for name in names}
+
+    made = [path for path in here.rglob("*") if path.is_file()]
+    kept = {str(path.relative_to(here)): path.read_bytes() for path in made}
+    assert files() == kept
+    there, local = (package.sweeps(place, shuffle=1) for place in (url, here))
+    for one, two in zip(there, local, strict=True):
+        np.testing.assert_array_equal(one.points, two.points)
+        assert (one.job, one.number, one.boxes.names) == (two.job, two.number, two.boxes.names)
+    data.remove_job(0, "00")
+    data.remove_job(0, "00")
+    left = files()
+    assert not [name for name in left if name.endswith(("/00.npz", "/00.json", "/00.mcap"))]
+    assert 0 < len(left) < len(kept)
+    system.rm(f"{folder}/dataset.json")
+    with pytest.raises(package.LidarpoolError, match="is an unfinished data set"):
+        package.sweeps(url)
 
 
 @pytest.mark.parametrize(

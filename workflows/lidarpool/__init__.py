@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .base.errors import LidarpoolError
     from .columns.cloud import Cloud
     from .columns.table import Column
+    from .export.loader import Sweep, sweeps
     from .export.ply import read_cloud
     from .pipeline import Frame
     from .plan import Plan, Planning
@@ -69,6 +70,7 @@ __all__ = [
     "Sensor",
     "Spin",
     "Survey",
+    "Sweep",
     "Track",
     "__version__",
     "load_robot",
@@ -77,6 +79,7 @@ __all__ = [
     "read_cloud",
     "remove_run",
     "simulate",
+    "sweeps",
 ]
 
 # Where the names above are. They are imported when they are asked for, which takes a second:
@@ -88,6 +91,7 @@ _MODULES = {
     "base.errors": ("LidarpoolError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
+    "export.loader": ("Sweep", "sweeps"),
     "export.ply": ("read_cloud",),
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),

@@ -10,6 +10,7 @@ import dataclasses
 import hashlib
 import reprlib
 import types
+import weakref
 from collections.abc import Mapping, Set
 from datetime import datetime
 from fractions import Fraction
@@ -57,6 +58,24 @@ def fingerprint(*things: Any) -> str:
     return digest.hexdigest()
 
 
+# {id of a read-only array: (it, its hash)}: jobs of a campaign share large scenes.
+_kept: dict[int, tuple[weakref.ref[Any], bytes]] = {}
+_KEPT_BYTES = 1 << 16  # smaller arrays are hashed each time
+
+
+def _content(array: np.ndarray[Any, Any]) -> bytes:
+    """Hash of the values of an array."""
+    known = _kept.get(id(array))
+    if known is not None and known[0]() is array:
+        return known[1]
+    data = np.ascontiguousarray(array).view(np.uint8).data
+    found = hashlib.sha256(data).digest()
+    if array.nbytes >= _KEPT_BYTES and not array.flags.writeable:  # as those of a Scene
+        key = id(array)
+        _kept[key] = weakref.ref(array, lambda _: _kept.pop(key, None)), found
+    return found
+
+
 class _Digest:
     """Hash of the things added."""
 
@@ -95,7 +114,7 @@ class _Digest:
             if thing.dtype.hasobject:
                 raise _refusal(thing)
             self._mark("array", thing.dtype.str, thing.shape)
-            self._hash.update(np.ascontiguousarray(thing).view(np.uint8).data)
+            self._hash.update(_content(thing))
         elif isinstance(thing, (list, tuple)):
             self._mark("sequence", len(thing), *getattr(thing, "_fields", ()))
             for item in thing:

@@ -67,8 +67,6 @@ def check(
     from .run_command import formats_of
     from .terminal import shown_status
 
-    file = None if cluster is None else ClusterFile.load(cluster)
-
     def look(read: Scenario, plans: bool) -> tuple[Job, dict[str, Any]]:
         with shown_status("reading the scene", as_json, logged=False):
             job = make_job(read, backend, not plans)
@@ -80,18 +78,21 @@ def check(
         return job, found
 
     try:
-        described, campaign = None, Campaign.load(scenario) if is_campaign(scenario) else None
-        if campaign is None and number is not None:
-            raise LidarpoolError(f"{scenario} is no campaign, and has no job {number}.")
-        if campaign is not None and number is None:
+        file = None if cluster is None else ClusterFile.load(cluster)
+        if not is_campaign(scenario):
+            if number is not None:
+                raise LidarpoolError(f"{scenario} is no campaign, and has no job {number}.")
+            job, found = look(Scenario.load(scenario), not no_plan)
+            lines = told(job, found)
+        elif number is None:
+            campaign = Campaign.load(scenario)
             found = _look_at_jobs(campaign, look)
             lines = _of_campaign(campaign, found)
         else:
-            described = None if campaign is None else campaign.describe(number or 0)
-            read = Scenario.load(scenario) if described is None else described.scenario
-            assert read is not None, "of a file"
-            job, found = look(read, not no_plan and described is None)
-            found |= {} if described is None else {"job": _figures(described, found)}
+            described = Campaign.load(scenario).describe(number)
+            assert described.scenario is not None, "of a file"
+            job, found = look(described.scenario, False)
+            found["job"] = _figures(described, found)
             lines = told(job, found)
     except LidarpoolError as error:
         if as_json:

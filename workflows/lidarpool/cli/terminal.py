@@ -71,7 +71,7 @@ class PlainLines:
     def __init__(self, stream: Any) -> None:
         self.stream = stream
         self._next = PLAIN_EVERY_S[0]  # seconds since the start of the next line
-        self._paces = {"survey": Pace(), "planning": Pace()}
+        self._paces = {"survey": Pace(), "planning": Pace(), "campaign": Pace()}
         self._done: set[str] = set()
         self._standing = ""  # the last line about it
 
@@ -81,19 +81,25 @@ class PlainLines:
         if (standing := standing_still(progress)) != self._standing:
             self._standing = standing
             words = standing or "goes on"
-            _tell(self.stream, f"run  {words}, {progress.collected:,} scans are done")
+            done, unit = (progress.collected, "scans")
+            if progress.jobs:
+                done, unit = (progress.jobs_done, "jobs")
+            _tell(self.stream, f"run  {words}, {done:,} {unit} are done")
         due = now >= self._next
         if due:
             least, most = PLAIN_EVERY_S
             self._next = now + min(max(least, now / 10), most)
         stages = ", ".join(
-            f"{label} {getattr(progress, count):,}" for label, count, unit in STAGES[:-1]
+            f"{label} {getattr(progress, count):,}"
+            for label, count, unit in STAGES
+            if unit == "scans"
         )
         scans, done = progress.scans, min(progress.collected, progress.framed)
         whole, trials = f"{scans:,} scans, {progress.points:,} points", progress.trials
         for what, count, total, unit, all_ in (
             ("survey", done, scans, f"scans ({stages})", whole),
             ("planning", progress.trials_done, trials, "trials", f"{trials:,} trials"),
+            ("campaign", progress.jobs_done, progress.jobs, "jobs", f"{progress.jobs:,} jobs"),
         ):
             pace = self._paces[what].told(now, count, total)
             if total and count == total and what not in self._done:

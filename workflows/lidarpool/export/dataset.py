@@ -30,7 +30,7 @@ T = TypeVar("T")
 U = TypeVar("U")
 
 # {format of a data set: format of its jobs}
-FORMATS = {
+DATA_SETS = {
     "kitti": "kitti", "nuscenes": "nuscenes", "mcap": "mcap", "parquet": "parquet", "folder": "ply",
 }  # fmt: skip
 INDEX_FILE = "dataset.json"  # a data set with this file is finished
@@ -82,15 +82,15 @@ class DataSet:
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
 
     def __post_init__(self) -> None:
-        if self.format not in FORMATS:
+        if self.format not in DATA_SETS:
             raise LidarpoolError(
                 f"format is {self.format!r}; that of a data set must be one of "
-                f"{', '.join(FORMATS)}."
+                f"{', '.join(DATA_SETS)}."
             )
 
     @property
     def _of_jobs(self) -> Format:
-        return Format(FORMATS[self.format], self.layout)
+        return Format(DATA_SETS[self.format], self.layout)
 
     @property
     def columns(self) -> tuple[str, ...]:

@@ -25,6 +25,7 @@ from .sweeps import Sweeps, plain_names
 VERSION = "v1.0-lidarpool"
 _SCENE, _LOG = "scene-0001", "survey"
 _DATE = "1980-01-06"  # surveys begin at time 0 of no date
+_DAY_US = 86_400_000_000
 _MAP = "maps/none.png"
 _TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
@@ -42,8 +43,8 @@ class Pieces(pieces.Pieces):
     sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
     sensor's, at each sweep. Actors are annotated in each sample.
 
-    In a data set each job is a scene with its name, its files are in folders of that name in
-    `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables once all jobs are there.
+    In a data set each job is a scene with its name, on a day of its own, its files are in folders
+    of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
 
     Caesar et al., nuScenes, 2020.
     """
@@ -102,7 +103,7 @@ class Reader(reading.Reader):
 
     def read(self, sweep: int) -> reading.Points:
         """Return the points of a sweep."""
-        rows = self.rows(self.file(sweep), np.dtype(("<f4", 5)))
+        rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
         columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
         return np.ascontiguousarray(rows[:, :3]), columns
 
@@ -188,7 +189,9 @@ class _Tables:
             log_token=self._token("log", _LOG), first_sample_token=self._token("sample", 0),
             last_sample_token=self._token("sample", count - 1),
         )  # fmt: skip
-        times = [round(begin / 1000) for begin in sweeps.begins_ns]  # microseconds
+        # The devkit sorts scenes by their time, and fails where two have the same.
+        day = 0 if self._entry is None else self._entry.number
+        times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
         for number, beside in enumerate(self._chain("sample", list(range(count)))):
             scene = self._token("scene", self._scene)
             self._add("sample", number, timestamp=times[number], scene_token=scene, **beside)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import os
+import shutil
 import tempfile
+import weakref
 from pathlib import Path
 from typing import Any
 
@@ -23,7 +26,7 @@ class Reader:
 
     def __init__(self, place: Storage, sweeps: Sweeps, entry: Entry, layout: str) -> None:
         self.place, self.sweeps, self.entry, self.layout = place, sweeps, entry, layout
-        self._copies: tempfile.TemporaryDirectory[str] | None = None
+        self._copies: Path | None = None
 
     def file(self, sweep: int) -> str:
         """Return the name of the file that has the points of a sweep."""
@@ -35,15 +38,17 @@ class Reader:
 
     def close(self) -> None:
         """Close and remove what the reader has opened."""
-        if self._copies:
-            self._copies.cleanup()
+        if self._copies is not None:
+            _remove(self._copies, os.getpid())
 
     def local(self, name: str) -> Path:
         """Return the path of a file: of a copy until `close`, if the place is a URL."""
         if self.place.is_local:
             return Path(self.place.path(name))
-        self._copies = self._copies or tempfile.TemporaryDirectory(prefix="lidarpool-")
-        path = Path(self._copies.name, Path(name).name)
+        if self._copies is None:
+            self._copies = Path(tempfile.mkdtemp(prefix="lidarpool-"))
+            weakref.finalize(self, _remove, self._copies, os.getpid())
+        path = self._copies / Path(name).name
         self.place.get(name, path)
         return path
 
@@ -58,6 +63,12 @@ class Reader:
         """Return points of the cloud's coordinates and all their columns."""
         places = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
         return places, {name: np.array(array) for name, array in cloud.columns.items()}
+
+
+def _remove(folder: Path, process: int) -> None:
+    """Remove a folder, unless this is a fork of the process that made it."""
+    if os.getpid() == process:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def checked_length(found: int, wanted: int, file: str) -> None:

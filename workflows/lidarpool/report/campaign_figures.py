@@ -42,7 +42,7 @@ class CampaignInfo:
     names
         Names of the varied values, in the order of the table's columns.
     sensors
-        {name: model and rate in words}.
+        {name: model and rate in words}; the name is "" where there is only one.
     license
         As given; "" for none.
     versions
@@ -58,7 +58,7 @@ class CampaignInfo:
     classes
         Names of semantic classes, {class: name}, as far as known.
     file
-        Name of the description, as after ``lidarpool run``.
+        Name of the description, as after ``lidarpool run``; "" for a campaign of Python.
     description
         The description as text.
     stages, records

@@ -105,6 +105,7 @@ def draw_varied(figures: Figures) -> Page | None:
     high = COUNTS + GAP + AGAINST + below
     page = Page((WIDTH, TOP + rows * high + (rows - 1) * ABOVE))
     points, failures = figures.each("points"), figures.failures
+    limits = _limits(points[~failures])
     telling = _most_telling(scales, points, ~failures)
     colours = np.tile(theme.rgb(DOT), (len(points), 1))
     if telling is not None:
@@ -119,6 +120,7 @@ def draw_varied(figures: Figures) -> Page | None:
         bars = some if number == telling else theme.rgb(BAR)
         _draw_counts(upper, scale, failures, bars)
         _draw_points(page, lower, scale, points, failures, colours)
+        lower.set_ylim(limits)
         for axes in (upper, lower):
             _set_scale(axes, scale)
         _set_labels(page, lower, scale, wide)
@@ -275,8 +277,19 @@ def _draw_points(
     axes.scatter(
         places[failed], np.zeros(len(failed)), marker="x", s=18 * unit**2, color=theme.SENSOR,
         linewidths=0.9 * unit, clip_on=False, zorder=5, rasterized=len(failed) > 200,
+        transform=axes.get_xaxis_transform(),
     )  # fmt: skip
-    axes.set_ylim(0, 1.06 * max(1.0, float(points[done].max(initial=0))))
+
+
+def _limits(points: Floats) -> tuple[float, float]:
+    """Limits of an axis of points: from 0, unless all jobs have nearly the same."""
+    if not len(points):
+        return 0.0, 1.0
+    low, high = float(points.min()), float(points.max())
+    if low > 0.6 * high:
+        aside = 0.2 * (high - low) or 0.5 * high
+        return low - aside, high + aside
+    return 0.0, 1.06 * max(high, 1.0)
 
 
 def _percentiles(values: Floats) -> tuple[float, float, float]:

@@ -190,7 +190,7 @@ def _card(
         yield from ("", f"The names of a split's jobs are in `{SPLITS}/`.")
     if info.sensors:
         yield from ("", "## Sensors", "")
-        rows = ((_md(name), _md(words)) for name, words in info.sensors.items())
+        rows = ((_md(name) or "–", _md(words)) for name, words in info.sensors.items())
         yield from _table(("sensor", "model"), rows)
     if report["varied"]:
         yield from ("", "## What was varied", "")
@@ -244,7 +244,7 @@ def _reading(info: CampaignInfo, figures: Figures) -> Iterator[str]:
         "",
         f'for sweep in lidarpool.sweeps("."{split}):',
         "    sweep.points  # float32 (n, 3), metres, in the sensor's axes",
-        '    sweep.labels["class"]  # (n,)',
+        "    sweep.classes  # (n,)",
         "    sweep.boxes  # of moving objects",
         "    sweep.values  # what was varied",
         "```",
@@ -255,12 +255,17 @@ def _reading(info: CampaignInfo, figures: Figures) -> Iterator[str]:
         "",
         "## Making a job again",
         "",
-        "```sh",
-        f"lidarpool run {info.file} --job 0 --out job-0",
-        "```",
-        "",
-        f"makes the points of job 0 again, with the SHA-256 in `{TABLE_FILE}`, on any cluster with "
-        f"this software. The seed is {info.seed}; that of all jobs together is "
+    )
+    if info.file:
+        yield from ("```sh", f"lidarpool run {info.file} --job 0 --out job-0", "```", "")
+    else:
+        yield from (
+            "The campaign is a program of Python, which makes each job from its number.",
+            "",
+        )
+    yield from (
+        f"Job 0 has the same points again, with the SHA-256 in `{TABLE_FILE}`, on any cluster "
+        f"with this software. The seed is {info.seed}; the SHA-256 of all jobs together is "
         f"`{figures.sha256}`.",
         "",
     )
@@ -278,7 +283,7 @@ def _table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> Iterator[str]:
 def _md(text: str) -> str:
     """Text of a user as one line of Markdown that shows it as it is."""
     line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
-    return re.sub(r"([\\`*_{}\[\]<>|#&~])", r"\\\1", line)
+    return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
 
 
 def _code(text: str) -> str:

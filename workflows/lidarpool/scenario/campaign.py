@@ -162,7 +162,7 @@ class Campaign:
     def _begin(self, jobs: _Jobs, head: CampaignSection) -> None:
         assert head.count is not None, "known by now"
         self.count, self.seed, self.license = head.count, head.seed, head.license
-        self.title, self.splits = head.title, MappingProxyType(head.splits)
+        self.title, self.splits = head.title, dict(head.splits)
         self.keep = Keep(**declared(head.keep, Keep))
         self._jobs, self._split = jobs, Splits(head.splits, head.seed)
 
@@ -477,19 +477,18 @@ class _Base:
         self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Row]]
     ) -> None:
         self.scenario, self.name, self._folder = Scenario.load(path), path.name, path.parent
-        self._vary, self._noise = vary, find_field(self.scenario, _NOISE)
+        self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
         self._fields: dict[str, FieldPath] = {}
         self.tables: dict[str, list[Row]] = {}
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
             with mistakes.noted(), prefixed("vary"):
-                self._fields[text] = find_field(self.scenario, text)
+                self._fields[text], kind = find_field(self.scenario, text)
             if choice.sample is None or text not in self._fields:
                 continue
             with mistakes.noted(), prefixed(f"vary: {text}"):
                 table = file_of(self._folder, choice.sample.file)
-                kind = self._fields[text].kind
                 if (key := (table, repr(kind))) not in tables:
                     tables[key] = read_rows(table, kind)
                 self.tables[text] = tables[key]

@@ -114,7 +114,7 @@ class Choice(Section):
     """How a value is chosen for each job: one of these."""
 
     uniform: Annotated[
-        Interval | None, told("a number between two, all alike likely", [0.5, 2])
+        Interval | None, told("a number between two, all equally likely", [0.5, 2])
     ] = None
     log_uniform: Annotated[
         Interval | None, told("a number between two above 0, its logarithm uniform", [0.2, 20])

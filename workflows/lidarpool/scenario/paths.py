@@ -25,13 +25,10 @@ class FieldPath:
     steps
         Keys, and numbers of entries, with the value of each in the scenario; of a section that is
         left out there, one of defaults.
-    kind
-        Annotation of the field at the end, for cells of tables.
     """
 
     text: str
     steps: tuple[tuple[str | int, Any], ...]
-    kind: Any = None
 
     @property
     def keys(self) -> tuple[str | int, ...]:
@@ -44,8 +41,8 @@ class FieldPath:
         return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in self.keys)[1:]
 
 
-def find_field(scenario: Scenario, text: str) -> FieldPath:
-    """Find out where a path leads.
+def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
+    """Find out where a path leads, and the annotation of the field there.
 
     Raises
     ------
@@ -76,7 +73,7 @@ def find_field(scenario: Scenario, text: str) -> FieldPath:
             raise LidarpoolError(f"{text} leads to no field: {what}.")
         steps.append((key, node))
         rest = rest[used:]
-    return FieldPath(text, tuple(steps), kind)
+    return FieldPath(text, tuple(steps)), kind
 
 
 def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:

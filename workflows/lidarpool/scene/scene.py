@@ -97,8 +97,9 @@ class Scene:
             )
         arrays = {"vertices": vertices, "faces": faces, "face_object": owners, "origin": origin}
         for name, array in arrays.items():
-            array = array.view()
-            array.flags.writeable = False
+            if array.flags.writeable:  # else it is another scene's, and known by its identity
+                array = array.view()
+                array.flags.writeable = False
             object.__setattr__(self, name, array)
         object.__setattr__(self, "names", tuple(self.names))
         object.__setattr__(self, "actors", tuple(self.actors))

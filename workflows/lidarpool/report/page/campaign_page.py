@@ -51,6 +51,7 @@ def campaign_page(
         bars=bars,
         rest=rest,
         splits={name or "none": counts for name, counts in splits.items()},
+        sensors=[(name or "model", words) for name, words in info.sensors.items()],
         command=info.file,
         most=VALUES_SHOWN,
         stages=ordered,

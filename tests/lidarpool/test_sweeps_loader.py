@@ -1,0 +1,304 @@
+"""Data sets read sweep by sweep: each format gives back what was written."""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import pickle
+import shutil
+import sys
+import threading
+import types
+from collections.abc import Callable
+from itertools import chain, pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tests.lidarpool.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
+
+import lidarpool
+from lidarpool import LidarpoolError, Scene, Sweep
+from lidarpool.export.boxes import Boxes
+from lidarpool.export.dataset import DATA_SETS, INDEX_FILE
+from lidarpool.export.sweeps import Sweeps
+
+JOBS = len(SPLITS)
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return the_scene()
+
+
+@pytest.fixture(scope="module")
+def all_sweeps(scene) -> Sweeps:
+    return the_sweeps(scene)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory, scene, all_sweeps) -> Callable[[str], Path]:
+    """Return data sets by format and layout."""
+    made: dict[str, Path] = {}
+
+    def write(name: str) -> Path:
+        if name not in made:
+            kind, _, layout = name.partition("-")
+            made[name] = tmp_path_factory.mktemp(name)
+            write_set(made[name], kind, scene, all_sweeps, layout or "velodyne")
+        return made[name]
+
+    return write
+
+
+def identity(sweep: Sweep) -> tuple[int, str, int]:
+    return sweep.job_number, sweep.sensor, sweep.number
+
+
+@pytest.mark.parametrize("name", [*DATA_SETS, "mcap-autoware", "mcap-ouster"])
+def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
+    data = lidarpool.sweeps(written(name))
+    assert len(data) == (JOBS - 1) * 2 * TURNS
+    for number in (0, 1, 2, 3, 5, len(data) - 1):
+        sweep = data[number]
+        inside = number % (2 * TURNS)
+        cloud = points_of(scene, sweep.job_number)
+        points = cloud.part(np.flatnonzero(cloud.scan // SCANS == inside))
+        assert sweep.sensor == ("front", "rear/left")[inside // TURNS]
+        assert sweep.number == inside % TURNS and len(sweep) == len(points)
+        assert sweep.time_ns == sweep.number * 100_000_000
+        assert (sweep.job, sweep.values) == (
+            f"{sweep.job_number:02}",
+            {"rain": sweep.job_number / 2},
+        )
+        assert sweep.points.dtype == np.float32 and sweep.points.shape == (len(points), 3)
+        # The pose brings points back to where they are in the world.
+        back = sweep.points.astype(float) @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
+        np.testing.assert_allclose(back, points.positions, atol=2e-5 if name != "folder" else 1e-3)
+        steps = 255 if name == "mcap-autoware" else 1e9
+        np.testing.assert_allclose(sweep.intensity, points.intensity, rtol=1e-6, atol=0.51 / steps)
+        if name in ("kitti", "parquet", "folder"):
+            np.testing.assert_array_equal(sweep.classes, points["class"])
+            np.testing.assert_array_equal(sweep.objects, points.object)
+            assert sweep.classes.dtype == np.uint16 and sweep.objects.dtype == np.int32
+        else:
+            assert sweep.classes is None and sweep.objects is None
+        if name != "kitti":
+            np.testing.assert_array_equal(sweep.columns["channel"], points.channel)
+        assert sweep.object_names == (*scene.names, "Car 1", "Van 1")
+        boxes = Boxes.of(all_sweeps, inside, points)
+        there = np.flatnonzero(boxes.there)
+        assert sweep.boxes.names == tuple(("Car 1", "Van 1")[k] for k in there)
+        assert sweep.boxes.types == tuple(("Car", "Van")[k] for k in there)
+        np.testing.assert_array_equal(sweep.boxes.points, boxes.points[there])
+        np.testing.assert_allclose(sweep.boxes.sizes, boxes.sizes[there])
+        centres = sweep.boxes.centres @ sweep.pose[:3, :3].T + sweep.pose[:3, 3]
+        np.testing.assert_allclose(centres, boxes.centres[there], atol=1e-6)
+        # Cars look along x of the world; their yaw is the sensor's, turned back.
+        heading = np.arctan2(sweep.pose[1, 0], sweep.pose[0, 0])
+        if 0 in there:
+            np.testing.assert_allclose(sweep.boxes.yaw[0], -heading, atol=1e-9)
+    first = data[0]
+    assert repr(first) == f"<Sweep 0 of front in job 00: {len(first)} points>"
+    assert repr(data).startswith(f"<{len(data)} sweeps of")
+    assert identity(data[-1]) == identity(data[len(data) - 1])
+    with pytest.raises(IndexError):
+        data[len(data)]
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_the_order_follows_from_the_seed(written, name):
+    place = written(name)
+    plain = [identity(sweep) for sweep in lidarpool.sweeps(place)]
+    data = lidarpool.sweeps(place, shuffle=4)
+    once, again = ([identity(sweep) for sweep in data] for _ in range(2))
+    assert once == again == [identity(sweep) for sweep in lidarpool.sweeps(place, shuffle=4)]
+    assert once != plain and sorted(once) == sorted(plain)
+    # Sweeps of a job are not beside each other.
+    assert sum(a[0] == b[0] for a, b in pairwise(once)) < len(once) / 2
+    assert once != [identity(sweep) for sweep in lidarpool.sweeps(place, shuffle=5)]
+    copy = pickle.loads(pickle.dumps(data))
+    assert [identity(sweep) for sweep in copy] == once
+
+
+def test_sweeps_are_chosen_by_split_job_and_sensor(written):
+    place = written("kitti")
+    chosen = lidarpool.sweeps(place, split="train")
+    assert {sweep.job_number for sweep in chosen} == {0, 1, 2}  # 3 failed
+    assert {sweep.split for sweep in chosen} == {"train"}
+    two = lidarpool.sweeps(place, split=["val", "test"])
+    assert {sweep.job for sweep in two} == {"04", "05"}
+    some = lidarpool.sweeps(place, jobs=[1, "04"], sensors=["rear/left"], shuffle=1)
+    assert sorted(map(identity, some)) == [
+        (n, "rear/left", k) for n in (1, 4) for k in range(TURNS)
+    ]
+    assert len(lidarpool.sweeps(place, jobs=[])) == 0
+    for options, words in (
+        ({"split": "trian"}, r"no split 'trian'\. Did you mean 'train'"),
+        ({"split": "x"}, r"no split 'x'\. It has train, val, test"),
+        ({"sensors": ["roof"]}, r"no sensor 'roof'\. It has front, rear/left"),
+        ({"jobs": [3]}, r"no job 3 that is done: jobs.csv lists all"),
+        ({"jobs": [4], "split": "train"}, "no job 4 in split 'train'"),
+        ({"jobs": "04"}, "jobs is '04'; it must be a list"),
+        ({"shuffle": True}, "shuffle is True; it must be a whole number or None"),
+        ({"shuffle": -1}, "shuffle is -1; it must be at least 0"),
+        ({"sensors": "front"}, "sensors is 'front'; it must be a list of text"),
+    ):
+        with pytest.raises(LidarpoolError, match=words) as told:
+            lidarpool.sweeps(place, **options)
+        assert "\n" not in str(told.value)
+
+
+def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
+    place = tmp_path / "copy"
+    shutil.copytree(written("kitti"), place)
+
+    def told(what: Callable[[], Any], words: str) -> None:
+        with pytest.raises(LidarpoolError, match=words) as raised:
+            what()
+        assert len(str(raised.value).splitlines()) == 1
+
+    told(lambda: lidarpool.sweeps(tmp_path / "nowhere"), "nowhere is no data set of lidarpool")
+    first = lidarpool.sweeps(place)
+    points = place / "sequences/00/velodyne/000000.bin"
+    whole = points.read_bytes()
+    points.write_bytes(whole[:-3])
+    told(lambda: first[0], r"sequences/00/velodyne/000000\.bin is missing or damaged")
+    points.write_bytes(whole[:-16])
+    told(lambda: first[0], r"000000\.label has \d+ points, not \d+")
+    points.unlink()
+    told(lambda: first[0], r"sequences/00/velodyne/000000\.bin cannot be read: No such file")
+    points.write_bytes(whole)
+    assert len(first[0]) == len(whole) // 16
+    kept = place / "sweeps/01.npz"
+    kept.write_bytes(kept.read_bytes()[:200])
+    told(lambda: lidarpool.sweeps(place, jobs=[1])[0], r"sweeps/01\.npz is damaged")
+    kept.unlink()
+    told(lambda: lidarpool.sweeps(place, jobs=[1])[0], r"sweeps/01\.npz cannot be read")
+    index = place / INDEX_FILE
+    text = index.read_text()
+    for bad in (text[:50], "[]", text.replace('"version": 1', '"version": 9')):
+        index.write_text(bad)
+        told(lambda: lidarpool.sweeps(place), r"dataset\.json is damaged or of another version")
+    index.write_text(json.dumps(json.loads(text)))
+    assert len(lidarpool.sweeps(place)) == len(first)
+    index.unlink()
+    told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
+    monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
+    told(lambda: lidarpool.sweeps(written("parquet")), r'pip install "lidarpool\[parquet\]"')
+    told(lambda: lidarpool.sweeps(written("mcap")), r'pip install "lidarpool\[ros\]"')
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("nuscenes", "samples/front/00/000000.pcd.bin"),
+        ("parquet", "points/job=0/part-00000.parquet"),
+        ("mcap", "bags/00.mcap"),
+        ("folder", "jobs/00/cloud.ply"),
+    ],
+)
+def test_a_damaged_file_is_named(written, tmp_path, name, file):
+    place = tmp_path / "copy"
+    shutil.copytree(written(name), place)
+    data = (place / file).read_bytes()
+    for there in (data[: len(data) // 2 - 3], b"", None):
+        (place / file).write_bytes(there) if there is not None else (place / file).unlink()
+        if name == "nuscenes" and there == b"":
+            continue  # a sweep without points
+        with pytest.raises(
+            LidarpoolError, match=r"damaged|cannot be read|not a point cloud"
+        ) as told:
+            lidarpool.sweeps(place)[0]
+        assert len(str(told.value).splitlines()) == 1 and file.split("/part")[0] in str(told.value)
+
+
+def _read(data: Any, queue: Any) -> None:
+    queue.put([(identity(sweep), float(sweep.points.sum())) for sweep in data])
+
+
+@pytest.mark.parametrize("name", DATA_SETS)
+def test_threads_and_forks_read_beside_each_other(written, name):
+    data = lidarpool.sweeps(written(name), shuffle=2)
+    alone = [(identity(sweep), float(sweep.points.sum())) for sweep in data]
+    context = multiprocessing.get_context("fork")
+    queue = context.Queue()
+    forks = [context.Process(target=_read, args=(data, queue)) for _ in range(2)]
+    threads = [threading.Thread(target=_read, args=(data, queue)) for _ in range(2)]
+    for one in (*forks, *threads):
+        one.start()
+    found = [queue.get(timeout=60) for _ in range(4)]
+    for one in (*forks, *threads):
+        one.join()
+    assert found == [alone] * 4
+
+
+# -- PyTorch ---------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def torch(monkeypatch) -> types.ModuleType:
+    """A module in place of PyTorch, whose tensors are arrays."""
+    played: Any = types.ModuleType("torch")
+    played.__spec__ = types.SimpleNamespace()
+    played.from_numpy = lambda array: array
+    played.utils = types.ModuleType("torch.utils")
+    played.utils.data = types.ModuleType("torch.utils.data")
+    played.utils.data.IterableDataset = object
+    played.utils.data.get_worker_info = lambda: None
+    played.distributed = types.ModuleType("torch.distributed")
+    played.distributed.is_available = played.distributed.is_initialized = lambda: False
+    for module in (played, played.utils, played.utils.data, played.distributed):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.delitem(sys.modules, "lidarpool.export.torch_sweeps", raising=False)
+    yield played
+    sys.modules.pop("lidarpool.export.torch_sweeps", None)
+
+
+def test_torch_gets_tensors(written, torch):
+    data = lidarpool.sweeps(written("kitti"), shuffle=3)
+    items = list(data.torch())
+    assert [item["job"] for item in items] == [sweep.job for sweep in data]
+    item, sweep = items[0], data[0]
+    np.testing.assert_array_equal(item["points"], sweep.points)
+    np.testing.assert_array_equal(item["class"], sweep.classes)
+    assert item["class"].dtype == np.int64 and item["points"].dtype == np.float32
+    assert item["boxes"].shape == (len(sweep.boxes), 7) and item["pose"].shape == (4, 4)
+    assert item["points"].flags.writeable
+    assert list(data.torch(transform=identity)) == [identity(sweep) for sweep in data]
+
+
+@pytest.mark.parametrize(("ranks", "workers"), [(1, 1), (1, 4), (4, 1), (4, 3), (7, 2)])
+@pytest.mark.parametrize("even", [True, False])
+def test_torch_divides_sweeps_between_ranks_and_workers(written, torch, ranks, workers, even):
+    data = lidarpool.sweeps(written("kitti"), shuffle=3)
+    torch.distributed.is_available = torch.distributed.is_initialized = lambda: True
+    torch.distributed.get_world_size = lambda: ranks
+    of_ranks = []
+    for rank in range(ranks):
+        torch.distributed.get_rank = lambda rank=rank: rank
+        whole = data.torch(transform=identity, even=even)
+        sent = pickle.dumps(whole)  # as to workers that are spawned, which have no ranks
+        of_workers = []
+        torch.distributed.is_initialized = lambda: False
+        for worker in range(workers):
+            info = types.SimpleNamespace(id=worker, num_workers=workers)
+            torch.utils.data.get_worker_info = lambda info=info: info
+            of_workers.append(list(pickle.loads(sent)))
+        torch.distributed.is_initialized = lambda: True
+        of_ranks.append(list(chain.from_iterable(of_workers)))
+    found = list(chain.from_iterable(of_ranks))
+    everything = [identity(sweep) for sweep in data]
+    assert len(set(found)) == len(found)
+    if even:
+        assert len({len(one) for one in of_ranks}) == 1
+        assert set(found) == set(everything[: len(everything) - len(everything) % ranks])
+    else:
+        assert sorted(found) == sorted(everything)
+
+
+def test_without_torch(written, monkeypatch):
+    monkeypatch.setattr("lidarpool.export.loader.find_spec", lambda name: None)
+    with pytest.raises(LidarpoolError, match="needs PyTorch: pip install torch"):
+        lidarpool.sweeps(written("kitti")).torch()
