@@ -32,6 +32,7 @@ from .validation_errors import validation_errors
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")
+SHOWN_MOST = 5  # files of a command that are named
 _NOISE = "noise.seed"  # where a job's own seed goes
 _DIGITS_LEAST = 4  # of a job's name, so that a campaign may grow
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
@@ -143,6 +144,8 @@ class Campaign:
     splits: Mapping[str, float]
     license: str
     title: str
+    command: str = ""  # what follows ``lidarpool run``; empty for a function
+    description: str = ""  # the file's text, where there is one
 
     @checked
     def __init__(
@@ -183,6 +186,7 @@ class Campaign:
         title = section.title or path.stem
         self = cls.__new__(cls)
         self._begin(jobs, section.model_copy(update={"count": jobs.count, "title": title}))
+        self.command, self.description = path.name, path.read_text("utf-8-sig")
         return self
 
     @classmethod
@@ -208,6 +212,9 @@ class Campaign:
         given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
         self = cls.__new__(cls)
         self._begin(jobs, _head(count=jobs.count, **given))
+        self.command = " ".join(Path(path).name for path in jobs.paths[:SHOWN_MOST])
+        if len(jobs.paths) > SHOWN_MOST:
+            self.command += " …"
         return self
 
     @property
@@ -355,7 +362,7 @@ class _Given:
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
             raise LidarpoolError("a campaign needs a scenario at least: name one or more files.")
-        self._paths, self.count = paths, len(paths)
+        self.paths, self.count = paths, len(paths)
         mistakes = Mistakes()
         self._files: list[list[Path]] = []
         self._prints: list[str] = []
@@ -377,7 +384,7 @@ class _Given:
 
     def job(self, number: int) -> Described:
         return Described(
-            number, self._names[number], {}, scenario=Scenario.load(self._paths[number])
+            number, self._names[number], {}, scenario=Scenario.load(self.paths[number])
         )
 
 
