@@ -22,11 +22,9 @@ def draw_sweep(sweep: Sweep) -> Page:
     page = Page(SIZE)
     width, height = SIZE[0] - LEFT - MARGIN - KEY, SIZE[1] - TOP - MARGIN
     axes = page.chart((LEFT, MARGIN, width, height))
-    points = sweep.points[:: -(-len(sweep) // MOST_DOTS)] if len(sweep) else sweep.points
-    classes = sweep.classes
-    classes = (
-        classes[:: -(-len(sweep) // MOST_DOTS)] if classes is not None and len(sweep) else None
-    )
+    some = slice(None, None, max(1, -(-len(sweep) // MOST_DOTS)))
+    points = sweep.points[some]
+    classes = None if sweep.classes is None else sweep.classes[some]
     values = ", ".join(f"{name} {value}" for name, value in list(sweep.values.items())[:3])
     page.title(
         f"A sweep of job {sweep.job}",
@@ -34,8 +32,8 @@ def draw_sweep(sweep: Sweep) -> Page:
         f"{f'; {values}' if values else ''}",
     )
     if classes is not None and len(np.unique(classes)) > 1:
-        frequent = np.bincount(classes).argsort()[::-1][:CLASSES]
-        frequent = [int(one) for one in frequent if (classes == one).any()]
+        counts = np.bincount(classes)
+        frequent = [one for one in counts.argsort()[::-1][:CLASSES].tolist() if counts[one]]
         colours = theme.object_colours(len(frequent))
         painted = np.full((len(points), 3), 0.6)
         for one, colour in zip(frequent, colours, strict=True):
