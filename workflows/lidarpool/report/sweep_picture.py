@@ -8,12 +8,13 @@ from matplotlib.lines import Line2D
 from ..base.words import counted
 from ..export.loader import Sweep
 from ..render import theme
-from ..render.page import Page
+from ..render.page import Page, shortened
 
 SIZE = (1600, 1000)
-LEFT, TOP, MARGIN, KEY = 40, 140, 40, 220  # pixels; KEY is the width beside the drawing
+LEFT, TOP, MARGIN, KEY = 90, 190, 60, 240  # pixels; KEY is the width beside the drawing
 MOST_DOTS = 150_000
 SHARE = 0.97  # of the points that are within the drawing
+VALUES = 4  # that are named
 CLASSES = 10  # with colours of their own, the most frequent
 
 
@@ -21,15 +22,18 @@ def draw_sweep(sweep: Sweep) -> Page:
     """Draw the points of a sweep in the sensor's axes, coloured by class, or else by height."""
     page = Page(SIZE)
     width, height = SIZE[0] - LEFT - MARGIN - KEY, SIZE[1] - TOP - MARGIN
-    axes = page.chart((LEFT, MARGIN, width, height))
+    axes = page.chart((LEFT / SIZE[0], MARGIN / SIZE[1], width / SIZE[0], height / SIZE[1]))
     some = slice(None, None, max(1, -(-len(sweep) // MOST_DOTS)))
     points = sweep.points[some]
     classes = None if sweep.classes is None else sweep.classes[some]
-    values = ", ".join(f"{name} {value}" for name, value in list(sweep.values.items())[:3])
+    values = [
+        f"{name} {f'{value:.4g}' if isinstance(value, float) else shortened(str(value))}"
+        for name, value in list(sweep.values.items())[:VALUES]
+    ]
     page.title(
         f"A sweep of job {sweep.job}",
-        f"{counted(len(sweep), 'point')} from above, in the sensor's axes"
-        f"{f'; {values}' if values else ''}",
+        f"{counted(len(sweep), 'point')} from above, metres in the sensor's axes",
+        ", ".join(values),
     )
     if classes is not None and len(np.unique(classes)) > 1:
         counts = np.bincount(classes)
@@ -51,6 +55,6 @@ def draw_sweep(sweep: Sweep) -> Page:
     ratio = width / height
     axes.set_xlim(-reach * ratio, reach * ratio)
     axes.set_ylim(-reach, reach)
-    axes.scatter(points[:, 0], points[:, 1], s=1.2 * page.unit**2, c=painted, lw=0, rasterized=True)
+    axes.scatter(points[:, 0], points[:, 1], s=3 * page.unit**2, c=painted, lw=0, rasterized=True)
     axes.plot(0, 0, marker="^", color=theme.SENSOR, ms=7 * page.unit)
     return page
