@@ -139,6 +139,8 @@ def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: Cam
         resumed=run.resumed,
         notes=run.notes,
         stages=run.stages,
+        file=campaign.command,
+        description=campaign.description,
     )
     write_card(place, info, store.rows())
     dataset.finish(store.rows())
