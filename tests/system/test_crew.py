@@ -94,6 +94,8 @@ class Together:
                 self.failed[name] = str(error)
             if driver.finished or name in self.failed:
                 self.crew.leave(self.drivers.pop(name).seat)
+            if name in self.failed:  # its orders may still be under way
+                self.stores[name].remove()
         return moved
 
     def check(self, alone, same_cloud, *, failed: int = 0) -> None:
@@ -233,4 +235,20 @@ def test_an_error_that_all_share_ends_all(client, tmp_path, monkeypatch, left_ov
 
     with pytest.raises(LidarpoolError, match="the disk is full"):
         together.run(fail)
+    assert left_over(client) == ([], [], [])
+
+
+def test_a_survey_whose_parts_have_no_folder_fails_alone(
+    client, tmp_path, alone, same_cloud, left_over
+):
+    gone = {"gone": (SEED, Survey(SENSOR, [(0, 0, 1)], steps=900))}
+    together = Together(client, tmp_path, gone | SURVEYS)
+
+    def remove(name: str, frame: Frame) -> None:
+        if name == "gone" and frame.scan == 1:
+            Path(together.stores[name].storage.url).rename(tmp_path / "elsewhere")
+
+    together.run(remove)
+    assert "cannot be kept in" in together.failed["gone"]
+    together.check(alone, same_cloud, failed=1)
     assert left_over(client) == ([], [], [])
