@@ -50,6 +50,7 @@ class Workers:
         self.most = 0  # batches of a task
         self.dropped = []
         self.released = False
+        self.wanted = []
         self._joined = 0
 
     @property
@@ -59,6 +60,9 @@ class Workers:
     def look(self):
         free = {a: n for a, n in self.slots.items() if a not in self.silent}
         return Whereabouts(frozenset(self.slots), frozenset(self.silent), free)
+
+    def want(self, slots):
+        self.wanted.append(slots)
 
     def cast(self, spans, worker):
         assert worker in self.slots

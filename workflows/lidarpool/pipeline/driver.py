@@ -88,6 +88,7 @@ class SurveyDriver:
         self.cast = 0  # scans that stage 2 has finished
         self.offered_again = 0
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
+        self._learned = [0.0, 0]  # casting time of scans, and their number
         self._condemned: list[str] = []  # why scans cannot be done
         self._hidden: set[str] = set()  # addresses of LIDAR workers that do not see the storage
         self._sorted_at = time.monotonic()  # when the last frames came
@@ -138,12 +139,14 @@ class SurveyDriver:
         moved |= self._check_casts()
         if (seen := self._workers.look()) is not None:
             self._leave_workers(seen)
+            self._want_slots()
         self._look_after_stages()
         moved |= self._hand_over()
         moved |= self._offer()
         if self._condemned and not self.batches:
             raise LidarpoolError("\n".join(self._condemned))
         if self._db.complete:
+            self._workers.want(0)
             self._stages.close()
             self._closed = True
         return moved
@@ -326,10 +329,17 @@ class SurveyDriver:
             self._send_summaries(new)
             self._on_parts(new)
 
+    def _want_slots(self) -> None:
+        """Say how many slots the remaining scans are worth."""
+        seconds, scans = self._learned
+        left = self.survey.scan_count - self._db.scans_done
+        self._workers.want(policies.slots_wanted(left, seconds / scans if scans else None))
+
     def _learn(self, record: TaskRecord) -> None:
         """Record a task of stage 2, and advise stage 1 on the scans in one item."""
         self.book.add(record)
         self._seconds.append(record.seconds)
+        self._learned = [self._learned[0] + record.seconds, self._learned[1] + record.items]
         count, slots = self.survey.scan_count, self._workers.slot_count
         self._stages.advise(
             policies.scans_per_batch(record.seconds, record.items, self._fit, count, slots)

@@ -1,4 +1,4 @@
-"""The GPU workers and their casting tasks: prepared, refused, paused, silent, gone."""
+"""The GPU workers and their casting tasks: wanted, prepared, refused, paused, silent, gone."""
 
 from __future__ import annotations
 
@@ -59,15 +59,24 @@ class CastingWorkers:
         self.handle, self._packed = handle, plan.packed()
         self._backend, self._software = plan.backend, dict(software)
         self._plan: Future | None = None  # the packed plan, on the workers
-        self._setups: dict[str, Future] = {}  # {address: task that prepares the worker}
+        self._setups: dict[str, Future] = {}  # {address: task that is preparing the worker}
+        # {address of a worker that is prepared: batches at a time}. The answers are not kept on the
+        # workers: one with a result cannot be returned to the queue.
+        self._prepared: dict[str, int] = {}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = self._offered = 0
         self._casts: dict[str, Future] = {}  # {key: casting task}
         self._died: list[str] = []  # workers that died while preparing, in a row
         self._looked_at = float("-inf")
         self.seen = Whereabouts()
-        self.slots: dict[str, int] = {}  # {address of a prepared worker: batches at a time}
+        self._wanted = -1  # slots, as the scheduler knows
+        self._adapts = True  # the partition grows with what is wanted, as far as known
         self.notes: list[str] = []  # what a user should know
+
+    @property
+    def slots(self) -> dict[str, int]:
+        """{address of a prepared worker that takes tasks: batches at a time}."""
+        return {a: slots for a, slots in self._prepared.items() if a in self.seen.free}
 
     @property
     def slot_count(self) -> int:
@@ -84,7 +93,7 @@ class CastingWorkers:
     def pending(self) -> list[str]:
         """Keys of the tasks that have not ended."""
         casts = [key for key, future in self._casts.items() if future.status == "pending"]
-        return casts + [f.key for a, f in self._setups.items() if a not in self.slots]
+        return casts + [future.key for future in self._setups.values()]
 
     # -- casting ---------------------------------------------------------------------------
 
@@ -134,9 +143,10 @@ class CastingWorkers:
         self._looked_at = time.monotonic()
         keys = [future.key for future in self.futures]
         self.seen = look_for_tasks(self._client, self._partition.name, keys)
-        for address in self._setups.keys() - self.seen.members:
+        known = self._setups.keys() | self._prepared.keys()
+        for address in known - self.seen.members:
             self._remove(address)
-        for address in sorted(self.seen.free.keys() - self._setups.keys()):
+        for address in sorted(self.seen.free.keys() - known):
             if address not in self._refused:
                 self._prepare(address)
         self._check()
@@ -145,10 +155,7 @@ class CastingWorkers:
     def _check(self) -> None:
         """Record the workers that are prepared."""
         for address, future in list(self._setups.items()):
-            if address in self.slots:
-                if address not in self.seen.free:
-                    del self.slots[address]
-            elif future.status == "finished" and address in self.seen.free:
+            if future.status == "finished" and address in self.seen.free:
                 self._take(address, future)
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, PREPARING)
@@ -158,12 +165,25 @@ class CastingWorkers:
     def drop(self, address: str) -> None:
         """Prepare a worker again: its rig is gone."""
         self._setups.pop(address, None)
-        self.slots.pop(address, None)
+        self._prepared.pop(address, None)
+
+    def want(self, slots: int) -> None:
+        """Want so many slots of a partition that grows with its work; 0 when there is no more.
+
+        The driver binds each batch to a worker, so that no batch waits for workers to come.
+        """
+        if slots != self._wanted and self._adapts:
+            self._wanted = slots
+            self._adapts = self._partition.want(slots)
+        if not slots:
+            self._plan = None  # it would keep a worker
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
         addresses = [a for a in self.slots if a in self.seen.members]
-        self.slots.clear()
+        self._prepared.clear()
+        if self._client.status == "running":
+            self.want(0)
         if addresses and self._client.status == "running":
             # Dask tries for half a minute to reach a worker that is ending.
             with suppress(TimeoutError):
@@ -195,9 +215,9 @@ class CastingWorkers:
         if future.key not in found:
             return
         answer: dict[str, Any] = found[future.key]
+        del self._setups[address]
         if differs := difference(answer["software"], self._software):
             self._refused[address] = differs
-            del self._setups[address]
             self.notes.append(
                 f"worker {answer['worker']} at {address} has {differs}: it cast nothing"
             )
@@ -207,15 +227,15 @@ class CastingWorkers:
                     f"one at {address} has {differs}. Install the same on all."
                 )
             return
-        self.slots[address] = max(1, answer["slots"].get(self._partition.name, 1))
+        self._prepared[address] = max(1, answer["slots"].get(self._partition.name, 1))
         self._died.clear()
 
     def _remove(self, address: str) -> None:
         """Remove a worker that has gone; the scene may have killed it."""
-        future = self._setups.pop(address)
         self._refused.pop(address, None)
-        if self.slots.pop(address, None) is not None:
+        if self._prepared.pop(address, None) is not None:
             return
+        future = self._setups.pop(address)
         place = self.seen.tasks.get(future.key)
         if place is not None and place.deaths:
             self._died.append(address)

@@ -26,7 +26,7 @@ from ..pipeline import GPU, LIDAR, OTHER, CastingWorkers, Frame, LongStages, Rig
 from ..pipeline.task_book import TaskBook
 from ..plan import best
 from ..simulator.memory import MB, scans_that_fit
-from .checks import find_workers, gpu_note
+from .checks import find_workers, gpu_note, want_nothing
 from .progress import Progress
 from .result import RunResult
 from .store import RunStore
@@ -67,9 +67,11 @@ class Run:
                 store.advice,
                 store.casting if store.resumed else {},
                 waiting,
+                job.survey.scan_count - store.resumed,
             )
             store.backend, store.casting = backend, software
         except LidarpoolError:
+            want_nothing(client, (GPU, LIDAR, OTHER))
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
@@ -121,12 +123,14 @@ class Run:
                 )
                 pumps.append(trials)
                 trials.step()
+                self.partitions[OTHER].want(0)  # from now on its trials wait for workers
             survey = self._survey_driver(on_frame)
             pumps.append(survey)
             survey.start()
             times = self._loop(pumps, survey, trials, on_progress, started)
             for pump in pumps:
                 pump.finish()
+            want_nothing(self.client, self.partitions)
             self.notes += survey.notes
         except BaseException as error:
             # A client that loses its scheduler cancels all futures, so tasks look cancelled.
@@ -134,6 +138,7 @@ class Run:
             lost = _is_lost(self.client, error)
             reason = str(error) or type(error).__name__
             _stop(self.client, pumps, f"the run was stopped: {reason}")
+            want_nothing(self.client, self.partitions)
             if error is self.callers_error:
                 raise
             if isinstance(error, PoolError) and not lost:
