@@ -178,7 +178,8 @@ class Adaptation(SchedulerPlugin):
     ) -> tuple[Advice, dict[str, list[Any]]] | None:
         """Decide about a partition; returns what to do, and workers to close, by job.
 
-        None if the number of its jobs is fixed. `jobs` are the names of the workers of each job, the newest last.
+        None if the number of its jobs is fixed. `jobs` are the names of the workers of each job,
+        the newest last.
         """
         record, now = self.records[name], time.monotonic()
         by_name = {str(worker.name): worker for worker in self.scheduler.workers.values()}

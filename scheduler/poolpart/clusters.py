@@ -135,7 +135,8 @@ class _Part:
                     f"adapt of partition {name!r} is {adapt!r}; give the least and the greatest "
                     "number of workers, such as [0, 8], and no workers beside it."
                 )
-            bounds = Bounds.checked(name, *adapt, IDLE_S if idle_s is None else idle_s)
+            least, most = adapt
+            bounds = Bounds.checked(name, least, most, IDLE_S if idle_s is None else idle_s)
         elif idle_s is not None:
             raise PoolError(f"Partition {name!r} has idle_s without adapt: give it [0, 8] or so.")
         try:

@@ -349,9 +349,10 @@ def is_idle(scheduler: Any, worker: Any) -> bool:
     """Whether nothing is lost with a worker: it has no task, and no result that is only there."""
     if worker.status is not Status.running or worker.processing or worker.actors:
         return False
-    if stealing := scheduler.extensions.get("stealing"):
-        if any(move["thief"] is worker for move in stealing.in_flight.values()):
-            return False
+    stealing = scheduler.extensions.get("stealing")
+    moves = stealing.in_flight.values() if stealing else ()
+    if any(move["thief"] is worker for move in moves):  # a task is on its way
+        return False
     return all(len(task.who_has) > 1 for task in worker.has_what)
 
 

@@ -60,8 +60,8 @@ class Pool:
         Raises
         ------
         PoolError
-            If the cluster has no workers and no adaptive partitions, a worker cannot import this package, or the client is
-            closed or asynchronous.
+            If the cluster has no workers and no adaptive partitions, a worker cannot import this
+            package, or the client is closed or asynchronous.
         """
         workers = all_workers(client)
         if not workers and not adaptive_names(client):
@@ -102,7 +102,7 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Find the partitions that the cluster's workers declare now, and adaptive ones, by name."""
+        """Find the partitions that workers declare now, and adaptive ones, by name."""
         workers = all_workers(self.client)
         names = {name for worker in workers for name in worker.partitions}
         names |= adaptive_names(self.client)  # perhaps empty

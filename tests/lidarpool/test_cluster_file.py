@@ -42,7 +42,9 @@ def test_slots_and_workers_of_a_file(tmp_path):
 
 
 def test_partitions_that_grow_with_their_work(tmp_path):
-    text = GOOD.replace("workers: 5", "adapt: [0, 8]").replace("slots: 2", "adapt: [1, 3], slots: 2")
+    text = GOOD.replace("workers: 5", "adapt: [0, 8]").replace(
+        "slots: 2", "adapt: [1, 3], slots: 2"
+    )
     file = load(tmp_path, text)
     assert file.slots == {"GPU": 6, "LIDAR": 4, "OTHER": 8}
     assert str(file) == "SSHCluster: up to 12 workers, GPU 1 to 3, LIDAR 1, OTHER 0 to 8"

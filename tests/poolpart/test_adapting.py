@@ -330,7 +330,7 @@ def test_a_map_has_work_for_all_that_may_come(queue, wait_until):
 
 def test_a_task_that_no_worker_to_come_can_run_is_refused(queue):
     with cluster_of({"GPU": adaptive(0, 3, slots=2)}) as client:
-        with pytest.raises(PoolError, match="asks for 3 slots .* have 2 at most"):
+        with pytest.raises(PoolError, match=r"asks for 3 slots .* have 2 at most"):
             Partition("GPU", client).submit(here, slots=3)
         assert Partition("GPU", client).submit(here, slots=2).result(LONG_S) == "GPU-0"
 

@@ -38,7 +38,6 @@ class Workers(BaseModel):
     slots: int = Field(1, ge=1, le=10_000)
     hosts: list[str] | None = Field(None, min_length=1)
 
-
     def wrong(self) -> str:
         """Say what is wrong with the number of workers; empty if nothing is."""
         if self.adapt is None:
