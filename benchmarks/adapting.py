@@ -97,7 +97,7 @@ class Watched(SchedulerPlugin):
 
 
 def counted(dask_scheduler: Any = None) -> tuple[Counter[str], Counter[str]]:
-    """What was counted; runs on the scheduler."""
+    """Return what was counted; runs on the scheduler."""
     watched = dask_scheduler.plugins[Watched.name]
     return watched.counts, watched.most
 

@@ -32,9 +32,9 @@ MOST = {"GPU": 4, "IO": 3}
 IDLE_S = 8
 LOOK_S = 0.25
 # (when, partition, tasks, seconds of each)
-WORK = ((5.0, "GPU", 24, 2.0), (20.0, "IO", 40, 1.0), (62.0, "GPU", 3, 2.0), (66.0, "IO", 12, 1.0))
-END_S = 95.0
-LOSS_S = 27.0  # when a job of IO is cancelled, as if its host had failed
+WORK = ((5.0, "IO", 70, 1.0), (46.0, "GPU", 24, 2.0), (97.0, "IO", 12, 1.0))
+END_S = 115.0
+LOSS_S = 16.0  # when a job of IO is killed, as if its host had failed
 SCHEDULER = {"host": LOOPBACK, "port": 0, "dashboard_address": f"{LOOPBACK}:0"}
 
 Sample = dict[str, Any]  # "t" and, for each partition, jobs that wait and run, slots, tasks
@@ -149,17 +149,16 @@ def draw(samples: Sequence[Sample]) -> Page:
         axes.yaxis.set_major_locator(MaxNLocator(integer=True, nbins=5))
         if name == "IO":
             axes.set_xlabel("seconds")
-            _say(page, axes, "a job is killed", (LOSS_S, 0.3), theme.SENSOR, mark=True)
+            _say(page, axes, "a job is killed", (LOSS_S, MOST[name]), theme.SENSOR, mark=True)
         else:
             axes.tick_params(labelbottom=False)
     tasks.tick_params(labelbottom=False)
-    grey = theme.MUTED
     page.key(
         [
             *(Line2D([], [], color=colours[n], lw=2.4 * unit, label=f"{n}") for n in NAMES),
             _square(theme.UNSEEN, 1.0, "job in the queue", unit),
-            _square(grey, 0.35, "job that runs", unit),
-            _square(grey, 0.9, "slot with a task", unit),
+            _square(colours["GPU"], 0.28, "job that runs", unit),
+            _square(colours["GPU"], 0.8, "slot with a task", unit),
             Line2D([], [], color=theme.INK, lw=1.3 * unit, label="slots"),
         ],
         7.0,

@@ -31,6 +31,7 @@ from .internals import (
     reopen,
     retire,
     shut,
+    takes_tasks,
     turn_away,
     waiting_for_workers,
 )
@@ -155,7 +156,8 @@ class Adaptation(SchedulerPlugin):
         """
         total = free = 0.0
         movable = waiting
-        members = [w for w in self.scheduler.running if w.resources.get(name)]
+        everybody = self.scheduler.workers.values()
+        members = [w for w in everybody if w.resources.get(name) and takes_tasks(w)]
         limit = enough + sum(worker.resources[name] for worker in members)
         for worker in members:
             slots = worker.resources[name]

@@ -356,6 +356,11 @@ def is_idle(scheduler: Any, worker: Any) -> bool:
     return all(len(task.who_has) > 1 for task in worker.has_what)
 
 
+def takes_tasks(worker: Any) -> bool:
+    """Whether a worker gets tasks, or will in a moment: one that joins is not ready at once."""
+    return worker.status in (Status.running, Status.init)
+
+
 def shut(scheduler: Any, worker: Any) -> None:
     """Let a worker get no more tasks."""
     stimulus = f"poolpart-shut-{time.time()}"
