@@ -152,6 +152,8 @@ def draw(samples: Sequence[Sample]) -> Page:
             _say(page, axes, "a job is killed", (LOSS_S, MOST[name]), theme.SENSOR, mark=True)
         else:
             axes.tick_params(labelbottom=False)
+            first = next((s["t"] for s in samples if s[name]["waiting"]), 0.0)
+            _say(page, axes, "there are two GPUs", (first, 3.2), theme.INK)
     tasks.tick_params(labelbottom=False)
     page.key(
         [

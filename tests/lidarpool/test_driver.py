@@ -283,6 +283,14 @@ def test_undisturbed_each_batch_is_cast_once(run):
     assert run.driver.book.stages["intersect"].items == SCANS
 
 
+def test_slots_are_wanted_as_long_as_there_is_work(run):
+    run.stages.seconds = 100.0
+    run.end()
+    wanted = run.workers.wanted
+    assert wanted[0] == SCANS and wanted[-1] == 0
+    assert wanted == sorted(wanted, reverse=True)
+
+
 def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
     run.until(lambda: len(run.committed) >= 4)
     done = [(part.first, part.stop) for part in run.committed]

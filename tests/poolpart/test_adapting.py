@@ -124,6 +124,20 @@ def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, w
         assert Pool.from_client(client).partitions().keys() == {"FIX", "GPU", "IO"}
 
 
+def test_no_more_jobs_than_tasks(queue, wait_until):
+    with cluster_of({"GPU": adaptive(0, 9)}) as client:
+        gpu = Partition("GPU", client)
+        for number in range(1, 4):
+            tasks = [gpu.submit(wait_for, f"go-{number}") for _ in range(2)]
+            wait_until(lambda: len(gpu) == 2)
+            time.sleep(3 * IDLE_S)
+            assert len(queue.submitted) == 2 * number
+            Event(f"go-{number}", client).set()
+            client.gather(tasks)
+            del tasks
+            wait_until(lambda: len(gpu) == 0)
+
+
 def test_the_minimum_stays_and_the_range_can_be_changed(queue, wait_until):
     with cluster_of({"GPU": adaptive(1, 2)}) as client:
         gpu = Partition("GPU", client)

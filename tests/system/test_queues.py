@@ -247,6 +247,21 @@ def test_a_run_on_hosts_that_ssh_reaches(ssh, tmp_path, monkeypatch, protocol):
 
 
 @needs_sshd
+def test_processes_that_ssh_starts_when_a_run_needs_them(ssh, tmp_path):
+    file = ssh_file(tmp_path, ssh)
+    file["partitions"] = HOSTS | {name: HOSTS[name] | ADAPTIVE for name in ("GPU", "OTHER")}
+    long = FEWER | {"steps": 600}  # idle workers of OTHER end before the run
+    run = Command(tmp_path, file, long)
+    run.wait_for("started SSHCluster: up to 5 workers, GPU 0 to 2, LIDAR 1, OTHER 0 to 2")
+    expected, _ = Command(tmp_path, None, long).result()
+    checksum, report = run.result()
+    assert checksum == expected
+    assert report["tasks"]["OTHER"] == {"trial": 10}
+    assert "cannot be started" not in run.said
+    wait_until(lambda: not processes_in(tmp_path))
+
+
+@needs_sshd
 @pytest.mark.parametrize("where", ["arguments", "GPU"])
 def test_what_a_host_says_that_cannot_start_its_process(ssh, tmp_path, where):
     file = ssh_file(tmp_path, ssh)
