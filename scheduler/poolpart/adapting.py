@@ -13,7 +13,6 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -41,7 +40,7 @@ from .workers import on_scheduler
 NAME = "poolpart-adapting"
 IDLE_S = 60.0  # a job that is not needed for so long ends
 _ANSWER_S = 5.0  # for an idle worker to say that it runs nothing
-_LOST_S = 30.0  # without a word of the process that starts jobs: it is gone
+_LOST_S = 120.0  # without a word of the process that starts jobs: it is gone
 
 
 @dataclass(frozen=True)
@@ -140,12 +139,13 @@ class Adaptation(SchedulerPlugin):
             return 0
         return record.coming
 
-    def waiting_slots(self) -> Counter[str]:
+    def waiting_slots(self) -> dict[str, float]:
         """Slots that tasks wait for without any worker, by partition."""
-        waiting: Counter[str] = Counter()
-        for task in waiting_for_workers(self.scheduler):
-            if task.resource_restrictions and not is_bound(task):
-                waiting.update(task.resource_restrictions)
+        waiting: dict[str, float] = {}
+        for task in waiting_for_workers(self.scheduler):  # there may be 100,000
+            if (asked := task.resource_restrictions) and not is_bound(task):
+                for name, slots in asked.items():
+                    waiting[name] = waiting.get(name, 0.0) + slots
         return waiting
 
     def lacking(self, name: str, waiting: float, enough: float) -> float:
@@ -282,7 +282,7 @@ async def look(
     advice: dict[str, Advice] = {}
     closing: list[tuple[str, str, list[Any]]] = []
     for name, own in jobs.items():
-        if (decided := record.decide(name, own, waiting[name])) is None:
+        if (decided := record.decide(name, own, waiting.get(name, 0.0))) is None:
             continue
         advice[name], idle = decided
         for job, workers in idle.items():
