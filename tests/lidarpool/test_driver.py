@@ -53,6 +53,7 @@ class Workers:
         self.tried = Counter()  # {(first, stop): casting tasks}
         self.most = 0  # batches of a task
         self.released = False
+        self.wanted = []
         self._joined = 0
 
     @property
@@ -72,6 +73,9 @@ class Workers:
 
     def remove(self, job):
         del self.jobs[job]
+
+    def want(self, slots):
+        self.wanted.append(slots)
 
     def cast(self, job, spans, worker):
         assert worker in self.slots and job in self.jobs
@@ -307,6 +311,14 @@ def test_undisturbed_each_batch_is_cast_once(run):
     assert set(run.workers.tried.values()) == {1} and run.driver.offered_again == 0
     assert run.driver.cast == run.driver.generated == SCANS
     assert run.driver.book.stages["intersect"].items == SCANS
+
+
+def test_slots_are_wanted_as_long_as_there_is_work(run):
+    run.stages.seconds = 100.0
+    run.end()
+    wanted = run.workers.wanted
+    assert wanted[0] == SCANS and wanted[-1] == 0
+    assert wanted == sorted(wanted, reverse=True)
 
 
 def test_what_an_earlier_run_has_committed_is_not_cast_again(run):

@@ -27,6 +27,7 @@ from lidarpool.pipeline.policies import (
     offers,
     room,
     scans_per_batch,
+    slots_wanted,
     verdict,
 )
 from poolpart import Whereabouts
@@ -76,6 +77,14 @@ def test_scans_of_a_batch(seconds, scans, fit, count, slots, wanted):
 def test_no_batches_are_taken_far_ahead_of_the_oldest():
     assert room(3, 5, 10) == 7
     assert room(3, SPAN * 10, 10) == 0
+
+
+def test_slots_are_wanted_for_what_is_left():
+    assert slots_wanted(100, None) == 100  # nothing is known of them
+    assert slots_wanted(100, 0.1) == 1  # of 10 s
+    assert slots_wanted(1000, 0.1) == 5
+    assert slots_wanted(3, 60.0) == 3  # a scan is never split
+    assert slots_wanted(0, 1.0) == slots_wanted(0, None) == 0
 
 
 # -- where ---------------------------------------------------------------------------------------

@@ -315,6 +315,7 @@ class CampaignDriver(Surveys):
         self._all_made = False
         self._remover = ThreadPoolExecutor(1, "remove")
         self._committed = 0
+        self._begun = (0, 0)  # jobs, and their scans
         self.books = TaskBook()
         self.casting = 0.0
         self.points = self.scans_done = 0
@@ -403,6 +404,10 @@ class CampaignDriver(Surveys):
             entry.job.survey.scan_count * left,
         )
         self._under_way.append(entry)
+        self._begun = (self._begun[0] + 1, self._begun[1] + entry.job.survey.scan_count)
+        ended = len(self._store.db.jobs)
+        to_come = self._store.count - ended - len(self._under_way) - len(self._writer)
+        self._crew.later = max(0, to_come) * self._begun[1] // self._begun[0]
 
     def _leave(self, entry: Entry) -> None:
         """Let the crew do nothing more for a job."""
@@ -506,7 +511,8 @@ def run_campaign(
         stack.callback(_remove_probe, dataset.place, probe[0])
         needed = slots_needed(first.job)
         needed[LIDAR] += 1  # which jobs are written in
-        cluster = Cluster(client, first.job, store, tell, waiting, needed)
+        left = first.job.survey.scan_count * len(store.left)
+        cluster = Cluster(client, first.job, store, tell, waiting, needed, left)
         crew = cluster.crew(store.storage, store.db.meta["mark"])
         probes = ((dataset.place, *probe), (store.storage, *crew.probe))
         sources = store.casting["lidarpool"]
