@@ -74,6 +74,7 @@ class SurveyDriver:
         self._fit, self._in_all = fit, max(in_all, survey.scan_count)
         self._db, self._storage = db, storage
         self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
+        seat.left = survey.scan_count - db.scans_done
         self._mark = db.meta["mark"]
         self._summary = summary_type(samples_of_scan(survey.scan_count))
         self.book = TaskBook()
