@@ -69,9 +69,10 @@ class Queue:
     async def close(self, job: Any, number: str, command: str) -> None:
         if number in self.waiting:
             self.cancelled.append(self.waiting.pop(number))
-        for worker in self.workers.pop(number, []):
+        for worker in self.workers.get(number, []):
             await asyncio.sleep(0.05)  # for its own end, or it logs an error
-            await worker.close(timeout=1)
+            await worker.close(timeout=1)  # a second call waits for the first
+        self.workers.pop(number, None)
 
 
 @pytest.fixture
