@@ -53,9 +53,10 @@ class LiveCampaign(CampaignPage):
     page: PageServer
 
     def __init__(self, campaign: Campaign) -> None:
-        self._campaign = campaign
+        self._title, self._count = campaign.title or "campaign", campaign.count
+        self._names = campaign.names
         self.stopped = threading.Event()  # by a user of the page; --resume continues
-        self.charts = Charts(campaign.names, campaign.count)
+        self.charts = Charts(self._names, self._count)
         self._state = "starting"
         self._progress: Progress | None = None
         self._pace, self._rate, self._left = Pace(), "", ""
@@ -97,7 +98,9 @@ class LiveCampaign(CampaignPage):
         self._progress, now = progress, time.monotonic()
         rate = self._pace.rate(progress.seconds, progress.jobs_done)
         if rate:
-            self._rate = f"{in_words(rate)} jobs/s" if rate >= 1 else f"{in_words(60 * rate)} a min"
+            self._rate = (
+                f"{in_words(rate)} jobs/s" if rate >= 1 else f"{in_words(60 * rate)} jobs/min"
+            )
             left = progress.jobs - progress.jobs_done
             sure = is_sure(progress.jobs_done, progress.jobs, progress.seconds) and left
             self._left = time_in_words(left / rate) if sure else ""
@@ -181,12 +184,12 @@ class LiveCampaign(CampaignPage):
             elif progress is not None:
                 state = standing_still(progress) or state
         return {
-            "title": self._campaign.title,
-            "names": list(self._campaign.names),
+            "title": self._title,
+            "names": list(self._names),
             "state": state,
             "over": self._over,
             "stopping": self.stopped.is_set(),
-            "count": self._campaign.count,
+            "count": self._count,
             "done": self._done,
             "failed": self._failed,
             "casting": len(under_way) - sum(job.writing for job in under_way),
@@ -216,7 +219,7 @@ class LiveCampaign(CampaignPage):
 
     def _words(self, values: Mapping[str, Value]) -> list[str]:
         """Values in the order of the table's columns; "" for one that is not there."""
-        return [_word(values.get(name, "")) for name in self._campaign.names]
+        return [_word(values.get(name, "")) for name in self._names]
 
 
 def _word(value: Value) -> str:
