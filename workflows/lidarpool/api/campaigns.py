@@ -15,7 +15,7 @@ from ..export.folder import output_place
 from ..pipeline import LIDAR
 from ..report.campaign_output import Making, make_dataset
 from ..run.bars import bars_here
-from ..run.campaign import CampaignRun
+from ..run.campaign import CampaignPage, CampaignRun
 from ..run.checks import slots_needed
 from ..run.connection import local_client
 from ..run.job import Job
@@ -42,6 +42,7 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
         resume: bool = False,
         fresh: bool = False,
         retry_failed: bool = False,
+        live: bool = False,
         wait_s: float = WAIT_S,
         patience_s: float = PATIENCE_S,
     ) -> CampaignRun:
@@ -71,6 +72,9 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             Remove first what an earlier run of a campaign has left in `out`.
         retry_failed
             Resume, and do the jobs that have failed again.
+        live
+            Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
+            in the cell.
         wait_s, patience_s
             As for `simulate`.
 
@@ -101,4 +105,13 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             wait_s, patience_s,
         )  # fmt: skip
         progress = bars_here() if on_progress is None else nullcontext(on_progress)
-        return make_dataset(self, making, cluster, progress, logger.info)
+        with _page(self, live) as page:
+            return make_dataset(self, making, cluster, progress, logger.info, page)
+
+
+def _page(campaign: Campaign, wanted: bool) -> AbstractContextManager[CampaignPage]:
+    if not wanted:
+        return nullcontext(CampaignPage())
+    from ..live.campaign_page import live_campaign  # with Matplotlib
+
+    return live_campaign(campaign)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from typing import Any
 
@@ -26,6 +26,7 @@ from ..report.campaign_output import (
     make_dataset,
     row_of,
 )
+from ..run.campaign import CampaignPage, CampaignRun
 from ..run.checks import slots_needed
 from ..run.job import Job
 from ..run.result import RunResult
@@ -40,11 +41,6 @@ from .terminal import shown_progress
 def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) -> None:
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
     set_logs(options.verbose)
-    if options.live:
-        raise LidarpoolError(
-            "--live shows one survey: give it with --job N, or watch the bars and the page of "
-            "partitions."
-        )
     if options.overwrite or options.only:
         raise LidarpoolError(
             "--overwrite and --only are for one survey: a data set needs a folder of its own, and "
@@ -63,7 +59,25 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
         options.out, options.here, options.resume, options.fresh, retry_failed, options.parts,
         options.backend, options.wait_s, options.patience_s,
     )  # fmt: skip
-    run = make_dataset(campaign, making, cluster, shown_progress(options.quiet), teller(options))
+    with _page(campaign, options) as page:
+        progress = shown_progress(options.quiet)
+        run = make_dataset(campaign, making, cluster, progress, teller(options), page)
+        _tell(run, options)
+        if options.live and options.stay:
+            page.stay()
+    if run.failed:
+        raise LidarpoolError(failures(run))
+
+
+def _page(campaign: Campaign, options: RunOptions) -> AbstractContextManager[CampaignPage]:
+    if not options.live:
+        return nullcontext(CampaignPage())
+    from ..live.campaign_page import live_campaign
+
+    return live_campaign(campaign)
+
+
+def _tell(run: CampaignRun, options: RunOptions) -> None:
     if options.as_json:
         told: dict[str, Any] = {
             "folder": str(options.out),
@@ -85,8 +99,6 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
             f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)"
         )
         click.echo(f"data set in {click.format_filename(str(options.out))}: see README.md there")
-    if run.failed:
-        raise LidarpoolError(failures(run))
 
 
 def run_job(campaign: Campaign, number: int, options: RunOptions) -> None:

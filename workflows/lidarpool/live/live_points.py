@@ -47,6 +47,11 @@ class LivePoints:
             while len(self._waiting) > PARTS_NOTED:
                 del self._waiting[1::2]
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there are parts to read."""
+        return bool(self._waiting)
+
     def gather(self) -> None:
         """Read some of the waiting parts, without those that cannot be read: the run says so."""
         with self._lock:

@@ -52,17 +52,7 @@ class LiveRun(Page):
     def __init__(self, job: Job) -> None:
         self._job = job
         self.stopped = threading.Event()  # by a user of the page; --resume continues
-        survey, scene = job.survey, job.scene
-        ways = sensor_ways(survey)
-        self._drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
-        pictured = Pictured(
-            self._drawn.scene, ways, np.zeros(0, np.int64),
-            np.zeros((0, 2, 3), np.float32), job.planning, None, (), survey.duration_ns, (),
-            reflectances_of(scene, survey),
-        )  # fmt: skip
-        self._view = View("lidarpool", no_points((SCAN, *survey.stored_columns)), pictured)
-        if survey.coordinates != "world":
-            self._view.note = IN_SENSOR_AXES
+        self._drawn, self._view = view_of(job, "lidarpool")
         self._view.hits = self._hits
         self._state = "starting"
         self._store: RunStore | None = None
@@ -238,6 +228,22 @@ class LiveRun(Page):
         if self.stopped.is_set():
             return "stopping"
         return escape(standing_still(progress)) or self._state
+
+
+def view_of(job: Job, title: str) -> tuple[Drawn, View]:
+    """Return the scene of a survey as it is drawn, and a view of both, without points."""
+    survey, scene = job.survey, job.scene
+    ways = sensor_ways(survey)
+    drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
+    pictured = Pictured(
+        drawn.scene, ways, np.zeros(0, np.int64),
+        np.zeros((0, 2, 3), np.float32), job.planning, None, (), survey.duration_ns, (),
+        reflectances_of(scene, survey),
+    )  # fmt: skip
+    view = View(title, no_points((SCAN, *survey.stored_columns)), pictured)
+    if survey.coordinates != "world":
+        view.note = IN_SENSOR_AXES
+    return drawn, view
 
 
 def _rays_of(frames: list[Frame]) -> NDArray[np.float32]:

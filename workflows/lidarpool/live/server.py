@@ -35,6 +35,7 @@ from .points import Abandoned
 
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free
+VIEWER = "index.html"
 _PORTS_TRIED = 100
 
 # A browser reaches this machine by these names, also through a port forwarded by SSH, with any
@@ -177,14 +178,20 @@ class PageServer:
 
 @contextmanager
 def page_server(
-    source: Source, port: int = PORT, stop: Callable[[], None] | None = None
+    source: Source,
+    port: int = PORT,
+    stop: Callable[[], None] | None = None,
+    *,
+    index: str = VIEWER,
 ) -> Iterator[PageServer]:
     """Serve a page while the body runs, in a thread of its own, on a port or the next free one.
 
-    A `port` of 0 is for any; `stop` is called when a user of the page orders to stop.
+    A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
+    the page's file; the viewer of a job is at ``job/NUMBER/``, and asks what begins with that.
     """
     bound, threads = _bound(port), ThreadPoolExecutor(2, "lidarpool-page")
-    page = {"path": str(files(__package__) / "page"), "default_filename": "index.html"}
+    folder = str(files(__package__) / "page")
+    page, viewer = ({"path": folder, "default_filename": name} for name in (index, VIEWER))
     asked = {"source": source, "stop": stop, "threads": threads}
     bound.setblocking(False)
     running: Future[asyncio.AbstractEventLoop] = Future()
@@ -193,6 +200,7 @@ def page_server(
     async def serve() -> None:
         handlers: list[Any] = [
             (r"/(|\w[\w.]*\.(?:css|js))", _File, page),
+            (r"/job/\d+/(|\w[\w.]*\.(?:css|js))", _File, viewer),
             (r"/(.*)", _Question, asked),
         ]
         server = HTTPServer(Application(handlers, log_function=lambda _: None))

@@ -106,10 +106,10 @@ class Figures:
     names
         Names of the varied quantities.
     jobs
-        Rows of the table, which are read once.
+        Rows of the table, which are read once; `add` takes more.
     """
 
-    def __init__(self, names: Sequence[str], jobs: Iterable[JobRow]) -> None:
+    def __init__(self, names: Sequence[str], jobs: Iterable[JobRow] = ()) -> None:
         self.jobs, self.done = 0, 0
         self.totals: Counter[str] = Counter(dict.fromkeys(_COUNTS, 0))
         self.splits: dict[str, Counter[str]] = {}  # {split: done jobs, sweeps, points}
@@ -122,15 +122,12 @@ class Figures:
         self._numbers = {name: array("d") for name in names}
         self._codes = {name: array("i") for name in names}
         self._labels: dict[str, dict[str, int]] = {name: {} for name in names}
-        digest = hashlib.sha256()
+        self._digest = hashlib.sha256()
         for row in jobs:
-            self._add(row)
-            if row.done:
-                digest.update(f"{row.name} {row.sha256}\n".encode())
-        self.sha256 = digest.hexdigest()
-        self.varied = [self._varied(name) for name in names]
+            self.add(row)
 
-    def _add(self, row: JobRow) -> None:
+    def add(self, row: JobRow) -> None:
+        """Count one more job."""
         self.jobs += 1
         for name, kept in self._each.items():
             kept.append(not row.done if name == "failed" else getattr(row, name))
@@ -141,6 +138,7 @@ class Figures:
                 self.failed.append(row)
             return
         self.done += 1
+        self._digest.update(f"{row.name} {row.sha256}\n".encode())
         self.seconds += row.seconds
         counts = {name: getattr(row, name) for name in _COUNTS}
         self.totals.update(counts)
@@ -177,6 +175,16 @@ class Figures:
         values = place[text_of].astype(np.float64)
         values[values < 0] = np.nan
         return Varied(name, values, tuple(texts[k] for k in order))
+
+    @property
+    def sha256(self) -> str:
+        """Digest of the names and points of all done jobs, in the order of their rows."""
+        return self._digest.hexdigest()
+
+    @property
+    def varied(self) -> list[Varied]:
+        """What each varied quantity was in each job."""
+        return [self._varied(name) for name in self._numbers]
 
     @property
     def slowest(self) -> list[JobRow]:

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections import deque
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -21,7 +22,7 @@ from ..export.dataset import INDEX_FILE, DataSet
 from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import sweeps
-from ..run.campaign import CampaignRun, described_job, run_campaign, run_result
+from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.job import Job
 from ..run.progress import Show
@@ -60,10 +61,12 @@ def make_dataset(
     cluster: Callable[[Waiting, Job], AbstractContextManager[Client]],
     progress: AbstractContextManager[Show],
     tell: Callable[[str], None],
+    page: CampaignPage,
 ) -> CampaignRun:
     """Do the jobs of a campaign that are not done, and write the data set.
 
-    `cluster` starts a cluster or connects to one, for jobs such as the one it is given.
+    `cluster` starts a cluster or connects to one, for jobs such as the one it is given. `page` is
+    told of all jobs.
 
     LidarpoolError if the place holds something else, the cluster lacks something, or what all jobs
     need fails; its notes say what was kept.
@@ -79,7 +82,9 @@ def make_dataset(
         if making.resume and INDEX_FILE in there and RUN_FOLDER not in there:
             check_same(out, campaign)
             tell(f"{out} is complete: nothing is left to do")
-            return run_result(read_table(out), time.monotonic())
+            run = run_result(_shown(read_table(out), page), time.monotonic())
+            page.finish(run)
+            return run
         if RUN_FOLDER not in there and (found := sorted(there)):
             raise LidarpoolError(
                 f"{out} holds {found[0]}: a data set needs a folder of its own, give another with "
@@ -97,6 +102,7 @@ def make_dataset(
         if making.retry_failed:
             store.db.forget_failed_jobs()
         store.tidy_jobs()
+        deque(_shown(store.rows(), page), maxlen=0)
         if store.left:
             run = run_campaign(
                 lambda waiting, job: stack.enter_context(cluster(waiting, job)),
@@ -107,6 +113,7 @@ def make_dataset(
                 Waiting(making.wait_s, tell),
                 own=making.own,
                 progress=progress,
+                page=page,
                 backend=making.backend,
                 wait_s=making.wait_s,
                 patience_s=making.patience_s,
@@ -119,7 +126,14 @@ def make_dataset(
             store.db.close()
         else:
             store.remove()
+    page.finish(run)
     return run
+
+
+def _shown(rows: Iterable[JobRow], page: CampaignPage) -> Iterator[JobRow]:
+    for row in rows:
+        page.ended(row)
+        yield row
 
 
 def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: CampaignRun) -> None:
@@ -217,5 +231,5 @@ def failures(run: CampaignRun, most: int = 5) -> str:
         values = ", ".join(f"{name} {value}" for name, value in row.values.items())
         lines.append(f"job {row.name}{f' ({values})' if values else ''}: {row.error}")
     if (more := len(run.failed) - most) > 0:
-        lines.append(f"and {counted(more, 'more')}, see jobs.csv")
+        lines.append(f"and {more:,} more, see jobs.csv")
     return "\n".join(lines) + "\n--retry-failed does these jobs again."

@@ -19,12 +19,16 @@ class Pace:
     def __init__(self) -> None:
         self._first: tuple[float, int] | None = None
 
+    def rate(self, seconds: float, count: int) -> float:
+        """Rate, 1/s; 0 until something has been counted."""
+        begin, before = self._first = self._first or (seconds, count)
+        return (count - before) / (seconds - begin) if seconds > begin else 0.0
+
     def told(self, seconds: float, count: int, whole: int) -> str:
         """Rate and time left; empty until something has been counted."""
-        begin, before = self._first = self._first or (seconds, count)
-        if count == before or seconds == begin:
+        rate = self.rate(seconds, count)
+        if not rate:
             return ""
-        rate = (count - before) / (seconds - begin)
         sure = is_sure(count, whole, seconds) and count < whole
         left = f"  {time_in_words((whole - count) / rate)} left" if sure else ""
         return f"{in_words(rate)}/s{left}"

@@ -24,7 +24,7 @@ from ..base.storage import Storage
 from ..columns.cloud import CloudLike
 from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet
-from ..export.jobs import JobRow, Tally
+from ..export.jobs import JobRow, Tally, Value
 from ..export.sweeps import Sweeps
 from ..pipeline import EXPORT, INTERSECT, LIDAR, Crew, JobError, SurveyDriver
 from ..pipeline.failures import raise_if_failed, was_killed
@@ -61,6 +61,48 @@ class Entry:
     def name(self) -> str:
         """Its name in files."""
         return self.described.name
+
+
+@dataclass(frozen=True)
+class UnderWay:
+    """A job that is being cast or written, at one moment.
+
+    `stored` of its `scans` are in storage, with `points`; `seconds` is the casting time so far.
+    """
+
+    name: str
+    values: Mapping[str, Value]
+    stored: int
+    scans: int
+    points: int
+    seconds: float
+    writing: bool
+
+
+class CampaignPage:
+    """What a campaign tells its live page, see `lidarpool.live.campaign_page`; here of no page.
+
+    Methods are called in the run's thread and must return at once, `look` in a thread that removes
+    what is left of ended jobs.
+    """
+
+    def ended(self, row: JobRow) -> None:
+        """Show a job that has ended, in this run or an earlier one."""
+
+    def follow(self, partitions: Mapping[str, Partition]) -> None:
+        """Show what goes on from now on, on these partitions."""
+
+    def on_progress(self, progress: Progress, under_way: Callable[[], Sequence[UnderWay]]) -> None:
+        """Show the progress; KeyboardInterrupt if a user of the page has stopped the run."""
+
+    def look(self, row: JobRow, store: RunStore) -> None:
+        """Read points of a job that is done, before its parts are removed, if they are shown."""
+
+    def finish(self, run: CampaignRun) -> None:
+        """Show that the data set is complete."""
+
+    def stay(self) -> None:
+        """Keep the page until its user ends it."""
 
 
 @dataclass(frozen=True)
@@ -304,10 +346,16 @@ class CampaignDriver(Surveys):
     """Casts the jobs of a campaign, several at a time, and has them written."""
 
     def __init__(
-        self, cluster: Cluster, crew: Crew, store: CampaignStore, maker: _Maker, writer: _Writer
+        self,
+        cluster: Cluster,
+        crew: Crew,
+        store: CampaignStore,
+        maker: _Maker,
+        writer: _Writer,
+        page: CampaignPage,
     ) -> None:
         self._cluster, self._crew, self._store = cluster, crew, store
-        self._maker, self._writer = maker, writer
+        self._maker, self._writer, self._page = maker, writer, page
         # Slots of LIDAR that the long stages leave, as they are at the start.
         needed = slots_needed(cluster.job)[LIDAR]
         self._slots = max(1, cluster.partitions[LIDAR].slots - needed)
@@ -331,6 +379,12 @@ class CampaignDriver(Surveys):
         """A number that grows when something is committed."""
         under_way = sum(e.driver.progress for e in self._under_way if e.driver is not None)
         return self._committed + under_way
+
+    def under_way(self) -> list[UnderWay]:
+        """List the jobs that are cast, then those that are written."""
+        writer = self._writer
+        written = (*writer.writing.values(), *writer.here.values(), *writer.waiting)
+        return [_under_way(entry) for entry in (*self._under_way, *written)]
 
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
@@ -374,7 +428,7 @@ class CampaignDriver(Surveys):
                 break
             moved = True
             if isinstance(found, JobRow):
-                self._store.end(found)
+                self._commit(found)
                 continue
             try:
                 self._cluster.check(found.job)
@@ -417,7 +471,7 @@ class CampaignDriver(Surveys):
         self._under_way.remove(entry)
         self._committed += driver.progress
         totals = driver.book.stages.get(INTERSECT)
-        entry.casting = totals.seconds if totals else 0.0
+        entry.casting = _casting_seconds(driver)
         for record in driver.book.stages[INTERSECT].records if totals else ():
             self.books.add(record)
         entry.driver = None
@@ -442,19 +496,27 @@ class CampaignDriver(Surveys):
             words = f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz"
             if words not in (told := self.sensors.setdefault(name, words)).split("; "):
                 self.sensors[name] = f"{told}; {words}"
-        self._store.end(row)
-        self._drop(entry)
+        self._commit(row)
+        self._drop(entry, row)
 
     def _fail(self, entry: Entry, error: LidarpoolError) -> None:
         """Commit that a job has failed."""
         described = entry.described
-        self._store.end(failed_row(described.number, described.name, error, described))
+        self._commit(failed_row(described.number, described.name, error, described))
         self._drop(entry)
 
-    def _drop(self, entry: Entry) -> None:
+    def _commit(self, row: JobRow) -> None:
+        self._store.end(row)
+        self._page.ended(row)
+
+    def _drop(self, entry: Entry, row: JobRow | None = None) -> None:
         def drop() -> None:
-            with suppress(LidarpoolError, OSError):  # what is left does no harm
-                entry.store.remove()
+            try:
+                if row is not None:
+                    self._page.look(row, entry.store)
+            finally:
+                with suppress(LidarpoolError, OSError):  # what is left does no harm
+                    entry.store.remove()
 
         self._remover.submit(drop)
 
@@ -470,6 +532,24 @@ class CampaignDriver(Surveys):
             entry.store.db.close()
 
 
+def _casting_seconds(driver: SurveyDriver) -> float:
+    totals = driver.book.stages.get(INTERSECT)
+    return totals.seconds if totals else 0.0
+
+
+def _under_way(entry: Entry) -> UnderWay:
+    driver, db = entry.driver, entry.store.db
+    return UnderWay(
+        name=entry.name,
+        values=entry.described.values,
+        stored=db.scans_done,
+        scans=entry.job.survey.scan_count,
+        points=db.point_count,
+        seconds=entry.casting if driver is None else _casting_seconds(driver),
+        writing=driver is None,
+    )
+
+
 def run_campaign(
     connect: Callable[[Waiting, Job], Client],
     campaign: Campaign,
@@ -480,6 +560,7 @@ def run_campaign(
     *,
     own: bool,
     progress: AbstractContextManager[Show],
+    page: CampaignPage,
     backend: str | None,
     wait_s: float,
     patience_s: float,
@@ -499,6 +580,7 @@ def run_campaign(
             while not isinstance(first := maker.take(wait=True), Entry):
                 assert first is not None, "it was waited for"
                 store.end(first)
+                page.ended(first)
         except EOFError:
             return run_result(store.rows(), started, store=store)
         maker.put_back(first)
@@ -517,12 +599,15 @@ def run_campaign(
         probes = ((dataset.place, *probe), (store.storage, *crew.probe))
         sources = store.casting["lidarpool"]
         writer = _Writer(client, cluster.partitions[LIDAR], dataset, probes, sources)
-        driver = CampaignDriver(cluster, crew, store, maker, writer)
+        driver = CampaignDriver(cluster, crew, store, maker, writer, page)
         stack.callback(driver.close)
+        page.follow(cluster.partitions)
 
         def on_progress(_: Surveys, seconds: float) -> None:
             waits_for = LIDAR if crew.stages.waiting else ""
-            cluster.call(show, _progress(store, seconds, waits_for))
+            now = _progress(store, seconds, waits_for)
+            cluster.call(show, now)
+            cluster.call(lambda progress: page.on_progress(progress, driver.under_way), now)
 
         with nullcontext() if own else cluster.partitions_page():
             cluster.run(crew, lambda: driver, None, store.save, on_progress)

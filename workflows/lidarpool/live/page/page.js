@@ -1,4 +1,5 @@
 // The page: what is asked of the server, the controls, and the time that is played.
+import { ask } from "./ask.js";
 import { button, dual, element, iconButton, legend, menu, number, row, section, setIcon, slider, stepFor, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
 
@@ -12,9 +13,6 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
 const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
 const HIDDEN = "not shown";
-const TYPES = {
-  float32: Float32Array, float64: Float64Array, uint8: Uint8Array, uint16: Uint16Array, uint32: Uint32Array, int32: Int32Array,
-};
 
 const $ = (id) => document.getElementById(id);
 const picture = new Picture($("canvas"), $("labels"), $("axes"), $("scale"), () => moved());
@@ -30,21 +28,6 @@ let playing = false;
 let picked = []; // points: {place, local, columns}
 
 // -- the server --------------------------------------------------------------------------
-
-async function ask(what, asked = {}, signal = undefined) {
-  const query = new URLSearchParams(Object.entries(asked).filter(([, value]) => value !== undefined));
-  const answer = await fetch(`${what}?${query}`, { signal });
-  if (!answer.ok) throw new Error(`${what}: ${answer.status}`);
-  const bytes = await answer.arrayBuffer();
-  const length = new DataView(bytes).getUint32(0, true);
-  const header = JSON.parse(new TextDecoder().decode(new Uint8Array(bytes, 4, length)));
-  const arrays = {};
-  for (const [name, type, shape, at] of header.arrays) {
-    arrays[name] = new TYPES[type](bytes, 4 + length + at, shape.reduce((a, b) => a * b, 1));
-    arrays[name].shape = shape;
-  }
-  return { ...header, arrays };
-}
 
 let lost = false;
 function failed(error) {
@@ -815,8 +798,11 @@ function mouse() {
 }
 
 async function begin() {
-  setTheme(savedTheme() ?? (systemDark.matches ? "dark" : "light"));
-  systemDark.addEventListener("change", () => { if (!savedTheme()) setTheme(systemDark.matches ? "dark" : "light"); });
+  const useTheme = () => setTheme(savedTheme() ?? (systemDark.matches ? "dark" : "light"));
+  useTheme();
+  systemDark.addEventListener("change", useTheme);
+  addEventListener("storage", useTheme); // the page around this one has changed it
+  document.documentElement.classList.toggle("plain", new URLSearchParams(location.search).has("plain"));
   say("Reading …");
   const told = await ask("state");
   picture.resize();

@@ -1,0 +1,169 @@
+// The page of a campaign: how many jobs are done, a table of some, points of one, and charts.
+import { ask } from "./ask.js";
+import { element, iconButton } from "./controls.js";
+
+const NEWS_MS = 1000;
+const SETTLED_MS = 1500; // after its page is loaded, the viewer of a job has drawn
+
+const $ = (id) => document.getElementById(id);
+const whole = (value) => Math.round(value).toLocaleString("en");
+const several = (count, what) => `${whole(count)} ${what}${count === 1 ? "" : "s"}`;
+
+// 12,345 up to six digits, then 1.23 M
+function short(value) {
+  for (const [size, letter] of [[1e12, "T"], [1e9, "G"], [1e6, "M"]]) {
+    if (value >= size) return `${(value / size).toPrecision(3)} ${letter}`;
+  }
+  return whole(value);
+}
+
+const inSeconds = (value) => `${value >= 100 ? whole(value) : value.toPrecision(2)} s`;
+
+function duration(seconds) {
+  if (seconds < 100) return `${whole(seconds)} s`;
+  const minutes = Math.round(seconds / 60);
+  return minutes < 100 ? `${minutes} min` : `${whole(Math.floor(minutes / 60))} h ${String(minutes % 60).padStart(2, "0")} min`;
+}
+
+// -- light or dark -----------------------------------------------------------------------
+
+const systemDark = matchMedia("(prefers-color-scheme: dark)");
+const saved = () => { try { return localStorage.getItem("lidarpool-theme"); } catch { return null; } };
+const setTheme = () => { document.documentElement.dataset.theme = saved() ?? (systemDark.matches ? "dark" : "light"); };
+
+function switchTheme() {
+  const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+  try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
+  document.documentElement.dataset.theme = theme;
+}
+
+// -- the run -----------------------------------------------------------------------------
+
+function meter(share) {
+  return element("span", { className: "meter" }, element("b", { style: { width: `${100 * share}%` } }));
+}
+
+function showRun(told) {
+  document.title = `${told.over ? "" : `${Math.floor((100 * (told.done + told.failed)) / told.count)}% `}${told.title} - lidarpool`;
+  $("title").textContent = told.title;
+  $("state").textContent = told.state;
+  $("count").replaceChildren(element("b", { textContent: whole(told.done) }), ` of ${several(told.count, "job")} done`);
+  const busy = told.casting + told.writing;
+  $("bar").replaceChildren(...[["done", told.done], ["failed", told.failed], ["busy", busy]].map(
+    ([className, count]) => element("i", { className, style: { width: `${(100 * count) / told.count}%` } }),
+  ));
+  const entries = [
+    ["failed", whole(told.failed), "failed", told.failed > 0], ["under way", told.over ? "" : whole(busy), "busy"],
+    ["rate", told.rate], ["left", told.left], ["time", told.seconds ? duration(told.seconds) : ""],
+    ["points", short(told.points)], ["rays", short(told.rays)],
+  ];
+  $("figures").replaceChildren(...entries.filter(([, value]) => value !== "").map(([name, value, className, bad]) => {
+    const mark = className ? [element("i", { className })] : [];
+    return element("div", { className: bad ? "bad" : "" }, element("dt", {}, ...mark, name), element("dd", { textContent: value }));
+  }));
+  $("slots").replaceChildren(...told.slots.map(([name, busySlots, slots]) => element(
+    "div", {}, element("span", { textContent: `${name}, slots busy` }),
+    element("span", { textContent: `${busySlots} / ${slots}` }), meter(slots ? busySlots / slots : 0),
+  )));
+  stop.textContent = told.over ? "Close" : told.stopping ? "Stopping" : "Stop";
+}
+
+// -- the table ---------------------------------------------------------------------------
+
+const cell = (text, className = "") => element("td", { textContent: text, className });
+
+// A path may be broken after its dots.
+const broken = (name) => name.split(/(?<=\.)/).flatMap((part, k) => (k ? [element("wbr"), part] : [part]));
+
+function group(title, remark, width, rows) {
+  if (!rows.length) return [];
+  const head = element("th", { className: "group", colSpan: width }, `${title} `, element("small", { textContent: remark }));
+  return [element("tbody", {}, element("tr", {}, head), ...rows)];
+}
+
+function showJobs(told) {
+  const width = told.names.length + 4;
+  const line = (job, state, points, seconds) => element(
+    "tr", {}, cell(job.name), state, cell(points), cell(seconds), ...job.values.map((value) => cell(value)),
+  );
+  const busy = told.casting + told.writing;
+  const underWay = told.under_way.map((job) => {
+    const state = cell(job.writing ? "writing" : "casting", "text");
+    state.append(meter(job.share));
+    return line(job, state, whole(job.points), inSeconds(job.seconds));
+  });
+  const failed = told.failures.flatMap((job, k) => {
+    const own = line(job, cell("failed", "text"), "", "");
+    if (told.failures[k + 1]?.error === job.error) return [own]; // a reason stands below all that have it
+    const reason = element("td", { className: "reason", colSpan: width }, element("span", { textContent: job.error }));
+    return [own, element("tr", {}, reason)];
+  });
+  const ended = told.ended.map((job) => line(job, cell("done", "text"), whole(job.points), inSeconds(job.seconds)));
+  const last = (count, shown) => (count > shown ? `the last ${shown} of ${whole(count)}` : whole(count));
+  const bodies = [
+    ...group("Under way", busy > underWay.length ? `the first ${underWay.length} of ${whole(busy)}` : whole(busy), width, underWay),
+    ...group("Failed", last(told.failed, told.failures.length), width, failed),
+    ...group("Done", last(told.done, told.ended.length), width, ended),
+  ];
+  const heads = [["job"], ["state", "text"], ["points"], ["casting"], ...told.names.map((name) => [name])];
+  const head = element("thead", {}, element("tr", {}, ...heads.map(([name, className = ""]) => element("th", { className }, ...broken(name)))));
+  const table = element("table", {}, head, ...bodies);
+  if (table.innerHTML !== $("jobs").firstElementChild.innerHTML) $("jobs").replaceChildren(table);
+}
+
+// -- points of a job ---------------------------------------------------------------------
+
+let shown = null, follows = true, isLoading = false;
+
+// The viewer of a job takes the place of the one before once it has drawn.
+function showCloud(newest) {
+  if (!newest || isLoading || newest[0] === shown || (shown !== null && !follows)) return;
+  const [number, name] = newest;
+  const before = [...$("frames").children];
+  const frame = element("iframe", { src: `job/${number}/?plain`, title: `points of job ${name}`, className: "coming" });
+  isLoading = true;
+  shown = number;
+  frame.onload = () => setTimeout(() => {
+    frame.className = "";
+    isLoading = false;
+    setTimeout(() => before.forEach((old) => old.remove()), 400);
+    const box = element("input", { type: "checkbox", checked: follows, onchange: () => { follows = box.checked; } });
+    $("shown").replaceChildren(
+      element("span", {}, "Points of ", element("b", { textContent: `job ${name}` })),
+      element("a", { href: `job/${number}/`, target: "_blank", textContent: "open with all controls" }),
+      element("label", {}, box, "go on to newer jobs"),
+    );
+  }, SETTLED_MS);
+  $("frames").append(frame);
+}
+
+// -- news --------------------------------------------------------------------------------
+
+const stop = element("button", { type: "button", className: "stop", textContent: "Stop" });
+stop.onclick = () => fetch("stop", { method: "POST", headers: { "X-Lidarpool": "1" } });
+
+async function begin() {
+  setTheme();
+  systemDark.addEventListener("change", setTheme);
+  $("buttons").append(iconButton("theme", "Light or dark", switchTheme), stop);
+  let charts = 0;
+  for (;;) {
+    const told = await ask("news", { newest: follows && !document.hidden ? 1 : undefined });
+    showRun(told);
+    showJobs(told);
+    showCloud(told.newest);
+    if (told.charts !== charts) {
+      charts = told.charts;
+      $("charts").innerHTML = (await ask("charts")).svg;
+    }
+    await new Promise((done) => setTimeout(done, document.hidden ? 4 * NEWS_MS : NEWS_MS));
+  }
+}
+
+begin().catch((error) => {
+  console.warn(error);
+  stop.hidden = true;
+  $("slots").replaceChildren(); // it goes on no more
+  $("state").textContent = "The server of this page has ended.";
+  $("state").className = "bad";
+});
