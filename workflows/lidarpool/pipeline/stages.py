@@ -27,6 +27,7 @@ from poolpart import (
     telling_departure,
 )
 
+from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.parts import pack
 from ..sensor import Survey
@@ -195,6 +196,11 @@ def _collected(
         try:
             yield replace(_stored(me, storage, batches[first], stop, name), job=order.job)
         except ScanError as error:
+            yield Failed(f"stage {COLLECT} failed: {error}", order.job)
+        except LidarpoolError as error:
+            # The folder of a job goes with it, and an order that came twice may be late.
+            if not isinstance(error.__cause__, FileNotFoundError):
+                raise
             yield Failed(f"stage {COLLECT} failed: {error}", order.job)
 
 
