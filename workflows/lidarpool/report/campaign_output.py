@@ -103,7 +103,7 @@ def make_dataset(
         )
         stack.enter_context(store.kept_on_error())
         if making.retry_failed:
-            store.db.forget_failed_jobs()
+            store.forget_failed()
         store.tidy_jobs()
         if store.left:
             run = run_campaign(

@@ -57,6 +57,11 @@ class CampaignStore(KeptRun):
         """How many jobs have failed."""
         return sum(self.db.jobs.values())
 
+    def forget_failed(self) -> None:
+        """Let the jobs that have failed be done again."""
+        self.db.forget_failed_jobs()
+        self.resumed = len(self.db.jobs)
+
     def rows(self) -> Iterator[JobRow]:
         """Yield the rows of the jobs that have ended, by number."""
         for row in self.db.job_rows():
