@@ -14,8 +14,8 @@ import fsspec
 import numpy as np
 import pytest
 from fsspec.registry import _registry
-from tests.lidarpool.drives import the_scene, the_sweeps, write_set
 from tests.clusters import thread_cluster
+from tests.lidarpool.drives import the_scene, the_sweeps, write_set
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of, drive
 from tests.system.test_resume import DRIVERS, SCANS
