@@ -415,7 +415,7 @@ def test_noise_of_a_function_that_has_a_seed_or_no_effect_is_kept():
         (lambda number, rng: job(keep_every=0), "job 1: keep_every is 0"),
         (
             lambda number, rng: job(*[3] * number),
-            "job 1 has the value 'drawn', which job 0 has not",
+            "job 1 has the value 'drawn', which the first has not",
         ),
         (
             lambda number, rng: CampaignJob(job().scene, job().survey, {"a": [1]}),

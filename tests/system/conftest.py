@@ -138,6 +138,7 @@ class OutsideCluster:
         self.folder = folder
         self.processes: dict[str, subprocess.Popen[bytes]] = {}
         self.workers: dict[str, int] = {}  # {process: how many are in it}
+        self._added = 0  # workers, those that were killed among them
         file = folder / "scheduler.json"
         self._start(
             "scheduler", "--port", "0", "--no-dashboard",
@@ -162,7 +163,8 @@ class OutsideCluster:
         """
         spec = {}
         for partition, slots in workers:
-            name = f"{partition}-{len(spec) + sum(self.workers.values())}"
+            name = f"{partition}-{self._added}"
+            self._added += 1
             options = {"name": name, "nthreads": slots, "resources": {partition: slots}}
             options |= {"host": "127.0.0.1", "dashboard": False}
             spec[name] = {

@@ -14,8 +14,10 @@ import fsspec
 import numpy as np
 import pytest
 from fsspec.registry import _registry
+from tests.clusters import thread_cluster
 from tests.lidarpool.drives import the_scene, the_sweeps, write_set
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
+from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of, drive
 from tests.system.test_resume import DRIVERS, SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
@@ -278,3 +280,24 @@ def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     assert report["resumed_scans"] == report["scans"] == SCANS
     assert Storage.at(f"{url}/run").sizes() == Storage.at(f"{url}/run/parts").sizes() == {}
     assert {path.name for path in here.iterdir()} == {"s.yaml"}
+
+
+@pytest.mark.slow
+def test_a_campaign_goes_to_the_bucket_though_its_driver_is_killed(
+    environment, lidarpool, tmp_path, no_pictures
+):
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "c.yaml").write_text(CAMPAIGN)
+    url = f"{BUCKET}/datasets/killed"
+    with thread_cluster({"GPU": 1}, {"LIDAR": 5}) as cluster:
+        address = cluster.scheduler_address
+        run = ["run", tmp_path / "c.yaml", "-q", "--scheduler", address, "--out"]
+        assert lidarpool(*run, tmp_path / "here").code == 0
+        kills = [("COMMIT", 2), ("END", 2), ("FINISH", 1), ("REMOVE", 1), ("", 1)]
+        assert drive(tmp_path, address, kills, "--out", url) == [-9] * 4 + [0]
+    system, folder = fsspec.url_to_fs(url)
+    system.invalidate_cache()
+    found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}
+    jobs = {n: data for n, data in found.items() if n.startswith(("jobs/", ".jobs/"))}
+    assert jobs == bytes_of(tmp_path / "here")
+    assert not any(name.startswith("run/") or name.endswith("-dataset") for name in found)

@@ -170,6 +170,8 @@ def run(scenarios: tuple[Path, ...], **given: Any) -> None:
         )
     if given["resume"] and given["fresh"]:
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
+    if given["retry_failed"] and (given["fresh"] or given["number"] is not None):
+        raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
     _run(scenarios, **given)
 
 

@@ -167,6 +167,11 @@ class LongStages:
     def _pipe(self, name: str, capacity: int) -> Pipe:
         return Pipe(f"lidarpool-{self.run}-{name}", capacity, self.client)
 
+    @property
+    def lacks_slot(self) -> bool:
+        """Whether a stage whose worker has died waits for a free slot."""
+        return any(task.dead_since is not None for task in self._tasks.values())
+
     # -- starting --------------------------------------------------------------------------
 
     def _start(self) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 import time
 from collections import deque
@@ -16,7 +17,7 @@ from distributed import Client
 
 from ..base.errors import LidarpoolError, explained
 from ..base.software import difference, software
-from ..base.storage import Storage
+from ..base.storage import Storage, target_of
 from ..base.words import counted
 from ..export.dataset import INDEX_FILE, DataSet
 from ..export.folder import result_folder
@@ -34,6 +35,13 @@ from .campaign_report import write_card
 from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
+
+# What there may be in the folder of a data set, of any format.
+_OWN = re.compile(
+    r"run|campaign\.json|dataset\.json|README\.md|report\.(html|json)|pictures|splits|"
+    r"jobs\.(csv|parquet)|\.?jobs|sweeps|boxes|sequences|poses|samples|maps|v1\.0-lidarpool|"
+    r"bags|points|job-.+|[0-9a-f]{16}-dataset"
+)
 
 
 @dataclass(frozen=True)
@@ -74,12 +82,15 @@ def make_dataset(
     out = Storage.at(str(making.out), durable=False)
     dataset = DataSet(out, campaign.keep.format, campaign.keep.layout)
     dataset.check_installed()
+    resume = making.resume or making.retry_failed
+    if making.fresh and resume:
+        raise LidarpoolError("fresh removes the run that resume and retry_failed go on with.")
     place = f"{out}/{RUN_FOLDER}"
     with result_folder(making.out), ExitStack() as stack:
         if making.fresh:
             _remove_dataset(out, place)
         there = set(out.entries())
-        if making.resume and INDEX_FILE in there and RUN_FOLDER not in there:
+        if resume and INDEX_FILE in there and RUN_FOLDER not in there:
             check_same(out, campaign)
             tell(f"{out} is complete: nothing is left to do")
             run = run_result(_shown(read_table(out), page), time.monotonic())
@@ -96,11 +107,11 @@ def make_dataset(
             making.backend or "auto",
             place,
             making.parts,
-            resume=making.resume or making.retry_failed,
+            resume=resume,
         )
         stack.enter_context(store.kept_on_error())
         if making.retry_failed:
-            store.db.forget_failed_jobs()
+            store.forget_failed()
         store.tidy_jobs()
         deque(_shown(store.rows(), page), maxlen=0)
         if store.left:
@@ -217,6 +228,11 @@ def _remove_dataset(out: Storage, place: str) -> None:
     if RUN_FOLDER not in there and CAMPAIGN_FILE not in there:
         raise LidarpoolError(
             f"{out} holds {sorted(there)[0]} and no data set of a campaign: give another folder."
+        )
+    if foreign := sorted(name for name in there if not _OWN.fullmatch(target_of(name))):
+        raise LidarpoolError(
+            f"{out} holds {foreign[0]}, which is not of a data set: move it elsewhere, or give "
+            "another folder."
         )
     remove_run(place)
     with explained(f"{out} cannot be removed"):

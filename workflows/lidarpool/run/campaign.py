@@ -16,7 +16,14 @@ from typing import Any
 
 from distributed import Client, Future
 
-from poolpart import Partition, Recorder, TaskRecord, fetch_available
+from poolpart import (
+    Partition,
+    Recorder,
+    TaskRecord,
+    WorkerLeft,
+    fetch_available,
+    look_for_tasks,
+)
 
 from ..base.errors import LidarpoolError, explained
 from ..base.software import call_alike
@@ -43,6 +50,8 @@ READY = 2  # jobs that are made ahead
 ANNOUNCED = 2  # jobs whose scans stage 1 has yet to describe
 SPARE = 8  # jobs under way beside two for each GPU slot
 WRITING = 2  # jobs that wait to be written, for each free slot of LIDAR
+BEGIN_S = 10.0  # for any job to begin to be written; then the driver writes one
+SENSORS_TOLD = 8  # kinds of a sensor that are named
 STOP_S = 10.0  # for a job that is being made when the run ends
 
 
@@ -53,6 +62,7 @@ class Entry:
     described: Described
     job: Job
     store: RunStore
+    sweeps: Sweeps
     driver: SurveyDriver | None = None
     row: JobRow | None = None
     casting: float = 0.0  # seconds of its tasks
@@ -212,12 +222,15 @@ class _Maker:
         try:
             described = self._campaign.describe(number)
             job = described_job(described, self._columns, self._scenes, **self._options)
-        except (LidarpoolError, ValueError, TypeError, ArithmeticError, LookupError) as error:
+            sweeps = Sweeps.of(job.survey, job.scene)
+        except MemoryError:
+            raise
+        except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
             told = str(error) if isinstance(error, LidarpoolError) else repr(error)
             name = described.name if described else f"{number:04}"
             return failed_row(number, name, told, described)
-        return Entry(described, job, self._store.store_of(described.name, job))
+        return Entry(described, job, self._store.store_of(described.name, job), sweeps)
 
     def _put(self, found: Entry | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():
@@ -225,7 +238,7 @@ class _Maker:
                 self._ready.put(found, timeout=0.1)
                 return True
         if isinstance(found, Entry):
-            found.store.db.close()
+            found.store.close()
         return False
 
     def close(self) -> None:
@@ -237,7 +250,7 @@ class _Maker:
             with suppress(Empty):
                 entries += [one for one in [self._ready.get_nowait()] if isinstance(one, Entry)]
         for entry in entries:
-            entry.store.db.close()
+            entry.store.close()
 
 
 def write_job(
@@ -258,8 +271,18 @@ def write_job(
 def _written(
     dataset: DataSet, number: int, name: str, cloud: CloudLike, sweeps: Sweeps
 ) -> dict[str, Any]:
-    tally = Tally.of(cloud)
-    dataset.write_job(number, name, cloud, sweeps)
+    """Write a job; JobError if that fails, LidarpoolError if it is because of the place."""
+    try:
+        tally = Tally.of(cloud)
+        dataset.write_job(number, name, cloud, sweeps)
+    except WorkerLeft:
+        raise
+    except Exception as error:
+        why = error if isinstance(error, OSError) else error.__cause__
+        if isinstance(why, OSError):  # a full disk fails all jobs
+            told = f"{error}" if isinstance(error, LidarpoolError) else f"job {name}: {error}"
+            raise LidarpoolError(told) from error
+        raise JobError(str(error) if isinstance(error, LidarpoolError) else repr(error)) from error
     return {"points": tally.points, "sha256": tally.sha256, "classes": tally.classes}
 
 
@@ -278,6 +301,7 @@ class _Writer:
     here: dict[Done[Any], Entry] = field(default_factory=dict)
     _thread: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "write"))
     hidden: bool = False
+    _moved_at: float = field(default_factory=time.monotonic)
 
     def __len__(self) -> int:
         return len(self.waiting) + len(self.writing) + len(self.here)
@@ -289,7 +313,7 @@ class _Writer:
     def step(self, slots: int) -> list[tuple[Entry, dict[str, Any] | LidarpoolError]]:
         """Submit what there is room for; returns the jobs that were written, or why they were not.
 
-        LidarpoolError if the data set cannot be written to.
+        Errors of single jobs are JobErrors; others are of the place, or of a worker's software.
         """
         while self.waiting and len(self.writing) < WRITING * slots:
             entry = self.waiting.popleft()
@@ -313,28 +337,46 @@ class _Writer:
                 raise_if_failed(future, "writing it")
                 self.waiting.append(entry)  # lost: it is done again
             except LidarpoolError as error:
-                ended.append((entry, error))
+                of_job = isinstance(error.__cause__, JobError)
+                ended.append((entry, JobError(str(error)) if of_job else error))
         for result in [one for one in self.here if one.done()]:
             entry = self.here.pop(result)
             try:
                 ended.append((entry, result.result()))
             except LidarpoolError as error:
                 ended.append((entry, error))
+        self._relieve(bool(ended))
         return ended
+
+    def _relieve(self, moved: bool) -> None:
+        """Write a job here if none has begun for long: all slots are held, or have gone."""
+        now = time.monotonic()
+        if moved or self.here or not self.writing:
+            self._moved_at = now
+        elif now - self._moved_at > BEGIN_S:
+            self._moved_at = now
+            keys = [future.key for future in self.writing]
+            seen = look_for_tasks(self.client, self.partition.name, keys)
+            if any(at.started and not seen.out_of_reach(key) for key, at in seen.tasks.items()):
+                return
+            future = next(iter(self.writing))
+            entry = self.writing.pop(future)
+            future.cancel()
+            self._write_here(entry)
 
     def _submitted(self, entry: Entry) -> Future:
         number, name = entry.described.number, entry.name
         future: Future = self.partition.submit(
             call_alike, self.sources, write_job, self.dataset, self.probes, number, name,
-            entry.store.points(), Sweeps.of(entry.job.survey, entry.job.scene), priority=5,
+            entry.store.points(), entry.sweeps, priority=5,
         )  # fmt: skip
         return future
 
     def _write_here(self, entry: Entry) -> None:
         number, name = entry.described.number, entry.name
-        sweeps = Sweeps.of(entry.job.survey, entry.job.scene)
         points = entry.store.points()
-        self.here[self._thread.submit(_written, self.dataset, number, name, points, sweeps)] = entry
+        written = self._thread.submit(_written, self.dataset, number, name, points, entry.sweeps)
+        self.here[written] = entry
 
     def close(self) -> None:
         """Write nothing more."""
@@ -405,12 +447,19 @@ class CampaignDriver(Surveys):
                 self._leave(entry)
                 self._writer.add(entry)
                 moved = True
-        for entry, made in self._writer.step(self._slots) if len(self._writer) else ():
-            if isinstance(made, LidarpoolError):
-                self._fail(entry, made)
+        slots = 0 if self._crew.stages.lacks_slot else self._slots  # that has to come first
+        for_all: LidarpoolError | None = None
+        for entry, made in self._writer.step(slots) if len(self._writer) else ():
+            if isinstance(made, JobError):
+                self._fail(entry, made, written=True)
+            elif isinstance(made, LidarpoolError):
+                self._writer.add(entry)  # it is not lost
+                for_all = made
             else:
                 self._end(entry, made)
             moved = True
+        if for_all is not None:
+            raise for_all
         return moved
 
     # -- jobs come and go --------------------------------------------------------------------
@@ -485,7 +534,7 @@ class CampaignDriver(Surveys):
             split=described.split,
             values=dict(described.values),
             scans=survey.scan_count,
-            sweeps=len(Sweeps.of(survey, entry.job.scene)),
+            sweeps=len(entry.sweeps),
             rays=survey.ray_count,
             hits=db.hits,
             seconds=entry.casting,
@@ -494,27 +543,32 @@ class CampaignDriver(Surveys):
         for carried in survey.carried:
             sensor, name = carried.sensor, carried.name or "lidar"
             words = f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz"
-            if words not in (told := self.sensors.setdefault(name, words)).split("; "):
-                self.sensors[name] = f"{told}; {words}"
+            told = self.sensors.setdefault(name, words).split("; ")
+            if words not in told and len(told) <= SENSORS_TOLD:
+                more = words if len(told) < SENSORS_TOLD else "and others"
+                self.sensors[name] = "; ".join([*told, more])
         self._commit(row)
         self._drop(entry, row)
 
-    def _fail(self, entry: Entry, error: LidarpoolError) -> None:
-        """Commit that a job has failed."""
+    def _fail(self, entry: Entry, error: LidarpoolError, *, written: bool = False) -> None:
+        """Commit that a job has failed; some of its files may have been written."""
         described = entry.described
         self._commit(failed_row(described.number, described.name, error, described))
-        self._drop(entry)
+        self._drop(entry, written=written)
 
     def _commit(self, row: JobRow) -> None:
         self._store.end(row)
         self._page.ended(row)
 
-    def _drop(self, entry: Entry, row: JobRow | None = None) -> None:
+    def _drop(self, entry: Entry, row: JobRow | None = None, *, written: bool = False) -> None:
         def drop() -> None:
             try:
                 if row is not None:
                     self._page.look(row, entry.store)
             finally:
+                if written:
+                    with suppress(LidarpoolError):
+                        self._writer.dataset.remove_job(entry.described.number, entry.name)
                 with suppress(LidarpoolError, OSError):  # what is left does no harm
                     entry.store.remove()
 
@@ -529,7 +583,7 @@ class CampaignDriver(Surveys):
         for entry in (*self._under_way, *left):
             with suppress(LidarpoolError):
                 entry.store.save(now=True)
-            entry.store.db.close()
+            entry.store.close()
 
 
 def _casting_seconds(driver: SurveyDriver) -> float:
@@ -576,14 +630,8 @@ def run_campaign(
     with ExitStack() as stack:
         maker = _Maker(campaign, store, dataset.columns, **options)
         stack.callback(maker.close)
-        try:
-            while not isinstance(first := maker.take(wait=True), Entry):
-                assert first is not None, "it was waited for"
-                store.end(first)
-                page.ended(first)
-        except EOFError:
+        if (first := _first(maker, store, page)) is None:
             return run_result(store.rows(), started, store=store)
-        maker.put_back(first)
         client = connect(waiting, first.job)
         show = stack.enter_context(progress)
         probe = (f"{store.db.meta['mark']}-dataset", store.db.meta["mark"].encode())
@@ -591,10 +639,22 @@ def run_campaign(
             dataset.place.prepare()
             dataset.place.write(*probe)
         stack.callback(_remove_probe, dataset.place, probe[0])
-        needed = slots_needed(first.job)
-        needed[LIDAR] += 1  # which jobs are written in
-        left = first.job.survey.scan_count * len(store.left)
-        cluster = Cluster(client, first.job, store, tell, waiting, needed, left)
+        while True:
+            needed = slots_needed(first.job)
+            needed[LIDAR] += 1  # which jobs are written in
+            left = first.job.survey.scan_count * len(store.left)
+            try:
+                cluster = Cluster(client, first.job, store, tell, waiting, needed, left)
+                break
+            except JobError as error:  # it is too large for the workers; others may not be
+                described = first.described
+                row = failed_row(described.number, described.name, error, described)
+                store.end(row)
+                page.ended(row)
+                maker.take()  # that one
+                first.store.remove()
+                if (first := _first(maker, store, page)) is None:
+                    return run_result(store.rows(), started, store=store)
         crew = cluster.crew(store.storage, store.db.meta["mark"])
         probes = ((dataset.place, *probe), (store.storage, *crew.probe))
         sources = store.casting["lidarpool"]
@@ -618,6 +678,19 @@ def run_campaign(
     if writer.hidden:
         notes.append(f"no worker of {LIDAR} sees {dataset.place}: the driver wrote the data set")
     return run_result(store.rows(), started, stages, notes, driver.sensors, store)
+
+
+def _first(maker: _Maker, store: CampaignStore, page: CampaignPage) -> Entry | None:
+    """Wait for a job that can be made, which stays the next to be taken; None without any."""
+    try:
+        while not isinstance(found := maker.take(wait=True), Entry):
+            assert found is not None, "it was waited for"
+            store.end(found)
+            page.ended(found)
+    except EOFError:
+        return None
+    maker.put_back(found)
+    return found
 
 
 def _remove_probe(place: Storage, name: str) -> None:

@@ -10,8 +10,9 @@ from pathlib import Path
 from ..base.errors import LidarpoolError
 from ..base.software import software
 from ..base.storage import Storage
+from ..columns.parts import files_of
 from ..export.jobs import JobRow
-from ..pipeline.database import RunDatabase, parts_folder
+from ..pipeline.database import RunDatabase, mark_of_folder, parts_folder
 from .job import Job
 from .store import JOBS, KeptRun, RunStore, remove_run
 
@@ -56,6 +57,11 @@ class CampaignStore(KeptRun):
         """How many jobs have failed."""
         return sum(self.db.jobs.values())
 
+    def forget_failed(self) -> None:
+        """Let the jobs that have failed be done again."""
+        self.db.forget_failed_jobs()
+        self.resumed = len(self.db.jobs)
+
     def rows(self) -> Iterator[JobRow]:
         """Yield the rows of the jobs that have ended, by number."""
         for row in self.db.job_rows():
@@ -73,7 +79,22 @@ class CampaignStore(KeptRun):
         Storage.at(f"{self.place}/{JOBS}").prepare()
         # The campaign keeps with which backend and software all of its jobs are cast.
         place, parts = self._place_of(name), self.storage.url
+        if (earlier := Storage.at(place)).entries():
+            try:
+                return RunStore(job, place, parts, resume=True, backend="auto")
+            except LidarpoolError:  # damaged, or files that the description names have changed
+                remove_run(earlier.url)
         return RunStore(job, place, parts, resume=True, backend="auto")
+
+    def remove(self) -> None:
+        """Remove the store, and parts of jobs that were written late: their jobs had them twice."""
+        for name in self.storage.entries():
+            if mark := mark_of_folder(name):
+                folder = Storage.at(self.storage.path(name))
+                with suppress(OSError):
+                    folder.remove(files_of(folder, mark))
+                folder.remove_folder()
+        super().remove()
 
     def folder_of(self, store: RunStore) -> str:
         """Folder of a job's parts in the storage of the campaign."""

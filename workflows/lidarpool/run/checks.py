@@ -26,7 +26,7 @@ from raybeam import available_backends
 from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
-from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
+from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT, JobError
 from ..simulator.memory import MB, cast_bytes
 from ..simulator.world import AUTO_TAKES
 from .job import Job
@@ -75,7 +75,7 @@ def find_workers(
     while True:
         looked = time.monotonic()
         try:
-            pool = _survey_pool(client, needed)
+            pool = _survey_pool(client, needed, job)
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             backend = common_backend(client, wanted, casting, advice)
             for worker in casting:
@@ -122,24 +122,28 @@ def want_nothing(client: Client, names: Iterable[str]) -> None:
 
 
 def check_memory(job: Job, backend: str, room: float, worker: str) -> None:
-    """Refuse scans and batches for which a worker has too little memory: `room`, bytes a slot."""
+    """Refuse scans and batches for which a worker has too little memory: `room`, bytes a slot.
+
+    JobError: another job may fit.
+    """
     takes = partial(cast_bytes, job.scene, job.survey, on_device=backend == "cuda")
     scan, all_scans = map(takes, (1, job.survey.scan_count))
     limit = f"more than the {room / MB:,.0f} MB that {worker} has for each slot"
     if scan > room:
-        raise LidarpoolError(
+        raise JobError(
             f"Casting one scan takes about {scan / MB:,.0f} MB, {limit}: take a smaller step_deg, "
             "fewer rays or columns, or give GPU workers a larger --memory-limit."
         )
     if min(job.batch_mb * MB, all_scans) > room:
-        raise LidarpoolError(
+        raise JobError(
             f"batch_mb is {job.batch_mb:,}, {limit}: make it smaller, or give GPU workers a larger "
             "--memory-limit."
         )
 
 
-def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
-    """All workers of the cluster, after checking that they suffice for a survey."""
+def _survey_pool(client: Client, needed: Mapping[str, int], job: Job) -> Pool:
+    """All workers of the cluster, after checking that they suffice for surveys such as a job."""
+    writing = ", and writing jobs of a campaign" if needed[LIDAR] > job.collectors + 2 else ""
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
@@ -155,7 +159,7 @@ def _survey_pool(client: Client, needed: Mapping[str, int]) -> Pool:
         raise LidarpoolError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
-        LIDAR: f"{GENERATE}, {SORT} and {needed[LIDAR] - 2} x {COLLECT}",
+        LIDAR: f"{GENERATE}, {SORT} and {job.collectors} x {COLLECT}{writing}",
         OTHER: "path planning; or leave it out with --no-plan",
     }
     try:

@@ -109,7 +109,7 @@ class KeptRun:
             try:
                 self._claim(here, resume)
             except BaseException:
-                self._close()
+                self.close()
                 raise
         except BaseException:
             if made:
@@ -307,13 +307,13 @@ class KeptRun:
             if self._remote and self._remote.lost:
                 self.db.close()
                 raise
-            self._close()
+            self.close()
             if self.kept and (self._folder / FILE).exists():
                 error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
             raise
 
-    def _close(self) -> None:
-        """Close the database after an error; remove a run that has committed nothing."""
+    def close(self) -> None:
+        """Close the database of an unfinished run; remove one that has committed nothing."""
         self.db.close()
         if not self.kept:
             with suppress(OSError, LidarpoolError):

@@ -6,6 +6,7 @@ import hashlib
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -221,7 +222,7 @@ class Campaign:
     def names(self) -> tuple[str, ...]:
         """Names of what differs from job to job, in the order of the table's columns.
 
-        Of a function, those of its first job, which is made to be asked.
+        Of a function, those of its first job that can be made, which is made to be asked.
         """
         return self._jobs.names
 
@@ -300,13 +301,16 @@ class _Made:
     """Jobs that a function makes."""
 
     def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
-        self._make, self._seed = make, seed
+        self._make, self._count, self._seed = make, count, seed
 
     choices: Mapping[str, str] = MappingProxyType({})
 
     @cached_property
     def names(self) -> tuple[str, ...]:
-        return tuple(self._made(0).values)
+        for number in range(self._count):
+            with suppress(LidarpoolError):  # one that fails must not end the others
+                return tuple(self._made(number).values)
+        return ()
 
     @property
     def identity(self) -> dict[str, str]:
@@ -316,8 +320,8 @@ class _Made:
         made = self._made(number)
         if extra := [name for name in made.values if name not in self.names]:
             raise LidarpoolError(
-                f"job {number} has the value {extra[0]!r}, which job 0 has not: give all jobs the "
-                "same names, with None where there is no value."
+                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
+                "the same names, with None where there is no value."
             )
         values = {name: _plain(number, name, value) for name, value in made.values.items()}
         survey = made.survey

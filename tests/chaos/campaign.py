@@ -1,0 +1,184 @@
+"""Do harm to campaigns until so many faults were done: `python -m tests.chaos.campaign`.
+
+Workers of an outside cluster are killed, and so is the driver, which resumes. The last line says
+whether a job was lost or doubled, and whether all files of jobs have the bytes of a run that nobody
+disturbed.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from tests.system.conftest import OutsideCluster
+
+BASE = """
+sensor: {rays_per_revolution: 720, layers: 8, step_deg: 2}
+poses: [[0, 0, 1], [2, 0, 2]]
+steps: 180
+cloud: {keep_every: 1}
+planning: {enabled: false}
+"""
+CAMPAIGN = """
+base: base.yaml
+count: 40
+seed: 3
+vary:
+  noise.range_m: {uniform: [0.001, 0.05]}
+  sensor.layers: {choice: [2, 4, 8]}
+keep: folder
+"""
+WORKERS = {"GPU": 1, "LIDAR": 5}  # slots of each of two
+DRIVER = "driver"
+BETWEEN_S = 0.3, 4.0  # seconds between faults
+ENDS_WITHIN_S = 300.0
+
+
+@dataclass
+class Tally:
+    """What became of the data sets."""
+
+    done: Counter[str] = field(default_factory=Counter)  # {what was killed: how often}
+    datasets: int = 0
+    lost: int = 0  # jobs
+    doubled: int = 0
+    differing: list[str] = field(default_factory=list)  # files
+    errors: list[str] = field(default_factory=list)  # drivers that ended by themselves
+
+    def __str__(self) -> str:
+        faults = ", ".join(f"{count} {kind}" for kind, count in sorted(self.done.items()))
+        identical = "no" if self.differing else "yes"
+        return (
+            f"faults {self.done.total()} ({faults}) data sets {self.datasets} lost {self.lost} "
+            f"duplicated {self.doubled} identical {identical} errors {len(self.errors)}"
+        )
+
+    @property
+    def sound(self) -> bool:
+        """Whether nobody could tell the data sets from undisturbed ones."""
+        return not (self.lost or self.doubled or self.differing or self.errors)
+
+
+class Arena:
+    """A cluster of two workers of each kind, in processes of their own, and a driver."""
+
+    def __init__(self, folder: Path, seed: int) -> None:
+        self.folder, self._chance = folder, random.Random(seed)
+        (folder / "base.yaml").write_text(BASE)
+        (folder / "c.yaml").write_text(CAMPAIGN)
+        (folder / "cluster").mkdir()
+        self.cluster = OutsideCluster(folder / "cluster")
+        self._workers = [self._worker(kind) for kind in (*WORKERS, *WORKERS)]
+        self.cluster.wait()
+
+    def _worker(self, kind: str) -> str:
+        return self.cluster.add((kind, WORKERS[kind]))
+
+    def start(self, out: str) -> subprocess.Popen[str]:
+        """Start a driver."""
+        return subprocess.Popen(
+            [
+                *(sys.executable, "-m", "lidarpool", "run", "c.yaml", "--resume", "-q"),
+                *("--out", out, "--scheduler", self.cluster.address, "--backend", "numpy"),
+            ],
+            cwd=self.folder,
+            env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.PIPE,
+            text=True,
+        )
+
+    def disturb(self, out: str, tally: Tally, faults: int) -> None:
+        """Make a data set, with so many faults at most."""
+        driver = self.start(out)
+        while driver.poll() is None and faults:
+            time.sleep(self._chance.uniform(*BETWEEN_S))
+            kind = self._chance.choice((*WORKERS, DRIVER))
+            if driver.poll() is not None:
+                break
+            faults -= 1
+            tally.done[kind] += 1
+            if kind != DRIVER:
+                name = self._chance.choice([n for n in self._workers if n.startswith(kind)])
+                self._workers.remove(name)
+                self.cluster.kill(name)
+                self._workers.append(self._worker(kind))
+                continue
+            driver.kill()
+            driver.communicate()
+            driver = self.start(out)
+        while True:
+            _, err = driver.communicate(timeout=ENDS_WITHIN_S)
+            if driver.returncode == 0:
+                return
+            tally.errors.append(err)
+            if len(tally.errors) > 10:
+                return
+            driver = self.start(out)
+
+
+def files_of(dataset: Path) -> dict[str, bytes]:
+    """Files of the jobs of a data set."""
+    found = [path for folder in ("jobs", ".jobs") for path in (dataset / folder).rglob("*")]
+    return {str(p.relative_to(dataset)): p.read_bytes() for p in found if p.is_file()}
+
+
+def judge(dataset: Path, reference: dict[str, bytes], tally: Tally) -> None:
+    """Compare a data set with an undisturbed one."""
+    with (dataset / "jobs.csv").open(newline="") as file:
+        rows = Counter(row["number"] for row in csv.DictReader(file))
+    count = sum(1 for name in reference if name.startswith(".jobs/"))
+    tally.datasets += 1
+    tally.lost += count - len(rows)
+    tally.doubled += sum(times - 1 for times in rows.values())
+    found = files_of(dataset)
+    tally.differing += [
+        name for name in {*found, *reference} if found.get(name) != reference.get(name)
+    ]
+    left = [path.name for path in dataset.iterdir()]
+    tally.differing += [name for name in left if name == "run" or name.endswith("-dataset")]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Disturb campaigns; returns 0 if every data set was sound."""
+    parser = argparse.ArgumentParser(prog="tests.chaos.campaign", description=__doc__)
+    parser.add_argument("--faults", type=int, default=60)
+    parser.add_argument("--seed", type=int, default=None, help="random by default")
+    parser.add_argument("--seconds", type=float, default=float("inf"), help="begin none later")
+    options = parser.parse_args(arguments)
+    seed = random.SystemRandom().randrange(10**6) if options.seed is None else options.seed
+    print(f"seed {seed}", flush=True)
+    tally, started = Tally(), time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="chaos-", ignore_cleanup_errors=True) as folder:
+        arena = Arena(Path(folder), seed)
+        try:
+            arena.disturb("reference", tally, 0)
+            reference = files_of(Path(folder, "reference"))
+            while (left := options.faults - tally.done.total()) > 0:
+                if time.monotonic() - started > options.seconds:
+                    break
+                out = f"ds-{tally.datasets}"
+                arena.disturb(out, tally, left)
+                judge(Path(folder, out), reference, tally)
+                print(f"{time.monotonic() - started:5.0f} s: {tally}", flush=True)
+        finally:
+            arena.cluster.close()
+    for error in dict.fromkeys(tally.errors):
+        print(f"a driver ended: {error.strip()}")
+    if tally.differing:
+        print("differ:", ", ".join(sorted({*tally.differing})[:20]))
+    print(tally)
+    return 0 if tally.sound else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

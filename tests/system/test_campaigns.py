@@ -1,0 +1,542 @@
+"""Campaigns: many jobs into one data set, whatever happens to workers, drivers and single jobs."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from distributed import Client
+from tests.clusters import thread_cluster
+
+import lidarpool.run.campaign
+from lidarpool import Campaign, CampaignJob, LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool.base.errors import explained
+from lidarpool.base.storage import Storage
+from lidarpool.export.dataset import DataSet
+from lidarpool.run.progress import Progress
+
+BASE = """
+sensor: {rays_per_revolution: 180, layers: 4, step_deg: 4}
+poses: [[0, 0, 1]]
+steps: 45
+cloud: {keep_every: 1}
+planning: {enabled: false}
+pool: {backend: numpy, gpu: 1}
+"""
+CAMPAIGN = """
+base: base.yaml
+count: 6
+seed: 3
+vary:
+  noise.range_m: {uniform: [0.001, 0.05]}
+  sensor.layers: {each: [2, 3, 4]}
+keep: folder
+"""
+SLOTS = ({"GPU": 1}, {"LIDAR": 5})
+
+
+@pytest.fixture(scope="module")
+def slots() -> Iterator[str]:
+    """Address of a cluster with the slots of a campaign."""
+    with thread_cluster(*SLOTS) as cluster:
+        yield cluster.scheduler_address
+
+
+@pytest.fixture
+def client(slots: str) -> Iterator[Client]:
+    with Client(slots, set_as_default=False) as client:
+        yield client
+
+
+@pytest.fixture
+def files(tmp_path: Path) -> Path:
+    """A folder with a campaign of six jobs."""
+    (tmp_path / "base.yaml").write_text(BASE)
+    (tmp_path / "c.yaml").write_text(CAMPAIGN)
+    return tmp_path
+
+
+def bytes_of(dataset: Path) -> dict[str, bytes]:
+    """Files of the jobs of a data set, and nothing that depends on time."""
+    found = [path for folder in ("jobs", ".jobs") for path in (dataset / folder).rglob("*")]
+    return {str(p.relative_to(dataset)): p.read_bytes() for p in found if p.is_file()}
+
+
+@pytest.fixture(scope="module")
+def whole(slots: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """The jobs' files, of a run that nobody disturbs."""
+    folder = tmp_path_factory.mktemp("whole")
+    (folder / "base.yaml").write_text(BASE)
+    (folder / "c.yaml").write_text(CAMPAIGN)
+    with Client(slots, set_as_default=False) as client:
+        assert Campaign.load(folder / "c.yaml").run(folder / "ds", client=client).done == 6
+    return bytes_of(folder / "ds")
+
+
+SENSOR = Sensor.grid(rays_per_revolution=90, layers=2, step_deg=4)
+
+
+def make(number: int, rng: np.random.Generator) -> CampaignJob:
+    """A job that differs from the others in its pose."""
+    return job(SENSOR, number)
+
+
+def job(sensor: Sensor, number: int, **survey: Any) -> CampaignJob:
+    what = Survey(sensor, [(number, 0, 1)], steps=45, keep_every=1, **survey)
+    return CampaignJob(Scene.seed(), what, {"x": number})
+
+
+# -- each job alone -------------------------------------------------------------------------------
+
+
+def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots, no_pictures):
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
+    for number in range(0, 6, 2):
+        out = files / f"job-{number}"
+        done = lidarpool(*run, "--job", number, "--out", out)
+        assert (done.code, done.err) == (0, "")
+        assert (out / "cloud.ply").read_bytes() == whole[f"jobs/{number:04}/cloud.ply"]
+
+
+def test_any_number_of_workers_gives_the_same_bytes(files, whole):
+    many = ({"GPU": 1}, {"GPU": 2, "A": 1}, {"LIDAR": 6}, {"LIDAR": 2, "A": 1})
+    with thread_cluster(*many) as cluster, Client(cluster, set_as_default=False) as client:
+        run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)
+    assert (run.done, run.failed, run.resumed) == (6, (), 0)
+    assert bytes_of(files / "ds") == whole
+    assert not (files / "ds" / "run").exists()
+
+
+# -- jobs that fail -------------------------------------------------------------------------------
+
+
+def failing(*numbers: int) -> Callable[[int, np.random.Generator], CampaignJob]:
+    def make_or_fail(number: int, rng: np.random.Generator) -> CampaignJob:
+        if number in numbers:
+            raise RuntimeError("no such street")
+        return make(number, rng)
+
+    return make_or_fail
+
+
+@pytest.mark.parametrize("numbers", [(0,), (2,), (0, 1, 2)], ids=["first", "last", "all"])
+def test_jobs_that_cannot_be_made(client, tmp_path, numbers):
+    campaign = Campaign(failing(*numbers), 3, keep="folder")
+    run = campaign.run(tmp_path / "ds", client=client)
+    assert [row.number for row in run.failed] == [*numbers]
+    assert all("RuntimeError: no such street" in row.error for row in run.failed)
+    assert run.done == 3 - len(numbers)
+
+
+def in_worker() -> bool:
+    """Whether a worker calls: those of these tests are threads."""
+    return "-Dask-" in threading.current_thread().name
+
+
+@dataclass(frozen=True, eq=False)
+class Breaks(Sensor):
+    """A sensor of a user's own that raises in a worker."""
+
+    where: str = ""
+
+    def directions(self, firings: Any) -> Any:
+        if self.where == "cast" and in_worker():
+            raise ZeroDivisionError("no direction")
+        return super().directions(firings)
+
+    def firings(self, step: int) -> tuple[int, int]:
+        if self.where == "describe" and step == 44 and in_worker():
+            raise ZeroDivisionError("no such step")
+        return super().firings(step)
+
+
+def breaking(where: str) -> Callable[[int, np.random.Generator], CampaignJob]:
+    def make_one_that_breaks(number: int, rng: np.random.Generator) -> CampaignJob:
+        breaks = Breaks(SENSOR.beams, head=SENSOR.head, where=where)
+        return job(breaks if number == 1 else SENSOR, number)
+
+    return make_one_that_breaks
+
+
+WORDS = {"cast": "no direction", "describe": "ZeroDivisionError: no such step"}
+
+
+@pytest.mark.parametrize("where", [*WORDS])
+def test_a_sensor_that_raises_in_a_worker_fails_its_job_only(client, tmp_path, where, left_over):
+    run = Campaign(breaking(where), 4, keep="folder").run(tmp_path / "ds", client=client)
+    assert [row.name for row in run.failed] == ["0001"] and run.done == 3
+    assert WORDS[where] in run.failed[0].error and run.failed[0].values == {"x": 1}
+    assert sorted(path.name for path in (tmp_path / "ds" / "jobs").iterdir()) == [
+        "0000", "0002", "0003",
+    ]  # fmt: skip
+    assert left_over(client) == ([], [], [])
+
+
+def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp_path, monkeypatch):
+    write = DataSet.write_job
+
+    def fail(self: DataSet, number: int, name: str, *arguments: Any) -> None:
+        write(self, number, name, *arguments)
+        if number == 1:
+            raise ValueError("cannot be written")
+
+    monkeypatch.setattr(DataSet, "write_job", fail)
+    run = Campaign(make, 3, keep="folder").run(tmp_path / "ds", client=client)
+    assert [row.name for row in run.failed] == ["0001"] and run.done == 2
+    assert "cannot be written" in run.failed[0].error
+    names = {Path(name).stem for name in bytes_of(tmp_path / "ds") if name.startswith(".jobs")}
+    assert names == {"0000", "0002"}
+    assert not (tmp_path / "ds" / "jobs" / "0001").exists()
+
+
+def test_a_full_disk_ends_the_run_and_keeps_it(client, tmp_path, monkeypatch):
+    """It would fail all jobs, one after the other."""
+    write, full = DataSet.write_job, [True]
+
+    def fail(self: DataSet, number: int, name: str, *arguments: Any) -> None:
+        if number == 2 and full:
+            with explained(f"Job {name} cannot be written to {self.place}"):
+                raise OSError(28, "No space left on device")
+        write(self, number, name, *arguments)
+
+    monkeypatch.setattr(DataSet, "write_job", fail)
+    campaign = Campaign(make, 5, keep="folder")
+    with pytest.raises(LidarpoolError, match=r"Job 0002 .*No space left on device") as caught:
+        campaign.run(tmp_path / "ds", client=client)
+    assert "of 5 jobs are kept in" in caught.value.__notes__[0]
+    full.clear()
+    run = campaign.run(tmp_path / "ds", client=client, resume=True)
+    assert (run.done, run.failed) == (5, ())
+    assert not (tmp_path / "ds" / "run").exists()
+
+
+def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots, no_pictures):
+    (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
+    vary = "scene.files.0.file: {each: [a.obj, b.obj]}"
+    (files / "c.yaml").write_text(f"base: base.yaml\ncount: 4\nvary: {{{vary}}}\nkeep: folder\n")
+    (files / "a.obj").write_text("v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n")
+    (files / "b.obj").write_text("nothing")
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
+    for option in ((), ("--resume",), ("--retry-failed",)):
+        failed = lidarpool(*run, *option)
+        assert failed.code == 2 and "Traceback" not in failed.err
+        lines = failed.err.splitlines()
+        assert lines[0] == "lidarpool: 2 jobs failed, the other 2 are done:"
+        assert lines[1].startswith("job 0001 (scene.files.0.file b.obj): ")
+        assert lines[2].startswith("job 0003 ") and "b.obj" in lines[2]
+        assert lines[3:] == ["--retry-failed does these jobs again."]
+
+
+def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
+    there, made = tmp_path / "there", []
+
+    def make_if_there(number: int, rng: np.random.Generator) -> CampaignJob:
+        made.append(number)
+        if number == 2 and not there.exists():
+            raise FileNotFoundError(there)
+        return make(number, rng)
+
+    campaign = Campaign(make_if_there, 4, keep="folder")
+    run = campaign.run(tmp_path / "ds", client=client)
+    assert [row.number for row in run.failed] == [2] and run.done == 3
+    before = bytes_of(tmp_path / "ds")
+    with pytest.raises(LidarpoolError, match=r"holds an unfinished run, 4 of 4 jobs"):
+        campaign.run(tmp_path / "ds", client=client)
+    assert campaign.run(tmp_path / "ds", client=client, resume=True).failed == run.failed
+    there.touch()
+    made.clear()
+    again = campaign.run(tmp_path / "ds", client=client, retry_failed=True)
+    assert (again.done, again.failed, again.resumed) == (4, (), 3)
+    assert set(made) <= {0, 2}  # the first says which values there are
+    after = bytes_of(tmp_path / "ds")
+    assert before.items() <= after.items() and len(after) > len(before)
+    assert not (tmp_path / "ds" / "run").exists()
+    assert campaign.run(tmp_path / "ds", client=client, retry_failed=True).done == 4
+
+
+# -- places and options ---------------------------------------------------------------------------
+
+
+def test_one_slot_too_few_names_what_it_is_for(files, lidarpool, tmp_path):
+    run = ["run", files / "c.yaml", "-q", "--out", files / "ds", "--wait", "0s"]
+    with thread_cluster({"GPU": 1}, {"LIDAR": 4}) as few:
+        refused = lidarpool(*run, "--scheduler", few.scheduler_address)
+    assert refused.code == 2 and refused.err.count("\n") == 1
+    assert "writing jobs of a campaign" in refused.err and '--resources "LIDAR=' in refused.err
+    assert "kept in" not in refused.err and not (files / "ds").exists()
+
+
+def test_other_content_or_software_is_refused(files, lidarpool, slots, no_pictures):
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
+    (files / "c.yaml").write_text(CAMPAIGN.replace("[2, 3, 4]", "[2, 3, 4.5]"))
+    assert lidarpool(*run).code == 2 and not (files / "ds").exists()
+    (files / "c.yaml").write_text(CAMPAIGN)
+    assert lidarpool(*run).code == 0
+    again = lidarpool(*run)
+    assert again.code == 2 and "needs a folder of its own" in again.err
+    assert lidarpool(*run, "--resume").code == 0, "it is complete"
+    (files / "c.yaml").write_text(CAMPAIGN.replace("seed: 3", "seed: 4"))
+    for more in (["--resume"], ["--job", 1]):
+        other = lidarpool(*run, *more)
+        assert other.code == 2 and "is of another campaign: its seed differs" in other.err
+    (files / "c.yaml").write_text(CAMPAIGN)
+    record = files / "ds" / "campaign.json"
+    made = json.loads(record.read_text())
+    made["casting"]["numpy"] = "1.0"
+    record.write_text(json.dumps(made))
+    old = lidarpool(*run, "--job", 1)
+    assert old.code == 2 and "was made with numpy 1.0, " in old.err and old.err.count("\n") == 1
+
+
+def test_foreign_files_are_not_touched(files, lidarpool, slots, no_pictures):
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
+    (files / "ds").mkdir()
+    (files / "ds" / "notes.txt").write_text("mine")
+    for option in ((), ("--resume",), ("--fresh",), ("--retry-failed",)):
+        refused = lidarpool(*run, *option)
+        assert refused.code == 2 and "notes.txt" in refused.err, option
+        assert [path.name for path in (files / "ds").iterdir()] == ["notes.txt"]
+    (files / "ds" / "notes.txt").rename(files / "notes.txt")
+    assert lidarpool(*run).code == 0
+    (files / "notes.txt").rename(files / "ds" / "notes.txt")
+    before = bytes_of(files / "ds")
+    refused = lidarpool(*run, "--fresh")
+    assert refused.code == 2 and "notes.txt, which is not of a data set" in refused.err
+    assert bytes_of(files / "ds") == before
+    (files / "ds" / "notes.txt").unlink()
+    assert lidarpool(*run, "--fresh").code == 0
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--job", 99], "there is no job 99"),
+        (["--live"], "--live shows one survey"),
+        (["--overwrite"], "for one survey"),
+        (["--only", "cloud"], "for one survey"),
+        (["--resume", "--fresh"], "--fresh"),
+        (["--retry-failed", "--fresh"], "--fresh"),
+        (["--retry-failed", "--job", 1], "--retry-failed"),
+    ],
+)
+def test_options_that_do_not_go_together(files, lidarpool, options, words, slots):
+    refused = lidarpool(
+        "run", files / "c.yaml", "-q", "--out", files / "ds", *options, "--scheduler", slots
+    )
+    assert refused.code == 2 and refused.err.count("\n") == 1
+    assert words in refused.err
+    assert not (files / "ds").exists()
+
+
+def test_options_of_campaigns_with_a_survey(files, lidarpool):
+    for option in (["--job", 1], ["--retry-failed"]):
+        refused = lidarpool("run", files / "base.yaml", "--out", files / "ds", *option)
+        assert refused.code == 2 and "are for campaigns" in refused.err
+
+
+def test_several_scenarios_are_a_campaign(files, lidarpool, slots, no_pictures):
+    (files / "other.yaml").write_text(BASE.replace("steps: 45", "steps: 30"))
+    two = [files / "base.yaml", files / "other.yaml"]
+    done = lidarpool("run", *two, "-q", "--scheduler", slots, "--out", files / "ds")
+    assert done.code == 0, done
+    for path in two:
+        alone = ["--out", files / path.stem, "--only", "cloud"]
+        assert lidarpool("run", path, "-q", "--scheduler", slots, *alone).code == 0
+        cloud = (files / path.stem / "cloud.ply").read_bytes()
+        assert cloud == (files / "ds" / "jobs" / path.stem / "cloud.ply").read_bytes()
+
+
+# -- workers and drivers that die -----------------------------------------------------------------
+
+# Each driver is a process of its own, forked from one that has imported everything. It is killed
+# when it calls something for the n-th time.
+DRIVERS = """
+import json, os, signal, sys, traceback
+import lidarpool.cli.run_command, lidarpool.report.campaign_output as output
+import lidarpool.cli.campaign_command
+from lidarpool.__main__ import main
+from lidarpool.pipeline.database import RunDatabase
+from lidarpool.export.dataset import DataSet
+from lidarpool.run.campaign_store import CampaignStore
+from lidarpool.run.store import RunStore
+
+def drive(point, times):
+    left = [times]
+    def before(owner, name, label):
+        function = getattr(owner, name)
+        def call(*arguments, **options):
+            left[0] -= label == point
+            if not left[0]:
+                os.kill(os.getpid(), signal.SIGKILL)
+            return function(*arguments, **options)
+        setattr(owner, name, call)
+    before(RunDatabase, "__init__", "OPEN")
+    before(RunDatabase, "commit", "COMMIT")
+    before(RunDatabase, "end_job", "END")
+    before(RunStore, "remove", "DROP")
+    before(output, "write_table", "TABLE")
+    before(DataSet, "finish", "FINISH")
+    before(CampaignStore, "remove", "REMOVE")
+    sys.argv = ["lidarpool", *json.loads(sys.argv[1])]
+    main()
+
+for point, times in json.loads(sys.argv[2]):
+    if not (child := os.fork()):
+        try:
+            drive(point, times)
+        except SystemExit as ended:
+            sys.stderr.flush()
+            sys.stdout.flush()
+            os._exit(ended.code or 0)
+        except BaseException:
+            traceback.print_exc()
+        os._exit(70)
+    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+    print(json.dumps(["ended", code]), flush=True)
+    if code >= 0:
+        break
+"""
+KILLS = [("OPEN", 3), ("COMMIT", 4), ("END", 1), ("END", 2), ("DROP", 1), ("TABLE", 1)]
+KILLS += [("FINISH", 1), ("REMOVE", 1), ("", 1)]
+
+forks = pytest.mark.skipif(sys.platform == "win32", reason="forks")
+
+
+def drive(folder: Path, address: str, kills: list[tuple[str, int]], *options: str) -> list[int]:
+    """Run the campaign of a folder again and again, each killed at a point; how they ended."""
+    arguments = ["run", "c.yaml", "--resume", "-q", "--scheduler", address, *options]
+    done = subprocess.run(
+        [sys.executable, "-c", DRIVERS, json.dumps(arguments), json.dumps(kills)],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    assert "Traceback" not in done.stderr, done.stderr
+    return [json.loads(line)[1] for line in done.stdout.splitlines() if '"ended"' in line]
+
+
+@forks
+def test_killed_drivers_leave_the_same_bytes_and_no_remains(files, slots, whole, client, left_over):
+    parts = files / "parts"
+    ended = drive(files, slots, KILLS, "--out", "ds", "--parts", str(parts))
+    assert ended == [-9] * 8 + [0]
+    assert bytes_of(files / "ds") == whole
+    rows = (files / "ds" / "jobs.csv").read_text().splitlines()
+    assert [row.split(",")[0] for row in rows[1:]] == [str(number) for number in range(6)]
+    names = {path.name for path in (files / "ds").iterdir()}
+    assert not names & {"run"} and not any(name.endswith("-dataset") for name in names)
+    assert [*parts.rglob("*")] == []
+    assert left_over(client) == ([], [], [])
+
+
+def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
+    (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 300"))
+    command = ["run", "c.yaml", "-q", "--scheduler", slots, "--out", "ds"]
+    with subprocess.Popen(
+        [sys.executable, "-m", "lidarpool", *command],
+        cwd=files,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        stderr=subprocess.PIPE, text=True,
+    ) as run:  # fmt: skip
+        wait_for(lambda: [*(files / "ds" / ".jobs").glob("*")])
+        run.send_signal(signal.SIGINT)
+        _, err = run.communicate(timeout=300)
+    assert run.returncode == 130
+    assert err.startswith("\nlidarpool: interrupted; everything was stopped")  # behind the ^C
+    assert re.search(r" of 300 jobs are kept in .*ds/run: continue with --resume .*\.\n$", err)
+
+
+def wait_for(condition: Callable[[], Any]) -> None:
+    stop = time.monotonic() + 300
+    while not condition():
+        assert time.monotonic() < stop, "waited in vain"
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+def test_killed_workers_change_no_byte(outside, files, whole):
+    cluster = outside()
+    gpu = cluster.add(("GPU", 1))
+    lidar = cluster.add(("LIDAR", 5))
+    cluster.wait()
+    strikes = [(1, gpu, ("GPU", 1)), (2, lidar, ("LIDAR", 5)), (4, None, ("LIDAR", 1))]
+
+    def on_progress(progress: Progress) -> None:
+        while strikes and progress.jobs_done >= strikes[0][0]:
+            _, name, another = strikes.pop(0)
+            if name:
+                cluster.kill(name)
+            cluster.add(another)
+
+    with Client(cluster.address, set_as_default=False) as client:
+        campaign = Campaign.load(files / "c.yaml")
+        run = campaign.run(files / "ds", client=client, on_progress=on_progress)
+    assert (run.done, run.failed, strikes) == (6, (), [])
+    assert bytes_of(files / "ds") == whole
+    assert not (files / "ds" / "run").exists()
+
+
+# -- others on the same cluster -------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("other", ["campaign", "survey"])
+def test_two_at_once_share_the_slots(other, files, whole, monkeypatch):
+    """There are slots for the stages of both, and none for writing."""
+    monkeypatch.setattr(lidarpool.run.campaign, "BEGIN_S", 0.5)
+    campaign = Campaign.load(files / "c.yaml")
+    scene, survey = Scene.seed(), job(SENSOR, 3).survey
+    running = threading.Event()
+
+    def watched(progress: Progress) -> None:
+        if not progress.waits_for:
+            running.set()
+
+    def run_other() -> Any:
+        assert running.wait(300)
+        with Client(cluster.scheduler_address, set_as_default=False) as client:
+            if other == "survey":
+                return simulate(scene, survey, client=client, backend="numpy")
+            return Campaign.load(files / "c.yaml").run(files / "ds2", client=client)
+
+    with (
+        thread_cluster({"GPU": 1}, {"LIDAR": 8}) as cluster,
+        Client(cluster, set_as_default=False) as client,
+        ThreadPoolExecutor(1) as pool,
+    ):
+        beside = pool.submit(run_other)
+        run = campaign.run(files / "ds", client=client, on_progress=watched)
+        found = beside.result(300)
+    assert run.done == 6 and bytes_of(files / "ds") == whole
+    assert other == "survey" or (found.done == 6 and bytes_of(files / "ds2") == whole)
+
+
+def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monkeypatch):
+    """Its last slots went with a worker that does not come back."""
+    monkeypatch.setattr(lidarpool.run.campaign, "BEGIN_S", 0.5)
+    monkeypatch.setattr(lidarpool.run.campaign, "slots_needed", lambda job: {"GPU": 1, "LIDAR": 3})
+    with (
+        thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
+        Client(cluster, set_as_default=False) as client,
+    ):
+        run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)
+    assert run.done == 6 and bytes_of(files / "ds") == whole
+
+
+def test_workers_that_do_not_see_the_data_set(files, whole, monkeypatch, client):
+    monkeypatch.setattr(Storage, "sees", lambda *_: not in_worker())
+    run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)
+    assert run.done == 6 and bytes_of(files / "ds") == whole
+    assert any("the driver wrote the data set" in note for note in run.notes)
