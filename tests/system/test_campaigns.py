@@ -324,7 +324,6 @@ def test_foreign_files_are_not_touched(files, lidarpool, slots, no_pictures):
     ("options", "words"),
     [
         (["--job", 99], "there is no job 99"),
-        (["--live"], "--live shows one survey"),
         (["--overwrite"], "for one survey"),
         (["--only", "cloud"], "for one survey"),
         (["--resume", "--fresh"], "--fresh"),
