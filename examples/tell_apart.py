@@ -2,8 +2,7 @@
 
     python tell_apart.py [FOLDER]
 
-It makes a data set of 30 cities, learns from some of them, and draws one of the others.
-"""
+It makes a data set of 30 cities, learns from some, and draws what it says of another."""
 
 import sys
 from itertools import pairwise
@@ -128,8 +127,7 @@ def main(place="cities"):
     known, classes = read(place, "train", 0.4)
     network = Network(known)
     rare = 1 / np.sqrt(np.bincount(classes))  # else it would learn nothing but ground and walls
-    steps = EPOCHS * len(known) // BATCH
-    for step in range(steps):
+    for step in range(steps := EPOCHS * len(known) // BATCH):
         some = RNG.integers(len(known), size=BATCH)
         network.learn(known[some], classes[some], rare[classes[some]], step + 1, steps)
 

@@ -105,6 +105,11 @@ def hold_for_driver(name: str, data: Any) -> str:
     return str(worker.address)
 
 
+def holds_for_driver() -> bool:
+    """Whether this process holds bytes that nobody has fetched yet."""
+    return bool(_held)
+
+
 def take_held(client: Client, address: str, name: str, patience_s: float = 2.0) -> Any:
     """Fetch bytes that a worker holds under a name, and have the worker forget them.
 

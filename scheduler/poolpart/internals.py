@@ -22,6 +22,7 @@ from typing import Any
 import dask
 import distributed
 from distributed import Client, Future, SpecCluster, Status, as_completed, futures_of
+from distributed.core import clean_exception
 from distributed.protocol import to_serialize
 from distributed.protocol.pickle import dumps
 from distributed.protocol.serialize import Serialize, Serialized, deserialize
@@ -338,6 +339,81 @@ def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any
             stealing.move_task_request(task, worker, thief)
 
 
+# -- workers that a cluster gives back ----------------------------------------------------
+#
+# From the step of the event loop in which one is found idle, it gets no tasks. What
+# `retire_workers` does comes later: it waits for a lock, and for its turn.
+
+
+def is_idle(scheduler: Any, worker: Any) -> bool:
+    """Whether nothing is lost with a worker: it has no task, and no result that is only there."""
+    if worker.status is not Status.running or worker.processing or worker.actors:
+        return False
+    stealing = scheduler.extensions.get("stealing")
+    moves = stealing.in_flight.values() if stealing else ()
+    if any(move["thief"] is worker for move in moves):  # a task is on its way
+        return False
+    return all(len(task.who_has) > 1 for task in worker.has_what)
+
+
+def takes_tasks(worker: Any) -> bool:
+    """Whether a worker gets tasks, or will in a moment: one that joins is not ready at once."""
+    return worker.status in (Status.running, Status.init)
+
+
+def shut(scheduler: Any, worker: Any) -> None:
+    """Let a worker get no more tasks."""
+    stimulus = f"poolpart-shut-{time.time()}"
+    scheduler.handle_worker_status_change(Status.closing_gracefully, worker, stimulus)
+
+
+def reopen(scheduler: Any, worker: Any) -> None:
+    """Let a worker get tasks again that `shut`, or a retirement in vain, has kept from it."""
+    if scheduler.workers.get(worker.address) is worker:
+        stimulus = f"poolpart-reopened-{time.time()}"
+        message = {"op": "worker-status-change", "status": "running", "stimulus_id": stimulus}
+        scheduler.stream_comms[worker.address].send(message)
+        scheduler.handle_worker_status_change(Status.running, worker, stimulus)
+
+
+def has_running_tasks(dask_worker: Any = None) -> bool:
+    """Whether a worker runs anything, also cancelled tasks, which its scheduler has forgotten."""
+    return bool(dask_worker.state.all_running_tasks)
+
+
+async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
+    """Close workers; False if some stay, because they have results that nobody else can take."""
+    addresses = [worker.address for worker in workers]
+    done = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
+    return len(done) == len(addresses)
+
+
+def turn_away(scheduler: Any, worker: Any) -> None:
+    """Close a worker that is just joining, before it gets tasks."""
+    shut(scheduler, worker)
+    scheduler.close_worker(worker.address)
+
+
+def is_bound(task: Any) -> bool:
+    """Whether a task may run on certain workers only."""
+    return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions
+
+
+def waiting_for_workers(scheduler: Any) -> Collection[Any]:
+    """Tasks that could run, and for which there is no worker."""
+    tasks: Collection[Any] = scheduler.unrunnable
+    return tasks
+
+
+async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments: Any) -> Any:
+    """Call `function(**arguments, dask_scheduler=…)` on a cluster's scheduler, without a client."""
+    packed = {"function": dumps(function), "args": dumps(()), "kwargs": dumps(arguments)}
+    answer = await cluster.scheduler_comm.run_function(**packed, wait=True)
+    if answer["status"] != "OK":
+        raise clean_exception(**answer)[1]
+    return _unpacked(answer["result"])
+
+
 # -- what a worker declares --------------------------------------------------------------
 
 
@@ -349,9 +425,11 @@ async def call(scheduler: Any, address: str, function: Callable[..., Any], **arg
     answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
     if answer["status"] != "OK":
         raise OSError(answer["exception_text"])
-    result = answer["result"]
-    # The scheduler passes the reply on as it is: as bytes, or unpacked if the worker is in the same
-    # process.
+    return _unpacked(answer["result"])
+
+
+def _unpacked(result: Any) -> Any:
+    """Unpack a reply, which may come as it is: as bytes, or unpacked from the same process."""
     if isinstance(result, Serialized):
         return deserialize(result.header, result.frames)
     return result.data if isinstance(result, Serialize) else result

@@ -25,9 +25,9 @@ from dask.utils import funcname
 from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
+from .adapting import running_most
 from .internals import when_done
 from .lending import slots_lent
-from .workers import all_workers
 
 logger = logging.getLogger(__name__)
 
@@ -184,9 +184,8 @@ class Stage:
                 raise ValueError(f"{name} is {value!r}; give a whole number, {least} or more.")
 
     def running(self) -> int:
-        """Tasks of this stage that run at a time."""
-        workers = all_workers(self.client)
-        return sum(int(w.resources.get(self.partition, 0)) // self.slots for w in workers)
+        """Tasks of this stage that run at a time, with all workers that may be started."""
+        return running_most(self.client, self.partition, self.slots)
 
     def send(
         self,

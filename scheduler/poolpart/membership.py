@@ -10,6 +10,7 @@ from weakref import WeakKeyDictionary
 
 from distributed import Client
 
+from .adapting import slots_of_new
 from .errors import PoolError
 from .inherit import begin_inheritance, is_inherited, workers_told
 from .internals import task_of_thread
@@ -25,7 +26,7 @@ class Membership:
     """Members of a partition at one moment."""
 
     names: Mapping[str, str]  # of the present members, by address
-    most: float  # slots of one member at most, also of one that its nanny is starting again
+    most: float  # slots of one member at most, also of one that is starting, or may be started
     has_rule: bool  # the scheduler has a rule for the partition
     strangers: frozenset[str]  # addresses of all other workers
 
@@ -117,6 +118,7 @@ async def _look(name: str, asking: str, in_task: bool, dask_scheduler: Any = Non
     here = dask_scheduler.workers
     members = {a: str(w.name) for a, w in here.items() if w.resources.get(name)}
     slots = [here[address].resources[name] for address in members]
+    slots.append(slots_of_new(dask_scheduler, name))
     if steward is not None:
         slots += [seat.slots for seat in steward.members(name)]
     # The last request of a client that was killed may come after it has left.

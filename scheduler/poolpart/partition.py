@@ -10,10 +10,12 @@ from typing import Any, Self
 import dask
 from distributed import Client, Future
 
+from .adapting import IDLE_S, Bounds, adapt, want
 from .division import ask, dissolve, grow, shrink
 from .errors import PoolError
 from .mapping import Results, Stage
 from .membership import addresses_of, check_slots, forget_memberships
+from .rules import check_count
 from .stats import PartitionStats, partition_stats
 from .task_context import own_client
 from .workers import WorkerInfo, all_workers
@@ -349,6 +351,55 @@ class Partition:
         arguments = {"count": workers, "timeout_s": timeout_s}
         moved: list[str] = ask(self.client, shrink, name=self.name, **arguments)
         return moved
+
+    # -- workers that come and go ------------------------------------------------------
+
+    def adapt(self, minimum: int, maximum: int, *, idle_s: float = IDLE_S) -> None:
+        """Let the number of jobs follow the work, where `start_partitions` has started them.
+
+        Jobs are started for tasks that can run and have no slot, second by second, and for what
+        clients `want`. One is returned, or cancelled while it waits in the queue, when it was not
+        needed for `idle_s`: a worker with a task, also one that has seceded, with a result that no
+        other worker has, or with an actor is kept. A lost worker is replaced while there is work.
+        Two equal numbers fix the number of jobs.
+
+        Parameters
+        ----------
+        minimum, maximum
+            Least and greatest number of jobs. With a minimum of 0 the partition may be empty.
+        idle_s
+            After so many seconds without need a job ends.
+
+        Raises
+        ------
+        PoolError
+            If the workers were not started by `start_partitions`, or the numbers are not possible.
+
+        Examples
+        --------
+        >>> gpu.adapt(0, 8)                                            # doctest: +SKIP
+        """
+        adapt(self.client, self.name, Bounds.checked(self.name, minimum, maximum, idle_s))
+
+    def want(self, slots: int) -> bool:
+        """Say how many slots this client wants; returns whether the number of workers adapts.
+
+        For a program that chooses a worker for each task and so has none waiting: as long as it
+        wants slots, jobs are started as if tasks waited for them, and kept. 0 ends it, and so does
+        the end of the client. Tasks that wait need no such word.
+
+        Raises
+        ------
+        PoolError
+            If the number is below 0.
+
+        Examples
+        --------
+        >>> gpu.want(4)                                                # doctest: +SKIP
+        True
+        """
+        check_count("The number of slots that are wanted", slots, least=0)
+        return want(self.client, self.name, slots)
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""

@@ -10,6 +10,7 @@ from typing import Any
 
 from distributed import Client
 
+from .adapting import adaptive_names
 from .division import ask, declare, dissolve
 from .errors import PoolError
 from .membership import forget_memberships
@@ -59,11 +60,11 @@ class Pool:
         Raises
         ------
         PoolError
-            If the cluster has no workers, one cannot import this package, or the client is
-            closed or asynchronous.
+            If the cluster has no workers and no adaptive partitions, a worker cannot import this
+            package, or the client is closed or asynchronous.
         """
         workers = all_workers(client)
-        if not workers:
+        if not workers and not adaptive_names(client):
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some with "
                 f'dask worker {client.scheduler.address} --resources "GPU=1"'
@@ -101,10 +102,11 @@ class Pool:
         return [worker.name for worker in self.workers]
 
     def partitions(self) -> dict[str, Partition]:
-        """Find the partitions that the cluster's workers declare now, by name."""
+        """Find the partitions that workers declare now, and adaptive ones, by name."""
         workers = all_workers(self.client)
-        names = sorted({name for worker in workers for name in worker.partitions})
-        return {name: Partition(name, self.client) for name in names}
+        names = {name for worker in workers for name in worker.partitions}
+        names |= adaptive_names(self.client)  # perhaps empty
+        return {name: Partition(name, self.client) for name in sorted(names)}
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
         """Check that partitions have enough slots before anything is submitted.

@@ -8,6 +8,7 @@ from typing import Any
 
 from distributed import Client
 
+from .adapting import jobs_coming, slots_at_most
 from .workers import on_scheduler
 
 SILENT_S = 20.0  # without a heartbeat: stopped, or with its GIL held
@@ -40,6 +41,8 @@ class Whereabouts:
     # {address: slots that no task holds or waits for}; below 0 with more tasks than slots.
     free: dict[str, int] = field(default_factory=dict)
     slots: int = 0  # free or not
+    most_slots: int = 0  # with those of workers that may be started, see `Partition.adapt`
+    coming: int = 0  # jobs of such workers that wait in a queue, or start
     tasks: dict[str, TaskPlace] = field(default_factory=dict)  # by requested key, of known ones
 
     def out_of_reach(self, key: str) -> bool:
@@ -73,11 +76,14 @@ def _look(
     silent = addresses & _silent_workers(dask_scheduler, patience_s)
     usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
     places = {key: _place(dask_scheduler.tasks[key]) for key in keys if key in dask_scheduler.tasks}
+    slots = sum(int(ws.resources[partition]) for ws in usable)
     return Whereabouts(
         members=addresses,
         silent=silent,
         free={ws.address: int(ws.resources[partition] - _in_use(ws, partition)) for ws in usable},
-        slots=sum(int(ws.resources[partition]) for ws in usable),
+        slots=slots,
+        most_slots=max(slots, slots_at_most(dask_scheduler, partition)),
+        coming=jobs_coming(dask_scheduler, partition),
         tasks=places,
     )
 

@@ -539,6 +539,41 @@ def test_values_that_do_not_fit_together_are_told_with_the_job(campaign):
     assert "\nIts values are returns.subrays: " in str(raised.value)
 
 
+def test_files_of_every_row_are_looked_for(campaign, folder):
+    rows = "".join(f"Car {i},1 1 1,{i}.csv\n" for i in range(5)).replace("1 1 1", '"[1, 1, 1]"')
+    (folder / "cars.csv").write_text("name,box,trajectory.file\n" + rows)
+    vary = {"actors": {"sample": {"from": "cars.csv", "count": [0, 2]}}}
+    for i in range(4):
+        (folder / f"{i}.csv").touch()
+    with pytest.raises(LidarpoolError, match=r"4\.csv' does not exist"):
+        campaign(vary)
+    (folder / "4.csv").touch()
+    before = campaign(vary).identity
+    (folder / "4.csv").write_text("time_s,x,y,z\n")
+    assert campaign(vary).identity["files"] != before["files"]
+
+
+def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
+    (folder / "fog.yaml").write_text("steps: 3\n")
+    with pytest.raises(LidarpoolError) as raised:
+        campaign(
+            {"sensors.roof.model": {"choice": ["velodyne/vlp16"]}}, base=["base.yaml", "fog.yaml"]
+        )
+    assert "campaign.yaml: vary, of fog.yaml: sensors of the base has no 'roof'" in str(
+        raised.value
+    )
+    with pytest.raises(LidarpoolError, match=r"vary, of fog\.yaml: steps can be 0; input should"):
+        campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
+
+
+def test_a_grid_that_is_too_large(campaign):
+    many = {"each": list(range(1, 1001))}
+    vary = {"steps": many, "planning.seed": many, "noise.seed": many}
+    with pytest.raises(LidarpoolError, match=r"all values of each are 1,000,000,000 jobs"):
+        campaign(vary, count=None)
+    assert campaign(vary, count=5).count == 5
+
+
 def test_given_files_that_cannot_be_used(folder):
     (folder / "wrong.yaml").write_text("stepps: 3\n")
     (folder / "campaign.yaml").write_text("base: base.yaml\n")

@@ -41,6 +41,19 @@ def test_slots_and_workers_of_a_file(tmp_path):
         file.require({"LIDAR": 5})
 
 
+def test_partitions_that_grow_with_their_work(tmp_path):
+    text = GOOD.replace("workers: 5", "adapt: [0, 8]").replace(
+        "slots: 2", "adapt: [1, 3], slots: 2"
+    )
+    file = load(tmp_path, text)
+    assert file.slots == {"GPU": 6, "LIDAR": 4, "OTHER": 8}
+    assert str(file) == "SSHCluster: up to 12 workers, GPU 1 to 3, LIDAR 1, OTHER 0 to 8"
+    file.require({"GPU": 1, "LIDAR": 4, "OTHER": 1})
+    few = load(tmp_path, GOOD.replace("slots: 4", "adapt: [0, 3]"))
+    with pytest.raises(LidarpoolError, match=r"partition LIDAR has 3 of the 4 slots needed"):
+        few.require({"LIDAR": 4})
+
+
 WRONG = {
     "empty": ("", "is empty; a cluster file has"),
     "a list": ("[1]", "holds a list; a cluster file has"),
@@ -55,6 +68,19 @@ WRONG = {
     ),
     "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
     "many": (GOOD.replace("workers: 5", "workers: 999999999"), "less than or equal to 10000"),
+    "a number to adapt to": (GOOD.replace("workers: 5", "adapt: 8"), "partitions.OTHER.adapt is 8"),
+    "a swapped range": (
+        GOOD.replace("workers: 5", "adapt: [8, 0]"),
+        r"partitions.OTHER.adapt is \[8, 0\]: give the least and the greatest number",
+    ),
+    "two numbers of workers": (
+        GOOD.replace("workers: 5", "workers: 5, adapt: [0, 8]"),
+        "partitions.OTHER.adapt .* leave out workers",
+    ),
+    "a time without a range": (
+        GOOD.replace("workers: 5", "idle_s: 60"),
+        "partitions.OTHER.idle_s needs adapt",
+    ),
     "no host": (GOOD.replace("[a, b], slots: 2", "[]"), "partitions.GPU.hosts is"),
     "no such package": (
         GOOD.replace("distributed.", "dask_jobqueues."),

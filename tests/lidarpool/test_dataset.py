@@ -181,10 +181,10 @@ def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
         data.write_job(3, "003", cloud, sweeps)
 
 
-@pytest.mark.parametrize("format", DATA_SETS)
+@pytest.mark.parametrize("format", ["kitti", "mcap"])
 def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # noqa: A002
     data = DataSet(Storage.at(tmp_path / "both"), format)
-    context = multiprocessing.get_context("spawn")
+    context = multiprocessing.get_context("fork")
     two = [context.Process(target=_write, args=(data, job(3), sweeps)) for _ in range(2)]
     for process in two:
         process.start()
@@ -193,6 +193,20 @@ def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # no
         assert process.exitcode == 0
     DataSet(Storage.at(tmp_path / "one"), format).write_job(3, "003", job(3), sweeps)
     assert files_of(tmp_path / "both") == files_of(tmp_path / "one")
+
+
+@pytest.mark.parametrize("format", ["kitti", "mcap", "folder"])
+def test_what_killed_writers_left_is_removed_at_the_end(written, tmp_path, format):  # noqa: A002
+    data, place = written(format)
+    before = files_of(place)
+    below = {"kitti": "sequences/00/velodyne", "mcap": "bags", "folder": "jobs/000"}[format]
+    (place / below / ".lidarpool-tmp-000000.bin-0123abcd").write_bytes(b"half")
+    if format != "kitti":
+        half = place / below / ".lidarpool-writing-0123abcd"
+        half.mkdir()
+        (half / "half").write_bytes(b"half")
+    data.finish(JobRow(number, f"{number:03}") for number in (0, 1, 7))
+    assert files_of(place) == before
 
 
 def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeypatch):

@@ -15,13 +15,14 @@ from hypothesis import strategies as st
 
 from lidarpool import LidarpoolError, Scene, Sensor, Survey
 from lidarpool.base.storage import Storage
-from lidarpool.pipeline import Crew, RigPlan, driver, policies
+from lidarpool.pipeline import Crew, JobError, RigPlan, driver, policies
 from lidarpool.pipeline.batches import PIECES, Place
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.driver import STALL_S, SurveyDriver
 from lidarpool.pipeline.long_stages import StageChanges
 from lidarpool.pipeline.messages import (
     ColumnsLost,
+    Failed,
     Receipt,
     ScanRange,
     Summaries,
@@ -52,6 +53,7 @@ class Workers:
         self.tried = Counter()  # {(first, stop): casting tasks}
         self.most = 0  # batches of a task
         self.released = False
+        self.wanted = []
         self._joined = 0
 
     @property
@@ -71,6 +73,9 @@ class Workers:
 
     def remove(self, job):
         del self.jobs[job]
+
+    def want(self, slots):
+        self.wanted.append(slots)
 
     def cast(self, job, spans, worker):
         assert worker in self.slots and job in self.jobs
@@ -224,7 +229,8 @@ class Run:
     """A driver with what it talks to."""
 
     def __init__(self, folder, beside=None, job="0"):
-        self.storage = Storage.at(folder / "parts", durable=False)
+        place = beside.folder / "parts" / job if beside else folder / "parts"
+        self.folder, self.storage = folder, Storage.at(place, durable=False)
         self.db = RunDatabase(folder / "run.db", SCANS, durable=False)
         self.workers = beside.workers if beside else Workers()
         self.stages = beside.stages if beside else Stages(self.storage, self.workers)
@@ -305,6 +311,14 @@ def test_undisturbed_each_batch_is_cast_once(run):
     assert set(run.workers.tried.values()) == {1} and run.driver.offered_again == 0
     assert run.driver.cast == run.driver.generated == SCANS
     assert run.driver.book.stages["intersect"].items == SCANS
+
+
+def test_slots_are_wanted_as_long_as_there_is_work(run):
+    run.stages.seconds = 100.0
+    run.end()
+    wanted = run.workers.wanted
+    assert wanted[0] == SCANS and wanted[-1] == 0
+    assert wanted == sorted(wanted, reverse=True)
 
 
 def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
@@ -406,9 +420,7 @@ def test_a_sorter_that_dies_gets_again_what_was_not_handed_out(run):
     assert min(s.first for s in run.stages.unsorted) == handed_out
     assert max(s.stop for s in run.stages.unsorted) >= handed_out + 20
     one = bytes(SUMMARY.itemsize)
-    run.stages.inbox += [
-        Summaries(at, at + 1, one, 0, SCANS, "0") for at in (0, handed_out + 1)
-    ]
+    run.stages.inbox += [Summaries(at, at + 1, one, 0, SCANS, "0") for at in (0, handed_out + 1)]
     run.step()
     assert len(run.frames) == handed_out, "only the next frame is handed out"
     run.end()
@@ -449,8 +461,8 @@ def test_a_scan_that_kills_its_workers_is_found_among_small_batches(run, stage):
     assert run.db.missing(0, SCANS)[0] == (40, 41)
 
 
-def striking(run, stage, poison, deaths=None):
-    """Let a scan kill whoever has it."""
+def striking(run, stage, poison, deaths=None, job=""):
+    """Let a scan kill whoever has it, of a job if one is given."""
 
     def has(spans):
         return any(first <= poison < stop for first, stop in spans)
@@ -459,11 +471,12 @@ def striking(run, stage, poison, deaths=None):
         killed = 0
         for key in run.workers.open if stage == "intersect" else ():
             spans, worker, _ = run.workers.casts[key]
-            if has(spans) and worker in run.workers.slots:
+            if has(spans) and worker in run.workers.slots and key.startswith(job):
                 run.workers.die(worker)
                 killed += 1
         for name, orders in run.stages.orders.items() if stage == "collect" else ():
-            if any(has([span for span, _ in order.parts]) for order in orders):
+            mine = [order for order in orders if order.job.startswith(job)]
+            if any(has([span for span, _ in order.parts]) for order in mine):
                 run.stages.die(name)
                 killed += 1
         if deaths is not None:
@@ -581,7 +594,110 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
 @pytest.fixture
 def two(run, tmp_path):
     """Return two surveys on one crew."""
+    (tmp_path / "other").mkdir()
     other = Run(tmp_path / "other", beside=run, job="other")
     run.all = other.all
     yield run, other
     other.db.close()
+
+
+def test_two_surveys_share_workers_stages_and_storage(two):
+    for run in two:
+        run.until(lambda run=run: run.driver.finished)
+    for run in two:
+        assert [frame.scan for frame in run.frames] == list(range(SCANS))
+        assert {part.name for part in run.committed} == run.storage.sizes().keys()
+        assert run.driver.offered_again == 0 and run.driver.generated == SCANS
+
+
+def test_a_survey_takes_no_more_than_it_has_room_for_while_another_wants_scans(two):
+    run, other = two
+    run.stages.advice = 1
+    most = most_under_way(2, 2)
+    for _ in range(5 * most):
+        run.step()
+        run.stages.generate()
+    assert len(run.driver.batches) == most and not run.stages.wanted
+    assert other.driver.seat.wants_scans and other.driver.generated == 0
+    other.until(lambda: other.driver.finished and run.driver.finished)
+
+
+@pytest.mark.parametrize("how", ["failed", "intersect", "collect"])
+def test_a_survey_that_fails_leaves_and_the_other_goes_on(two, how):
+    bad, good = two
+    bad.stages.advice = 1
+    if how != "failed":
+        strike = striking(bad, how, 23, job="0")
+        with pytest.raises(JobError, match=r"^scan 23 kills"):
+            bad.until(strike)
+    else:
+        bad.until(lambda: bad.at(Place.CASTING) and bad.committed)
+        bad.stages.inbox.append(Failed("stage generate failed: scan 59: out of order", "0"))
+        with pytest.raises(JobError, match=r"^stage generate failed: scan 59"):
+            bad.step()
+    bad.crew.leave(bad.driver.seat)
+    assert list(bad.workers.jobs) == ["other"]
+    good.all.remove(bad)
+    good.end()  # nothing is left of the first either
+
+
+def test_of_a_survey_that_has_left_messages_are_dropped_and_its_scans_pass(two):
+    bad, good = two
+    bad.until(lambda: any(bad.stages.orders.values()), idle="collect")
+    late = [bad.stages.collect(o) for orders in bad.stages.orders.values() for o in orders]
+    bad.crew.leave(bad.driver.seat)
+    good.all.remove(bad)
+    good.stages.inbox += chain.from_iterable(late)
+    committed = len(bad.committed)
+    good.end()
+    assert len(bad.committed) == committed and not bad.driver.seat.inbox
+
+
+def test_a_generator_that_is_started_again_is_told_of_all_surveys(two):
+    run, other = two
+    run.until(lambda: run.driver.generated > 20)
+    run.stages.die("generate")
+    run.step()
+    assert [(d.job, d.first) for d in run.stages.described] == [
+        ("0", run.driver.generated), ("other", 0),
+    ]  # fmt: skip
+    run.until(lambda: run.driver.finished and other.driver.finished)
+    assert set(run.workers.tried.values()) == {2}  # scans of each survey
+
+
+def test_a_sorter_that_dies_is_told_of_all_surveys_again(two):
+    run, other = two
+    run.until(lambda: other.db.scans_done > 20, idle="sort")
+    run.stages.die("sort")
+    run.step()
+    assert {s.job for s in run.stages.unsorted} == {"0", "other"}
+    run.until(lambda: run.driver.finished and other.driver.finished)
+    assert len(run.frames) == len(other.frames) == SCANS
+
+
+def test_a_suspect_of_one_survey_is_alone_on_its_worker(two):
+    run, other = two
+    run.stages.advice = 20
+    run.until(lambda: other.at(Place.CASTING), idle="cast")
+    suspect = run.at(Place.CASTING)[0]
+    for _ in range(2):
+        run.workers.die(suspect.worker)
+        run.until(lambda: suspect.place is Place.CASTING)
+    assert suspect.deaths["intersect"] == 2
+    there = [b for one in two for b in one.at(Place.CASTING) if b.worker == suspect.worker]
+    assert there == [suspect]
+    run.until(lambda: run.driver.finished and other.driver.finished)
+
+
+@pytest.mark.parametrize("advice", [1, 7, SCANS])
+def test_a_scene_that_kills_whoever_casts_it_is_told_after_a_few_deaths(run, advice):
+    run.stages.advice, deaths = advice, []
+
+    def strike():
+        for worker in {run.workers.casts[key][1] for key in run.workers.open}:
+            run.workers.die(worker)
+            deaths.append(worker)
+
+    with pytest.raises(JobError, match=r"^GPU workers die whatever they cast first: 3 died, one a"):
+        run.until(strike)
+    assert len(deaths) <= 10

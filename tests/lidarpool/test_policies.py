@@ -7,6 +7,7 @@ from collections import Counter
 import pytest
 
 from lidarpool.pipeline.batches import Batch, Batches, Place
+from lidarpool.pipeline.names import COLLECT, INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
@@ -26,6 +27,7 @@ from lidarpool.pipeline.policies import (
     offers,
     room,
     scans_per_batch,
+    slots_wanted,
     verdict,
 )
 from poolpart import Whereabouts
@@ -77,6 +79,14 @@ def test_no_batches_are_taken_far_ahead_of_the_oldest():
     assert room(3, SPAN * 10, 10) == 0
 
 
+def test_slots_are_wanted_for_what_is_left():
+    assert slots_wanted(100, None) == 100  # nothing is known of them
+    assert slots_wanted(100, 0.1) == 1  # of 10 s
+    assert slots_wanted(1000, 0.1) == 5
+    assert slots_wanted(3, 60.0) == 3  # a scan is never split
+    assert slots_wanted(0, 1.0) == slots_wanted(0, None) == 0
+
+
 # -- where ---------------------------------------------------------------------------------------
 
 
@@ -126,6 +136,43 @@ def test_a_suspect_has_a_worker_for_itself():
     assert {where for _, where in offers([alone, *waiting(5)], {A: 1, B: 1}, 99)} == {B}
     # Until a worker is free the others wait, too: they would occupy all.
     assert offers([casting(0, A), casting(1, B), suspect, *waiting(5)], {A: 1, B: 1}, 99) == []
+
+
+def test_a_suspect_of_another_survey_is_left_a_worker_for_itself():
+    suspect = batch(0, suspect=INTERSECT)
+    there = [casting(1, A), casting(2, B), casting(3, B)]
+    slots = {A: 1, B: 2}
+    beside = [suspect, *there]
+    assert {where for _, where in numbers(offers(waiting(9), slots, 20, 1, beside))} == {B}
+    assert offers(waiting(9), {A: 1}, 20, 1, [suspect]) == []
+    # Two surveys with suspects do not wait for each other.
+    mine = batch(7, suspect=INTERSECT)
+    assert numbers(offers([mine], {A: 1}, 20, 1, [suspect])) == [(7, A)]
+    assert numbers(offers(waiting(9), {A: 1, B: 1}, 20, 1, [casting(0, A, INTERSECT)])) == [
+        (10, B), (11, B),
+    ]  # fmt: skip
+    beside = [casting(n, A) for n in (1, 2)]
+    assert offers([mine], {A: 1}, 20, 1, beside) == [], "there are others on the only worker"
+
+
+def test_what_others_have_under_way_counts():
+    beside = [batch(n, Place.COLLECTING, A) for n in range(4)] + waiting(20, first=50)
+    assert len(numbers(offers(waiting(9), {A: 9}, 10, 1, beside))) == 6
+    assert {where for _, where in numbers(offers(waiting(1), {A: 1, B: 1}, 10, 1, [casting(0, A)]))
+            } == {B}  # fmt: skip
+
+
+def test_stage_4_is_left_to_a_suspect_of_another_survey():
+    collectors = {"collect-0": A, "collect-1": B}
+    ready = [batch(n, Place.CAST, A) for n in (1, 2)]
+    suspect = batch(9, Place.CAST, A, suspect=COLLECT)
+    assert handovers(ready, collectors, [suspect]) == []
+    busy = batch(1, Place.COLLECTING, A, "collect-0")
+    assert handovers([suspect], collectors, [busy]) == []
+    assert numbers(handovers([suspect], collectors, ready)) == [(9, "collect-0")]
+    alone = batch(9, Place.COLLECTING, A, "collect-0", suspect=COLLECT)
+    assert handovers(ready, collectors, [alone]) == []
+    assert len(handovers(ready, collectors, [busy])) == 2
 
 
 def test_a_collector_on_the_host_of_the_columns_is_preferred():

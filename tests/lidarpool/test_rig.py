@@ -8,11 +8,15 @@ import numpy as np
 import pytest
 from tests.lidarpool.casting import Cart, cast_between, tally_of
 
-from lidarpool import Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey
+from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
+from lidarpool.columns.parts import pack
 from lidarpool.pipeline.failures import naming_scans
+from lidarpool.scene.actors import box
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.models import load_sensor
 from lidarpool.sensor.optics import Returns
+from lidarpool.simulator import world
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 from poolpart import WorkerLeft
 from raybeam import RayCaster
@@ -164,3 +168,24 @@ def test_a_worker_that_leaves_is_not_a_failure_of_its_scans():
     """The driver casts those elsewhere, and would end the run at any other error."""
     with pytest.raises(WorkerLeft), naming_scans(3, 5):
         raise WorkerLeft("the worker has left")
+
+
+def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch):
+    built = []
+
+    class Counted(RayCaster):
+        def __init__(self, vertices, faces, **options):
+            built.append(len(faces))
+            super().__init__(vertices, faces, **options)
+
+    monkeypatch.setattr(world, "RayCaster", Counted)
+    scene = Scene.from_meshes(seed_objects(rings=8, segments=12))
+    car = Actor(box("Car", (4.5, 1.8, 1.5)), Track([0, 2], [[6, -3, 0.5], [6, 7, 0.5]]))
+    surveys = [survey(poses=TURNED), survey(trajectory=CART)]
+    rig = Rig(scene, surveys[0], "numpy")
+    other = rig.with_survey(scene.with_actors([car]), surveys[1])
+    assert built == [len(scene.faces)]
+    fresh = Rig(scene.with_actors([car]), surveys[1], "numpy")
+    for one, two in ((other, fresh), (rig, Rig(scene, surveys[0], "numpy"))):
+        assert pack(columns_of(list(one.cast(0, 14)))) == pack(columns_of(list(two.cast(0, 14))))
+    assert other.scene.actors == (car,) and rig.scene.actors == ()

@@ -45,8 +45,9 @@ def written(tmp_path_factory, scene, all_sweeps) -> Callable[[str], Path]:
     def write(name: str) -> Path:
         if name not in made:
             kind, _, layout = name.partition("-")
-            made[name] = tmp_path_factory.mktemp(name)
-            write_set(made[name], kind, scene, all_sweeps, layout or "velodyne")
+            place = tmp_path_factory.mktemp(name)
+            write_set(place, kind, scene, all_sweeps, layout or "velodyne")
+            made[name] = place
         return made[name]
 
     return write
@@ -185,6 +186,7 @@ def test_what_is_no_data_set_is_told_in_a_line(written, tmp_path, monkeypatch):
     assert len(lidarpool.sweeps(place)) == len(first)
     index.unlink()
     told(lambda: lidarpool.sweeps(place), "is an unfinished data set: .*--resume")
+    written("parquet"), written("mcap")
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
     told(lambda: lidarpool.sweeps(written("parquet")), r'pip install "lidarpool\[parquet\]"')
     told(lambda: lidarpool.sweeps(written("mcap")), r'pip install "lidarpool\[ros\]"')

@@ -7,6 +7,7 @@ import pytest
 from lidarpool import LidarpoolError
 from lidarpool.run import watch
 from lidarpool.run.watch import Watch
+from poolpart import Whereabouts
 
 
 @pytest.fixture
@@ -27,9 +28,11 @@ def look(monkeypatch):
             for number, (name, status) in enumerate(workers)
         }
         monkeypatch.setattr(watch, "worker_identities", lambda client: identities)
+        there = Whereabouts(coming=look.coming)
+        monkeypatch.setattr(watch, "look_for_tasks", lambda client, name: there)
         watching.look(1000.0 + seconds)
 
-    look.watching, look.told = watching, told
+    look.watching, look.told, look.coming = watching, told, 0
     return look
 
 
@@ -45,6 +48,16 @@ def test_a_partition_may_be_empty_for_a_while(look):
     assert look.told[1:] == ["waiting for workers of partition GPU, for another 3 s"]
     with pytest.raises(LidarpoolError, match=r"'GPU' has had no workers for 60 s.*\"GPU=1\""):
         look(124, *ALL[1:])
+
+
+def test_jobs_in_the_queue_are_waited_for(look):
+    look.coming = 2
+    look(200, *ALL[1:])
+    words = "waiting for workers of partition GPU: 2 jobs in the queue, or starting"
+    assert look.told == [words]
+    look.coming = 0
+    with pytest.raises(LidarpoolError, match="'GPU' has had no workers"):
+        look(202, *ALL[1:])
 
 
 def test_workers_that_are_paused_take_no_tasks(look):

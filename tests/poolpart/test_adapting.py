@@ -1,9 +1,417 @@
-"""Adaptive clusters: the scheduler offers none to stop that a partition needs."""
+"""Partitions whose jobs come and go with their work, and adaptive clusters of Dask itself.
 
-from distributed import Event
-from tests.poolpart.helpers import wait_for
+The queue is made up, and its jobs are workers of this process; `tests/system/test_queues.py` has a
+real one.
+"""
 
-from poolpart import Pool, n_workers, per_host, rest
+from __future__ import annotations
+
+import asyncio
+import itertools
+import re
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import dask
+import pytest
+from distributed import Client, Event, Worker, get_client, secede, wait
+from tests.clusters import import_jobqueue
+from tests.poolpart.helpers import LONG_S, here, twice, wait_for
+
+import poolpart.adapting
+import poolpart.clusters
+from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, start_partitions
+from poolpart.task_locations import look_for_tasks
+
+SCHEDULER = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
+IDLE_S = 0.2
+
+
+class Queue:
+    """A queue whose jobs begin at once, unless it is held."""
+
+    def __init__(self) -> None:
+        self.held = self.full = False
+        self.submitted: list[str] = []  # names of the jobs
+        self.waiting: dict[str, str] = {}  # {number: name of a job that has not begun}
+        self.workers: dict[str, list[Worker]] = {}  # {number: of a job that has begun}
+        self.cancelled: list[str] = []  # names of jobs that had not begun
+        self._numbers = map(str, itertools.count())
+        self._scripts: dict[str, str] = {}
+
+    async def submit(self, job: Any, path: str) -> str:
+        if self.full:
+            raise RuntimeError("the queue is full")
+        number, text = next(self._numbers), Path(path).read_text()
+        name = re.search(r"--name (\S+)", text)[1]
+        self.submitted.append(name)
+        self.waiting[number] = name
+        self._scripts[number] = text
+        self._scheduler = job._command_template.split("dask_worker ")[1].split()[0]
+        if not self.held:
+            await self.begin(number)
+        return f"Submitted batch job {number}"
+
+    async def begin(self, number: str) -> None:
+        """Let a job begin."""
+        name, text = self.waiting.pop(number), self._scripts[number]
+        partition, slots = re.search(r"--resources (\w+)=(\d+)", text).groups()
+        count = re.search(r"--nworkers (\d+)", text)
+        names = [f"{name}-{n}" for n in range(int(count[1]))] if count else [name]
+        options = {"nthreads": 2, "resources": {partition: int(slots)}, "dashboard": False}
+        self.workers[number] = [
+            await Worker(self._scheduler, name=one, host="127.0.0.1", **options) for one in names
+        ]
+
+    async def close(self, job: Any, number: str, command: str) -> None:
+        if number in self.waiting:
+            self.cancelled.append(self.waiting.pop(number))
+        for worker in self.workers.get(number, []):
+            await asyncio.sleep(0.05)  # for its own end, or it logs an error
+            await worker.close(timeout=1)  # a second call waits for the first
+        self.workers.pop(number, None)
+
+
+@pytest.fixture
+def queue(monkeypatch: pytest.MonkeyPatch) -> Queue:
+    jobs, queue = import_jobqueue().slurm.SLURMJob, Queue()
+    monkeypatch.setattr(jobs, "_submit_job", lambda job, path: queue.submit(job, path))
+    monkeypatch.setattr(
+        jobs, "_close_job", lambda job, number, command: queue.close(job, number, command)
+    )
+    monkeypatch.setattr(poolpart.clusters, "_ADAPT_EVERY_S", 0.05)
+    monkeypatch.setattr(poolpart.clusters, "_LOOK_EVERY_S", 0.05)
+    return queue
+
+
+@contextmanager
+def cluster_of(partitions: dict[str, dict[str, Any]], **options: Any) -> Iterator[Client]:
+    """Client of a cluster of jobs."""
+    with import_jobqueue().SLURMCluster(
+        cores=2, processes=1, memory="2GB", scheduler_options=SCHEDULER
+    ) as cluster:
+        start_partitions(cluster, partitions, **options)
+        with Client(cluster) as client:
+            yield client
+
+
+def adaptive(minimum: int, maximum: int, **options: Any) -> dict[str, Any]:
+    return {"adapt": [minimum, maximum], "idle_s": IDLE_S, **options}
+
+
+def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, wait_until):
+    with cluster_of({"GPU": adaptive(0, 3), "IO": adaptive(0, 3), "FIX": {}}) as client:
+        gpu, io = Partition("GPU", client), Partition("IO", client)
+        assert queue.submitted == ["FIX-0"]
+        tasks = [gpu.submit(wait_for, "go") for _ in range(8)]
+        wait_until(lambda: len(gpu) == 3)
+        assert len(io) == 0
+        Event("go", client).set()
+        client.gather(tasks)
+        names = {gpu.submit(here).result(LONG_S) for _ in range(5)}
+        assert names <= {"GPU-0", "GPU-1", "GPU-2"}
+        del tasks
+        wait_until(lambda: len(gpu) == 0)
+        time.sleep(5 * IDLE_S)
+        assert queue.submitted.count("FIX-0") == 1
+        assert len(Partition("FIX", client)) == 1
+        assert sorted(queue.submitted) == ["FIX-0", "GPU-0", "GPU-1", "GPU-2"]
+        assert list(queue.workers) == ["0"]
+        # Later ones have names of their own.
+        assert gpu.submit(here).result(LONG_S) == "GPU-3"
+        assert Pool.from_client(client).partitions().keys() == {"FIX", "GPU", "IO"}
+
+
+def test_no_more_jobs_than_tasks(queue, wait_until):
+    with cluster_of({"GPU": adaptive(0, 9)}) as client:
+        gpu = Partition("GPU", client)
+        for number in range(1, 4):
+            tasks = [gpu.submit(wait_for, f"go-{number}") for _ in range(2)]
+            wait_until(lambda: len(gpu) == 2)
+            time.sleep(3 * IDLE_S)
+            assert len(queue.submitted) == 2 * number
+            Event(f"go-{number}", client).set()
+            client.gather(tasks)
+            del tasks
+            wait_until(lambda: len(gpu) == 0)
+
+
+def test_the_minimum_stays_and_the_range_can_be_changed(queue, wait_until):
+    with cluster_of({"GPU": adaptive(1, 2)}) as client:
+        gpu = Partition("GPU", client)
+        wait_until(lambda: len(gpu) == 1)
+        time.sleep(5 * IDLE_S)
+        assert len(gpu) == 1
+        gpu.adapt(3, 3, idle_s=IDLE_S)
+        wait_until(lambda: len(gpu) == 3)
+        gpu.adapt(0, 3, idle_s=IDLE_S)
+        wait_until(lambda: len(gpu) == 0)
+        assert queue.cancelled == []
+
+
+def secedes(event):
+    secede()
+    return wait_for(event)
+
+
+class Counter:
+    """An actor."""
+
+
+def is_kept(partition, queue, begin):
+    """Whether the one worker stays that has what `begin` begins; it ends with what that returns."""
+    partition.adapt(1, 1)
+    partition.submit(here).result(LONG_S)
+    began, end = len(queue.submitted), begin()
+    partition.adapt(0, 1, idle_s=IDLE_S)
+    time.sleep(4 * IDLE_S)
+    kept = len(partition) == 1 and len(queue.submitted) == began
+    end()
+    return kept
+
+
+def test_a_worker_is_kept_for_what_would_be_lost_with_it(queue, wait_until):
+    events = itertools.count()
+    with cluster_of({"GPU": adaptive(0, 1)}) as client:
+        gpu = Partition("GPU", client)
+
+        def runs(function):
+            name = f"end-{next(events)}"
+            task = gpu.submit(function, name)
+
+            def end():
+                Event(name, client).set()
+                task.result(LONG_S)
+                task.release()
+
+            return end
+
+        def has_result():
+            task = gpu.submit(twice, 2)
+            wait(task)
+            return lambda: (task.result(LONG_S), task.release())
+
+        def has_data():
+            data = client.scatter([1], workers=[gpu.workers[0].address])
+            return data.clear
+
+        def has_actor():
+            actor = [client.submit(Counter, actor=True, resources={"GPU": 1}).result(LONG_S)]
+            return actor.clear
+
+        def runs_what_was_cancelled():
+            name = f"end-{next(events)}"
+            task = gpu.submit(wait_for, name)
+            [worker] = client.cluster.scheduler.workers.values()
+            wait_until(lambda: worker.processing)
+            time.sleep(0.1)  # it has begun
+            task.cancel()
+            wait_until(lambda: not worker.processing)
+            return Event(name, client).set
+
+        begins = [lambda: runs(wait_for), lambda: runs(secedes)]
+        begins += [has_result, has_data, has_actor, runs_what_was_cancelled]
+        for begin in begins:
+            assert is_kept(gpu, queue, begin)
+            wait_until(lambda: len(gpu) == 0)
+
+
+def test_a_job_in_the_queue_is_cancelled_when_its_work_is_gone(queue, wait_until):
+    queue.held = True
+    with cluster_of({"GPU": adaptive(0, 4)}) as client:
+        gpu = Partition("GPU", client)
+        tasks = [gpu.submit(here) for _ in range(3)]
+        wait_until(lambda: look_for_tasks(client, "GPU").coming == 3)
+        seen = look_for_tasks(client, "GPU")
+        assert (len(queue.waiting), seen.slots, seen.most_slots) == (3, 0, 4)
+        tasks.pop().cancel()
+        wait_until(lambda: queue.cancelled == ["GPU-2"])
+        for task in tasks:
+            task.cancel()
+        wait_until(lambda: not queue.waiting)
+        wait_until(lambda: look_for_tasks(client, "GPU").coming == 0)
+        wait_until(lambda: not client.cluster.worker_spec)
+
+
+def test_a_worker_whose_job_was_cancelled_too_late_gets_no_task(queue, wait_until):
+    queue.held = True
+    with cluster_of({"GPU": adaptive(0, 1)}) as client:
+        gpu = Partition("GPU", client)
+        task = gpu.submit(here)
+        wait_until(lambda: queue.waiting)
+        [number], scheduler = queue.waiting, client.cluster.scheduler
+        task.cancel()
+        # The scheduler has decided, and the queue has not been told.
+        adaptation = scheduler.plugins[poolpart.adapting.NAME]
+        adaptation._cancelled.add("GPU-0")
+        task = gpu.submit(here)
+        client.sync(queue.begin, number)
+        wait_until(lambda: not scheduler.workers)
+        assert not task.done()
+        queue.held = False
+        gpu.adapt(0, 2, idle_s=IDLE_S)
+        assert task.result(LONG_S) == "GPU-1"
+
+
+def test_a_lost_worker_is_replaced_while_there_is_work(queue, wait_until):
+    soon = dask.config.set({"distributed.deploy.lost-worker-timeout": "0.1s"})
+    with soon, cluster_of({"GPU": adaptive(0, 2)}) as client:
+        gpu = Partition("GPU", client)
+        tasks = [gpu.submit(wait_for, "go") for _ in range(2)]
+        wait_until(lambda: len(gpu) == 2)
+        [worker] = queue.workers.pop("0")
+        client.sync(worker.close, timeout=1)
+        wait_until(lambda: len(gpu) == 2)
+        Event("go", client).set()
+        assert client.gather(tasks) == [True, True]
+        del tasks
+        wait_until(lambda: not client.cluster.worker_spec)
+
+
+def test_jobs_that_the_queue_refuses_are_tried_again_while_there_is_work(queue, wait_until):
+    said: list[str] = []
+    queue.full = True
+    with cluster_of({"GPU": adaptive(0, 2)}, tell=said.append) as client:
+        gpu = Partition("GPU", client)
+        task = gpu.submit(here)
+        wait_until(lambda: said)
+        assert said == ["A worker cannot be started: the queue is full"]
+        task.cancel()
+        wait_until(lambda: not client.cluster.worker_spec)
+        task = gpu.submit(here)
+        wait_until(lambda: client.cluster.worker_spec)
+        queue.full = False
+        assert task.result(LONG_S).startswith("GPU-")
+
+
+def test_workers_of_one_job_go_together(queue, wait_until):
+    with cluster_of({"NODE": adaptive(0, 2, processes=2, slots=2)}) as client:
+        node = Partition("NODE", client)
+        tasks = [node.submit(wait_for, "go") for _ in range(5)]  # four slots a job
+        wait_until(lambda: len(node) == 4)
+        Event("go", client).set()
+        client.gather(tasks)
+        del tasks
+        wait_until(lambda: len(node) == 0)
+        name = "end"
+        long = node.submit(wait_for, name)
+        wait_until(lambda: len(node) == 2)
+        time.sleep(4 * IDLE_S)
+        assert len(node) == 2
+        Event(name, client).set()
+        assert long.result(LONG_S)
+
+
+def test_what_a_client_wants_ends_with_it(queue, wait_until):
+    with cluster_of({"GPU": adaptive(0, 3, slots=2), "FIX": {}}) as client:
+        with Client(client.cluster) as other:
+            gpu = Partition("GPU", other)
+            assert gpu.want(3)
+            assert not Partition("FIX", other).want(3)
+            wait_until(lambda: len(gpu) == 2)
+            time.sleep(4 * IDLE_S)
+            assert len(gpu) == 2
+            gpu.want(1)
+            wait_until(lambda: len(gpu) == 1)
+            with pytest.raises(PoolError, match="wanted is -1"):
+                gpu.want(-1)
+        wait_until(lambda: len(Partition("GPU", client)) == 0)
+
+
+def test_tasks_for_one_worker_start_no_others(queue, wait_until):
+    with cluster_of({"GPU": adaptive(1, 3)}) as client:
+        gpu = Partition("GPU", client)
+        wait_until(lambda: len(gpu) == 1)
+        tasks = [gpu.submit(wait_for, "go", workers="GPU-0") for _ in range(5)]
+        time.sleep(0.5)
+        assert queue.submitted == ["GPU-0"]
+        tasks.append(gpu.submit(here))
+        assert tasks[-1].result(LONG_S) == "GPU-1"
+        Event("go", client).set()
+        client.gather(tasks)
+
+
+def test_a_map_has_work_for_all_that_may_come(queue, wait_until):
+    with cluster_of({"GPU": adaptive(0, 3)}) as client:
+        gpu = Partition("GPU", client)
+        results = gpu.map(wait_for, ["go"] * 20, chunk=1)
+        wait_until(lambda: len(gpu) == 3)
+        Event("go", client).set()
+        assert sum(results) == 20
+
+
+def test_a_task_that_no_worker_to_come_can_run_is_refused(queue):
+    with cluster_of({"GPU": adaptive(0, 3, slots=2)}) as client:
+        with pytest.raises(PoolError, match=r"asks for 3 slots .* have 2 at most"):
+            Partition("GPU", client).submit(here, slots=3)
+        assert Partition("GPU", client).submit(here, slots=2).result(LONG_S) == "GPU-0"
+
+
+def outer(number):
+    return get_client().submit(twice, number).result()
+
+
+ran: list[tuple[int, str, str]] = []  # number of a task, its partition, and its worker
+
+
+def note(number, partition):
+    ran.append((number, partition, here()))
+    return number
+
+
+def test_no_task_is_lost_or_run_again_while_workers_come_and_go(queue, monkeypatch):
+    """Idle workers go at once, while tasks come one by one."""
+    monkeypatch.setattr(poolpart.clusters, "_ADAPT_EVERY_S", 0.01)
+    ran.clear()
+    partitions = {name: adaptive(0, 2) | {"idle_s": 0.0} for name in ("A", "B")}
+    with cluster_of(partitions) as client:
+        parts = [Partition(name, client) for name in partitions]
+        for number in range(100):
+            part = parts[number % 2]
+            task = part.submit(note, number, part.name)
+            assert task.result(LONG_S) == number
+            del task
+            if number % 3 == 0:
+                time.sleep(0.01)
+        assert parts[0].submit(outer, 3).result(LONG_S) == 6
+    assert sorted(number for number, *_ in ran) == list(range(100))
+    assert all(worker.startswith(partition) for _, partition, worker in ran)
+    assert len(queue.submitted) > 10
+
+
+WRONG = {
+    "a number": ({"adapt": 3}, r"adapt of partition 'GPU' is 3; .* such as \[0, 8\]"),
+    "three": ({"adapt": [1, 2, 3]}, "the least and the greatest"),
+    "workers beside it": ({"adapt": [0, 1], "workers": 1}, "no workers beside it"),
+    "below 0": ({"adapt": [-1, 1]}, "minimum of partition 'GPU' is -1"),
+    "swapped": ({"adapt": [8, 1]}, "maximum of partition 'GPU' is 1; .* 8 or more"),
+    "nothing": ({"adapt": [0, 0]}, "maximum of partition 'GPU' is 0; .* 1 or more"),
+    "a time": ({"adapt": [0, 1], "idle_s": "1m"}, "idle_s of partition 'GPU' is '1m'"),
+    "a time alone": ({"idle_s": 60}, "idle_s without adapt"),
+    "an option": ({"adapt": [0, 1], "mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG)
+def test_what_is_wrong_is_told_before_anything_starts(queue, case):
+    options, says = WRONG[case]
+    with pytest.raises(PoolError, match=says), cluster_of({"IO": {}, "GPU": options}):
+        pass
+    assert queue.submitted == []
+
+
+def test_other_partitions_do_not_adapt(start):
+    client = start({name: {} for name in "ab"})
+    parts = Pool.from_client(client).divide({"A": n_workers(1), "B": rest()})
+    with pytest.raises(PoolError, match=r"'A' has no jobs .* start_partitions .* Partition.grow"):
+        parts["A"].adapt(0, 2)
+    assert not parts["A"].want(2)
+
+
+# -- adaptive clusters of Dask: the scheduler offers none to stop that a partition needs ----
 
 
 def to_close(client):

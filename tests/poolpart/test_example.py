@@ -3,6 +3,8 @@
 import os
 import runpy
 import signal
+import subprocess
+import sys
 import threading
 import time
 from pathlib import Path
@@ -11,11 +13,13 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from distributed import Client, LocalCluster
+from tests.clusters import import_jobqueue
 
 from poolpart import Partition
 from poolpart.pipe import pipes_of
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "thumbnails.py"
+EXAMPLES = Path(__file__).parents[2] / "examples"
+EXAMPLE = EXAMPLES / "thumbnails.py"
 
 
 def thumbnails(count):
@@ -69,3 +73,12 @@ def test_a_writer_goes_on_where_one_has_died(start, tmp_path):
     path.write_bytes(thumbnails(5) + b"half")
     runpy.run_path(str(EXAMPLE))["run"](client, path, 9)
     assert path.read_bytes() == thumbnails(9)
+
+
+@pytest.mark.slow
+def test_partitions_that_grow_with_their_work():
+    import_jobqueue()
+    command = [sys.executable, EXAMPLES / "adaptive.py"]
+    ran = subprocess.run(command, check=True, capture_output=True, text=True, timeout=300)
+    said = ["workers: 0 0", "200 tasks of GPU ran on GPU", "workers of IO: 0"]
+    assert ran.stdout.splitlines() == said

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 import pytest
 from benchmarks import control, formats, gpu, live, pipeline, scale
 from distributed import Client
-from tests.clusters import thread_cluster
+from tests.clusters import import_jobqueue, thread_cluster
 from tests.cuda_on_host import played_cuda, source_backend  # noqa: F401 - fixtures
 
 import lidarpool.api.simulation
@@ -53,6 +53,29 @@ def test_live(tmp_path, capsys):
     assert figures["ratio"] > 0
     assert figures["megabytes_sent"] > 0  # or nobody looked
     assert "times as long" in capsys.readouterr().out
+
+
+def test_adapting(tmp_path, capsys):
+    import_jobqueue()
+    from benchmarks import adapting
+
+    path = tmp_path / "figures.json"
+    figures = adapting.main(["--tasks", "300", "--waves", "2", "--json", str(path)])
+    assert json.loads(path.read_text()) == figures
+    assert (figures["tasks"], figures["misplaced"], figures["taken_back"]) == (300, 0, 0)
+    assert figures["workers_joined"] == figures["workers_left"] >= 3
+    assert "0 of 300 tasks misplaced" in capsys.readouterr().out
+
+
+def test_the_picture_of_jobs(tmp_path):
+    from benchmarks import adapting_slurm
+
+    one = {"waiting": 1, "running": 2, "slots": 2, "busy": 1, "tasks": 9}
+    samples = [{"t": t, "GPU": one, "IO": one} for t in (0.0, 50.0, 90.0)]
+    (tmp_path / "samples.json").write_text(json.dumps(samples))
+    picture = tmp_path / "jobs.png"
+    adapting_slurm.main([str(picture), "--samples", str(tmp_path / "samples.json")])
+    assert picture.stat().st_size > 10_000
 
 
 def test_bytes_of_batches(capsys):

@@ -161,7 +161,13 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     assert not Storage.at(url).has("nuscenes") and not Storage.at(url).has("report.json")
 
 
-@pytest.mark.parametrize("format", DATA_SETS)
+@pytest.mark.parametrize(
+    "format",
+    [
+        pytest.param(name, marks=[] if name in ("kitti", "mcap") else pytest.mark.slow)
+        for name in DATA_SETS
+    ],
+)
 def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, format):  # noqa: A002
     scene, url, here = the_scene(), f"{BUCKET}/sets/{format}", tmp_path / "here"
     sweeps = the_sweeps(scene)

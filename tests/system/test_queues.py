@@ -178,6 +178,41 @@ def test_an_encrypted_cluster_of_jobs(empty_queue, tmp_path, monkeypatch, certif
     assert empty_queue.jobs() == {}
 
 
+ADAPTIVE = {"adapt": [0, 2], "idle_s": 1}
+
+
+@needs_slurm
+def test_partitions_without_jobs_get_some_when_a_run_needs_them(empty_queue, tmp_path):
+    file = slurm_file(tmp_path)
+    gpu = {option: value for option, value in JOBS["GPU"].items() if option != "workers"}
+    held = [*gpu["job_extra_directives"], "--hold"]
+    gpu |= {"job_extra_directives": held, "job_name": "waiting"}
+    file["partitions"]["GPU"] = gpu | ADAPTIVE
+    file["partitions"]["OTHER"] = JOBS["OTHER"] | ADAPTIVE
+    run = Command(tmp_path, file)
+    run.wait_for(r"started SLURMCluster: up to 5 workers, GPU 0 to 2, LIDAR 1, OTHER 0 to 2")
+    run.wait_for(r"waiting for workers: Partition 'GPU' has 0 of the 1 slots .* jobs in the queue")
+    assert empty_queue.jobs()["waiting"][1] == "PENDING"
+    empty_queue.ask("scontrol", "release", "jobname=waiting")
+    run.assert_default_result()
+    assert empty_queue.jobs() == {}
+
+
+@needs_slurm
+def test_a_run_waits_for_jobs_that_replace_lost_ones(empty_queue, tmp_path):
+    expected, _ = Command(tmp_path, None, MINUTE).result()
+    file = slurm_file(tmp_path)
+    gpu = {option: value for option, value in JOBS["GPU"].items() if option != "workers"}
+    file["partitions"]["GPU"] = gpu | ADAPTIVE | {"adapt": [0, 1]}
+    run = Command(tmp_path, file, MINUTE)
+    run.wait_for(r"survey +[1-9]")
+    empty_queue.ask("scancel", empty_queue.jobs()["gpu"][0])
+    run.wait_for(r"waiting for workers of partition GPU: 1 job in the queue, or starting")
+    checksum, _ = run.result()
+    assert checksum == expected
+    assert empty_queue.jobs() == {}
+
+
 def configure_certificates(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Put certificates into Dask's configuration, for this process and those that it starts."""
     _, files = new_files(folder)
@@ -208,6 +243,21 @@ def test_a_run_on_hosts_that_ssh_reaches(ssh, tmp_path, monkeypatch, protocol):
         configure_certificates(tmp_path, monkeypatch)
     run = Command(tmp_path, ssh_file(tmp_path, ssh, protocol=protocol))
     run.assert_default_result()
+    wait_until(lambda: not processes_in(tmp_path))
+
+
+@needs_sshd
+def test_processes_that_ssh_starts_when_a_run_needs_them(ssh, tmp_path):
+    file = ssh_file(tmp_path, ssh)
+    file["partitions"] = HOSTS | {name: HOSTS[name] | ADAPTIVE for name in ("GPU", "OTHER")}
+    long = FEWER | {"steps": 600}  # idle workers of OTHER end before the run
+    run = Command(tmp_path, file, long)
+    run.wait_for("started SSHCluster: up to 5 workers, GPU 0 to 2, LIDAR 1, OTHER 0 to 2")
+    expected, _ = Command(tmp_path, None, long).result()
+    checksum, report = run.result()
+    assert checksum == expected
+    assert report["tasks"]["OTHER"] == {"trial": 10}
+    assert "cannot be started" not in run.said
     wait_until(lambda: not processes_in(tmp_path))
 
 

@@ -85,7 +85,7 @@ def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
 
 
 @pytest.mark.slow
-def test_a_worker_that_stops_when_it_was_checked_is_done_without(client, monkeypatch):
+def test_a_worker_that_stops_when_it_has_prepared_itself_is_done_without(client, monkeypatch):
     """Its answer cannot be had for longer than Dask's own calls wait for one."""
     stopped: list[int] = []
     take = CastingWorkers._take

@@ -120,13 +120,7 @@ def demo(out: Path | Storage, **shown: Any) -> None:
 @options.flag("--resume", help="Resume an unfinished run, if there is one.")
 @options.flag("--fresh", help="Delete an unfinished run.")
 @options.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
-@click.option(
-    "--job",
-    "number",
-    type=click.IntRange(min=0),
-    metavar="N",
-    help="Of a campaign: run job N alone, again, as a survey.",
-)
+@options.job
 @click.option(
     "--parts",
     metavar="PLACE",

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -18,8 +18,10 @@ from rosbags.interfaces import (
     QosReliability,
     QosTime,
 )
+from rosbags.rosbag2 import Reader as Bag
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys.store import Typestore
 
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS
@@ -142,17 +144,17 @@ class Reader(reading.Reader):
 
     def __init__(self, *given: Any) -> None:
         super().__init__(*given)
-        self._opened: AnyReader | None = None
+        self._opened: Bag | None = None
 
     def file(self, sweep: int) -> str:
         """Return the name of the job's bag."""
         return f"bags/{self.entry.name}.mcap"
 
     @property
-    def _bag(self) -> AnyReader:
+    def _bag(self) -> Bag:
         if self._opened is None:
-            store = get_typestore(Stores.ROS2_HUMBLE)
-            bag = AnyReader([self.local(self.file(0))], default_typestore=store)
+            # AnyReader would parse the definitions of messages, which takes longer than a sweep.
+            bag = Bag(self.local(self.file(0)))
             bag.open()
             self._opened = bag
         return self._opened
@@ -166,7 +168,7 @@ class Reader(reading.Reader):
         connection, _, data = next(found, (None, 0, b""))
         if connection is None:
             raise ValueError(f"it has no message on {topic} at {time_ns} ns")
-        message: Any = self._bag.deserialize(data, connection.msgtype)
+        message: Any = _types().deserialize_cdr(data, connection.msgtype)
         coloured = any(field.name == "rgb" for field in message.fields)
         rows = message.data.view(_row(self.layout, coloured))
         light = rows["intensity"].astype(np.float32)
@@ -181,6 +183,12 @@ class Reader(reading.Reader):
         if self._opened is not None:
             self._opened.close()
         super().close()
+
+
+@cache
+def _types() -> Typestore:
+    """Return the types of messages in bags of ours."""
+    return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def _frames(sweeps: Sweeps) -> list[str]:

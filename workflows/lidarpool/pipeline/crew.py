@@ -25,6 +25,7 @@ from .messages import (
     Summaries,
 )
 from .names import GENERATE, SORT
+from .policies import slots_wanted
 from .rigs import RigPlan
 from .workers import CastingWorkers, Outcome
 
@@ -43,6 +44,7 @@ class Seat:
         self._workers, self._stages = crew.workers, crew.stages
         self.batches, self.seconds = Batches(), crew.seconds
         self.wants_scans = False  # whether messages of stage 1 are wanted
+        self.left = 0  # scans that are not committed
         self.inbox: list[Message] = []
         self.died: dict[str, str] = {}  # {name of a stage: address}, since the driver looked
         self.started: list[str] = []
@@ -81,6 +83,10 @@ class Seat:
     def forget(self, key: str) -> None:
         """Cancel a casting task, or drop its result."""
         self._workers.forget(key)
+
+    def learn(self, record: TaskRecord) -> None:
+        """Record how long a batch took to cast."""
+        self._crew.learn(record)
 
     def words_on_memory(self, worker: str) -> str:
         """Clause for a message about a dead worker, if a nanny ended it for its memory."""
@@ -157,6 +163,8 @@ class Crew:
 
     def __init__(self, workers: CastingWorkers, stages: LongStages) -> None:
         self.workers, self.stages = workers, stages
+        self.later = 0  # scans of surveys that have no seat yet
+        self._learned = [0.0, 0]  # casting time of scans, and their number
         self._seats: dict[str, Seat] = {}
         self.seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._running: list[str] = []  # stages that were started
@@ -189,6 +197,11 @@ class Crew:
         seat.started, seat.seen = [*self._running], self.workers.seen
         return seat
 
+    def learn(self, record: TaskRecord) -> None:
+        """Record how long a batch took to cast."""
+        self.seconds.append(record.seconds)
+        self._learned = [self._learned[0] + record.seconds, self._learned[1] + record.items]
+
     def leave(self, seat: Seat) -> None:
         """Do nothing more for a survey."""
         for batch in seat.batches:
@@ -214,6 +227,10 @@ class Crew:
             if (seat := self._seats.get(message.job)) is not None:  # else of one that has failed
                 seat.take(message)
         seen = self.workers.look()
+        if seen is not None:
+            seconds, scans = self._learned
+            left = self.later + sum(seat.left for seat in self.seats)
+            self.workers.want(max(1, slots_wanted(left, seconds / scans if scans else None)))
         changes = self.stages.look(progress)
         if GENERATE in changes.started:
             self._described.clear()  # it is told again
@@ -247,6 +264,7 @@ class Crew:
 
     def close(self) -> None:
         """Let all stages end: everything is committed."""
+        self.workers.want(0)
         self.stages.close()
 
     @property

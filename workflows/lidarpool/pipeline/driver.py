@@ -74,6 +74,7 @@ class SurveyDriver:
         self._fit, self._in_all = fit, max(in_all, survey.scan_count)
         self._db, self._storage = db, storage
         self._read, self._on_frame, self._on_parts = read, on_frame, on_parts
+        seat.left = survey.scan_count - db.scans_done
         self._mark = db.meta["mark"]
         self._summary = summary_type(samples_of_scan(survey.scan_count))
         self.book = TaskBook()
@@ -126,6 +127,7 @@ class SurveyDriver:
         moved |= self._offer()
         if self._condemned and not self.batches:
             raise JobError("\n".join(self._condemned))
+        self.seat.left = self.survey.scan_count - self._db.scans_done
         room = policies.room(len(self.batches), self.batches.span, self._most)
         left = self.generated < self.survey.scan_count
         self.seat.wants_scans = room > 0 and left and not self._condemned
@@ -327,7 +329,7 @@ class SurveyDriver:
     def _learn(self, record: TaskRecord) -> None:
         """Record a task of stage 2, and advise stage 1 on the scans in one item."""
         self.book.add(record)
-        self._seconds.append(record.seconds)
+        self.seat.learn(record)
         slots = self.seat.slot_count
         self.seat.advise(
             policies.scans_per_batch(record.seconds, record.items, self._fit, self._in_all, slots)

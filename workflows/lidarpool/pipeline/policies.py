@@ -5,6 +5,7 @@ Nothing here reads a clock, the cluster or the driver.
 
 from __future__ import annotations
 
+import math
 import statistics
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
@@ -21,6 +22,7 @@ TASK_SECONDS = 0.1  # casting time that makes a task worth its overhead
 TASK_BATCHES = 32  # batches of one task, at most
 AHEAD = 2  # tasks offered to a worker for each of its slots, so that it need not wait
 COLLECTING = 3  # tasks whose batches a collector is given at a time
+WORTH_S = 20.0  # casting time that makes another slot worth its start
 SPAN = 8  # batches that the newest may be ahead of the oldest, for each that may be under way
 SUSPECT_DEATHS = 2  # workers that may die with a batch before it is tried alone
 KILLS_MOST = 3  # workers that a single scan may kill, alone
@@ -68,6 +70,14 @@ def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
 def room(under_way: int, span: int, most: int) -> int:
     """Batches that may be taken; none while the newest is far ahead of the oldest."""
     return 0 if span >= SPAN * most else most - under_way
+
+
+def slots_wanted(left: int, scan_s: float | None) -> int:
+    """Slots that so many scans are worth, if each takes `scan_s` seconds to cast, None if unknown.
+
+    Then as many as may be of use: who waits in a queue twice waits twice as long.
+    """
+    return left if scan_s is None else min(left, math.ceil(left * scan_s / WORTH_S))
 
 
 # -- where batches go ------------------------------------------------------------------------

@@ -195,7 +195,11 @@ def _collected(
         me.trace("get", range(first, stop))
         try:
             yield replace(_stored(me, storage, batches[first], stop, name), job=order.job)
-        except ScanError as error:
+        except (ScanError, LidarpoolError) as error:
+            # A survey that has failed leaves orders behind, and its folder may be removed.
+            folder_is_gone = isinstance(error.__cause__, FileNotFoundError)
+            if not isinstance(error, ScanError) and not folder_is_gone:
+                raise
             yield Failed(f"stage {COLLECT} failed: {error}", order.job)
         except LidarpoolError as error:
             # The folder of a job goes with it, and an order that came twice may be late.

@@ -1,4 +1,4 @@
-"""The GPU workers and their casting tasks: checked, refused, paused, silent, gone."""
+"""The GPU workers and their casting tasks: wanted, checked, refused, paused, silent, gone."""
 
 from __future__ import annotations
 
@@ -90,15 +90,24 @@ class CastingWorkers:
         # Of surveys, and those used last; their plans keep what they are known by.
         self._scenes: dict[tuple[int, ...], tuple[RigPlan, _Packed]] = {}
         self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
-        self._setups: dict[str, Future] = {}  # {address: task that checks the worker}
+        self._setups: dict[str, Future] = {}  # {address: task that is checking the worker}
+        # {address of a worker that may cast: tasks at a time}. The answers are not kept on the
+        # workers: one with a result cannot be returned to the queue.
+        self._checked: dict[str, int] = {}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = self._offered = 0
         self._casts: dict[str, Future] = {}  # {key: casting task}
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
         self.seen = Whereabouts()
-        self.slots: dict[str, int] = {}  # {address of a worker that may cast: tasks at a time}
+        self._wanted = -1  # slots, as the scheduler knows
+        self._adapts = True  # the partition grows with what is wanted, as far as known
         self.notes: list[str] = []  # what a user should know
+
+    @property
+    def slots(self) -> dict[str, int]:
+        """{address of a worker that was checked and takes tasks: tasks at a time}."""
+        return {a: slots for a, slots in self._checked.items() if a in self.seen.free}
 
     @property
     def slot_count(self) -> int:
@@ -121,7 +130,7 @@ class CastingWorkers:
     def pending(self) -> list[str]:
         """Keys of the tasks that have not ended."""
         casts = [key for key, future in self._casts.items() if future.status == "pending"]
-        return casts + [f.key for a, f in self._setups.items() if a not in self.slots]
+        return casts + [future.key for future in self._setups.values()]
 
     # -- surveys ---------------------------------------------------------------------------
 
@@ -221,9 +230,10 @@ class CastingWorkers:
         self._looked_at = time.monotonic()
         keys = [future.key for future in self.futures]
         self.seen = look_for_tasks(self._client, self._partition.name, keys)
-        for address in self._setups.keys() - self.seen.members:
+        known = self._setups.keys() | self._checked.keys()
+        for address in known - self.seen.members:
             self._remove(address)
-        for address in sorted(self.seen.free.keys() - self._setups.keys()):
+        for address in sorted(self.seen.free.keys() - known):
             if address not in self._refused:
                 self._prepare(address)
         self._check()
@@ -232,10 +242,7 @@ class CastingWorkers:
     def _check(self) -> None:
         """Record the workers that may cast."""
         for address, future in list(self._setups.items()):
-            if address in self.slots:
-                if address not in self.seen.free:
-                    del self.slots[address]
-            elif future.status == "finished" and address in self.seen.free:
+            if future.status == "finished" and address in self.seen.free:
                 self._take(address, future)
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
@@ -246,10 +253,24 @@ class CastingWorkers:
             if _is_gone(scene.data):
                 scene.data = self._shared(scene.name, plan.packed_scene())
 
+    def want(self, slots: int) -> None:
+        """Want so many slots of a partition that grows with its work; 0 when there is no more.
+
+        The driver binds each batch to a worker, so that no batch waits for workers to come.
+        """
+        if slots != self._wanted and self._adapts:
+            self._wanted = slots
+            self._adapts = self._partition.want(slots)
+        if not slots:  # what workers have for tasks would keep these workers
+            self._surveys.clear()
+            self._scenes.clear()
+
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
         addresses = [a for a in self.slots if a in self.seen.members]
-        self.slots.clear()
+        self._checked.clear()
+        if self._client.status == "running":
+            self.want(0)
         if addresses and self._client.status == "running":
             # Dask tries for half a minute to reach a worker that is ending.
             with suppress(TimeoutError):
@@ -276,9 +297,9 @@ class CastingWorkers:
         if future.key not in found:
             return
         answer: dict[str, Any] = found[future.key]
+        del self._setups[address]
         if differs := difference(answer["software"], self._software):
             self._refused[address] = differs
-            del self._setups[address]
             self.notes.append(
                 f"worker {answer['worker']} at {address} has {differs}: it cast nothing"
             )
@@ -288,18 +309,18 @@ class CastingWorkers:
                     f"one at {address} has {differs}. Install the same on all."
                 )
             return
-        self.slots[address] = max(1, answer["slots"].get(self._partition.name, 1))
+        self._checked[address] = max(1, answer["slots"].get(self._partition.name, 1))
         self._died.clear()
 
     def _remove(self, address: str) -> None:
         """Remove a worker that has gone."""
-        future = self._setups.pop(address)
         self._refused.pop(address, None)
         self._unneeded.pop(address, None)
         for packed in self._packed_things:
             packed.there.discard(address)
-        if self.slots.pop(address, None) is not None:
+        if self._checked.pop(address, None) is not None:
             return
+        future = self._setups.pop(address)
         place = self.seen.tasks.get(future.key)
         if place is not None and place.deaths:
             self._died.append(address)

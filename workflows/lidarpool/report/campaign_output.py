@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import json
 import re
+import tempfile
 import time
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager, ExitStack
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from ..base.words import counted
 from ..export.dataset import INDEX_FILE, DataSet
 from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
+from ..export.loader import sweeps
 from ..run.campaign import CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.job import Job
@@ -29,6 +31,7 @@ from ..run.watch import Waiting
 from ..scenario.campaign import Campaign, Described
 from .campaign_figures import CampaignInfo
 from .campaign_report import write_card
+from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
@@ -137,6 +140,7 @@ def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: Cam
     with explained(f"{place} cannot be written"):
         place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
     write_table(place, campaign.names, store.rows())
+    dataset.finish(store.rows())
     info = CampaignInfo(
         title=campaign.title,
         license=campaign.license,
@@ -150,9 +154,16 @@ def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: Cam
         resumed=run.resumed,
         notes=run.notes,
         stages=run.stages,
+        file=campaign.command,
+        description=campaign.description,
     )
-    write_card(place, info, store.rows())
-    dataset.finish(store.rows())
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+        saved = sweeps(place.url)
+        if len(saved):
+            picture = Path(folder, "job.png")
+            draw_sweep(next(iter(saved))).save(picture)
+            info = replace(info, picture=picture)
+        write_card(place, info, store.rows())
 
 
 def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:

@@ -357,6 +357,7 @@ class CampaignDriver(Surveys):
         self._all_made = False
         self._remover = ThreadPoolExecutor(1, "remove")
         self._committed = 0
+        self._begun = (0, 0)  # jobs, and their scans
         self.books = TaskBook()
         self.casting = 0.0
         self.points = self.scans_done = 0
@@ -452,6 +453,10 @@ class CampaignDriver(Surveys):
             entry.job.survey.scan_count * left,
         )
         self._under_way.append(entry)
+        self._begun = (self._begun[0] + 1, self._begun[1] + entry.job.survey.scan_count)
+        ended = len(self._store.db.jobs)
+        to_come = self._store.count - ended - len(self._under_way) - len(self._writer)
+        self._crew.later = max(0, to_come) * self._begun[1] // self._begun[0]
 
     def _leave(self, entry: Entry) -> None:
         """Let the crew do nothing more for a job."""
@@ -556,8 +561,9 @@ def run_campaign(
         while True:
             needed = slots_needed(first.job)
             needed[LIDAR] += 1  # which jobs are written in
+            left = first.job.survey.scan_count * len(store.left)
             try:
-                cluster = Cluster(client, first.job, store, tell, waiting, needed)
+                cluster = Cluster(client, first.job, store, tell, waiting, needed, left)
                 break
             except JobError as error:  # it is too large for the workers; others may not be
                 described = first.described

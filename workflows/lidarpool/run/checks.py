@@ -6,12 +6,21 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from distributed import Client
 
-from poolpart import Pool, PoolError, WorkerInfo, ask_workers, worker_identities
+from poolpart import (
+    Partition,
+    Pool,
+    PoolError,
+    WorkerInfo,
+    ask_workers,
+    look_for_tasks,
+    worker_identities,
+)
 from raybeam import available_backends
 
 from .._version import __version__
@@ -21,9 +30,10 @@ from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT, JobError
 from ..simulator.memory import MB, cast_bytes
 from ..simulator.world import AUTO_TAKES
 from .job import Job
-from .watch import Waiting
+from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2
+SUBMIT_S = 30.0  # for jobs to be in the queue once slots are wanted
 
 
 class TooFewWorkersError(LidarpoolError):
@@ -43,22 +53,29 @@ def find_workers(
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
     needed: Mapping[str, int] | None = None,
+    left: int | None = None,
 ) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
     """Find all workers, the casting ones among them, their backend and their software.
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
     software that a resumed run was cast with. Workers that are missing or just died are waited
-    for as long as `waiting` says. Slots `needed` are by default those of the job.
+    for as long as `waiting` says. Slots `needed` are by default those of the job. If scans are
+    `left` to be cast, slots are wanted of partitions that grow with their work, and jobs that are
+    in the queue are waited for.
 
     LidarpoolError if workers, slots, memory or the backend are missing, or versions differ.
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
     waiting = waiting or Waiting()
+    needed = needed or slots_needed(job)
+    began = time.monotonic()
+    for name, slots in needed.items() if left is not None else ():
+        Partition(name, client).want(max(slots, left or 0) if name == GPU else slots)
     while True:
         looked = time.monotonic()
         try:
-            pool = _survey_pool(client, needed or slots_needed(job), job)
+            pool = _survey_pool(client, needed, job)
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             backend = common_backend(client, wanted, casting, advice)
             for worker in casting:
@@ -70,11 +87,38 @@ def find_workers(
         except TooFewWorkersError as error:
             # One that has just died takes half a minute not to answer, which is no waiting: what
             # counts is when the last look began.
-            if not waiting.left(looked):
+            coming = _coming(client, needed) if left is not None else None
+            submitting = coming == 0 and looked - began < SUBMIT_S
+            if not (coming or submitting or waiting.left(looked)):
                 raise
             # Who waits has started them.
-            waiting.tell("workers", str(error).partition(": start ")[0])
+            why = str(error).partition(": start ")[0]
+            why += f"; {queued(coming)}" if coming else ""
+            waiting.tell("workers", why, limited=not coming)
         time.sleep(LOOK_EVERY_S)
+
+
+def _coming(client: Client, needed: Mapping[str, int]) -> int | None:
+    """Jobs that wait in a queue, or start, of partitions that lack slots.
+
+    None if there is no such partition, or one that will not have enough.
+    """
+    jobs = None
+    for name, slots in needed.items():
+        seen = look_for_tasks(client, name)
+        if seen.slots < slots:
+            if seen.most_slots < slots:
+                return None
+            jobs = (jobs or 0) + seen.coming
+    return jobs
+
+
+def want_nothing(client: Client, names: Iterable[str]) -> None:
+    """Let partitions shrink that have grown for a run."""
+    if client.status == "running":
+        with suppress(PoolError, OSError):
+            for name in names:
+                Partition(name, client).want(0)
 
 
 def check_memory(job: Job, backend: str, room: float, worker: str) -> None:

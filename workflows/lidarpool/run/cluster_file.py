@@ -33,8 +33,21 @@ class Workers(BaseModel):
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
 
     workers: int = Field(1, ge=0, le=10_000)
+    adapt: list[int] | None = Field(None, min_length=2, max_length=2)  # least and greatest number
+    idle_s: float | None = Field(None, ge=0, allow_inf_nan=False)
     slots: int = Field(1, ge=1, le=10_000)
     hosts: list[str] | None = Field(None, min_length=1)
+
+    def wrong(self) -> str:
+        """Say what is wrong with the number of workers; empty if nothing is."""
+        if self.adapt is None:
+            return "" if self.idle_s is None else "idle_s needs adapt beside it, such as [0, 8]."
+        if "workers" in self.model_fields_set:
+            return "adapt is a number of workers too: leave out workers."
+        least, most = self.adapt
+        if not 0 <= least <= most <= 10_000 or most < 1:
+            return f"adapt is {self.adapt}: give the least and the greatest number, such as [0, 8]."
+        return ""
 
 
 class ClusterFile(BaseModel):
@@ -67,12 +80,14 @@ class ClusterFile(BaseModel):
                     f"{path}: partitions.{name} is not a partition of a survey: GPU, LIDAR or "
                     f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
                 )
+            if wrong := file.partitions[name].wrong():
+                raise LidarpoolError(f"{path}: partitions.{name}.{wrong}")
         file._factory()
         return file
 
     @property
     def slots(self) -> dict[str, int]:
-        """Slots of each partition."""
+        """Slots of each partition, the most that it may have."""
         return {name: self._count(name) * one.slots for name, one in self.partitions.items()}
 
     def require(self, needed: Mapping[str, int]) -> None:
@@ -85,8 +100,9 @@ class ClusterFile(BaseModel):
                 )
 
     def __str__(self) -> str:
-        parts = ", ".join(f"{name} {self._count(name)}" for name in self.partitions)
+        parts = ", ".join(f"{name} {self._range(name)}" for name in self.partitions)
         total = counted(sum(map(self._count, self.partitions)), "worker")
+        total = f"up to {total}" if any(one.adapt for one in self.partitions.values()) else total
         return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
 
     @contextmanager
@@ -98,7 +114,8 @@ class ClusterFile(BaseModel):
         """
         arguments = dict(self.arguments)
         partitions = {
-            name: {"workers": self._count(name)} | one.model_dump(exclude_unset=True)
+            name: ({} if one.adapt else {"workers": self._count(name)})
+            | one.model_dump(exclude_unset=True)
             for name, one in self.partitions.items()
         }
         factory = self._factory()
@@ -135,9 +152,15 @@ class ClusterFile(BaseModel):
 
     def _count(self, name: str) -> int:
         one = self.partitions[name]
+        if one.adapt:
+            return one.adapt[1]
         return (
             len(one.hosts) if one.hosts and "workers" not in one.model_fields_set else one.workers
         )
+
+    def _range(self, name: str) -> str:
+        adapt = self.partitions[name].adapt
+        return f"{adapt[0]} to {adapt[1]}" if adapt else str(self._count(name))
 
     def _factory(self) -> Any:
         """Import the class; only clusters are taken."""

@@ -37,7 +37,7 @@ from ..pipeline import (
 from ..pipeline.task_book import TaskBook
 from ..plan import best
 from ..simulator.memory import MB, scans_that_fit
-from .checks import check_memory, find_workers, gpu_note
+from .checks import check_memory, find_workers, gpu_note, want_nothing
 from .job import Job
 from .progress import Show
 from .result import RunResult
@@ -91,8 +91,8 @@ class Cluster:
 
     `job` is what it is checked for, and `kept` says what earlier runs cast with. `tell` is called
     every few seconds with a message while the run waits, and `waiting` says how long to wait for
-    workers at the start. Slots `needed` are by default those of the job. LidarpoolError if the
-    cluster lacks something.
+    workers at the start. Slots `needed` are by default those of the job, and so many scans are
+    `left`. LidarpoolError if the cluster lacks something.
     """
 
     def __init__(
@@ -103,6 +103,7 @@ class Cluster:
         tell: Callable[[str], None],
         waiting: Waiting,
         needed: Mapping[str, int] | None = None,
+        left: int | None = None,
     ) -> None:
         self.client, self.job, self._tell, self._kept = client, job, tell, kept
         # For errors about a lost cluster; a client that was never connected is refused below.
@@ -116,9 +117,11 @@ class Cluster:
                 kept.casting if kept.resumed else {},
                 waiting,
                 needed,
+                left,
             )
             kept.backend, kept.casting = backend, software
         except LidarpoolError:
+            want_nothing(client, (GPU, LIDAR, OTHER))
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
@@ -228,6 +231,7 @@ class Cluster:
         try:
             if trials is not None:  # first: no slot of OTHER waits for the survey
                 trials.step()
+                self.partitions[OTHER].want(0)  # from now on its trials wait for workers
             crew.open()
             times = self._loop(crew, surveys(), trials, save, on_progress)
             self.stages = TaskBook()
@@ -235,6 +239,7 @@ class Cluster:
                 self.stages.add(record)
             if trials is not None:
                 trials.finish()
+            want_nothing(self.client, self.partitions)
             self.notes += crew.notes
             return times
         except BaseException as error:
@@ -245,6 +250,7 @@ class Cluster:
             _stop(
                 self.client, [crew, *([trials] if trials else [])], f"the run was stopped: {reason}"
             )
+            want_nothing(self.client, self.partitions)
             if error is self.callers_error:
                 raise
             if isinstance(error, PoolError) and not lost:
@@ -317,7 +323,8 @@ def drive(
     page. LidarpoolError if the cluster lacks something.
     """
     started, job = time.monotonic(), store.job
-    cluster = Cluster(client, job, store, tell, waiting)
+    left = job.survey.scan_count - store.resumed
+    cluster = Cluster(client, job, store, tell, waiting, left=left)
     show = watched(show, cluster.partitions)
     trials = None
     if job.planning is not None:

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 from distributed import Client, Future
 
-from poolpart import Partition, fetch_available, look_for_tasks, recorded
+from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks, recorded
 
 from ..base.errors import LidarpoolError
 from ..base.software import call_alike
@@ -46,9 +46,7 @@ class TrialPump:
         self._waiting = deque(n for n in range(planning.trials) if n not in known)  # numbers
         self._running: dict[Future, int] = {}  # {future: number of the trial}
         self._rounds: Counter[int] = Counter()  # {number: how often it was submitted}
-        self._looked_at = time.monotonic()
-        # One waits behind each running trial: no slot idles, and a dying worker loses few.
-        self._most = 2 * max(1, partition.slots)
+        self._look()
 
     @property
     def finished(self) -> bool:
@@ -106,15 +104,22 @@ class TrialPump:
 
     def _leave_silent_workers(self) -> None:
         """Rerun trials whose workers are silent or have gone."""
-        self._looked_at = time.monotonic()
-        keys = [future.key for future in self._running]
-        seen = look_for_tasks(self.client, self.partition.name, keys)
+        seen = self._look()
         heard = sorted(seen.members - seen.silent)
         # A trial bound to a worker that has gone waits for ever.
         waiting = {key for key, place in seen.tasks.items() if place.state == "no-worker"}
         lost = [f for f in self._running if f.key in waiting or seen.out_of_reach(f.key)]
         for place, future in enumerate(lost if heard else []):
             self._submit(self._running.pop(future), heard[place % len(heard)])
+
+    def _look(self) -> Whereabouts:
+        self._looked_at = time.monotonic()
+        keys = [future.key for future in self._running]
+        seen = look_for_tasks(self.client, self.partition.name, keys)
+        # One waits behind each running trial: no slot idles, and a dying worker loses few. Trials
+        # that wait have more workers started, where their number adapts.
+        self._most = 2 * max(1, seen.most_slots)
+        return seen
 
     def stop(self, reason: str) -> None:
         """Start no more trials; running ones end in a fraction of a second."""

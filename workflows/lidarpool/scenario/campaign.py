@@ -33,6 +33,7 @@ from .validation_errors import validation_errors
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")
+SHOWN_MOST = 5  # files of a command that are named
 _NOISE = "noise.seed"  # where a job's own seed goes
 _DIGITS_LEAST = 4  # of a job's name, so that a campaign may grow
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
@@ -144,6 +145,8 @@ class Campaign:
     splits: Mapping[str, float]
     license: str
     title: str
+    command: str = ""  # what follows ``lidarpool run``; empty for a function
+    description: str = ""  # the file's text, where there is one
 
     @checked
     def __init__(
@@ -184,6 +187,7 @@ class Campaign:
         title = section.title or path.stem
         self = cls.__new__(cls)
         self._begin(jobs, section.model_copy(update={"count": jobs.count, "title": title}))
+        self.command, self.description = path.name, path.read_text("utf-8-sig")
         return self
 
     @classmethod
@@ -209,6 +213,9 @@ class Campaign:
         given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
         self = cls.__new__(cls)
         self._begin(jobs, _head(count=jobs.count, **given))
+        self.command = " ".join(Path(path).name for path in jobs.paths[:SHOWN_MOST])
+        if len(jobs.paths) > SHOWN_MOST:
+            self.command += " …"
         return self
 
     @property
@@ -241,6 +248,7 @@ class Campaign:
             raise LidarpoolError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
             )
+        number = int(number)  # of NumPy, perhaps
         found = self._jobs.job(number)
         name = found.name or f"{number:0{max(_DIGITS_LEAST, len(str(self.count - 1)))}d}"
         return replace(found, name=name, split=self._split(number))
@@ -358,7 +366,7 @@ class _Given:
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
             raise LidarpoolError("a campaign needs a scenario at least: name one or more files.")
-        self._paths, self.count = paths, len(paths)
+        self.paths, self.count = paths, len(paths)
         mistakes = Mistakes()
         self._files: list[list[Path]] = []
         self._prints: list[str] = []
@@ -380,7 +388,7 @@ class _Given:
 
     def job(self, number: int) -> Described:
         return Described(
-            number, self._names[number], {}, scenario=Scenario.load(self._paths[number])
+            number, self._names[number], {}, scenario=Scenario.load(self.paths[number])
         )
 
 
@@ -406,13 +414,14 @@ class _Varied:
         self._vary, self._seed, self._source = section.vary, section.seed, str(path)
         mistakes = Mistakes()
         self._bases: list[_Base] = []
-        tables: dict[Any, list[Row]] = {}
+        tables: dict[Any, list[Row]] = {}  # {file and kind of entry: rows}
+        alone = len(section.base) == 1
         for name in section.base:
             with mistakes.noted(), prefixed(path):
                 file = file_of(path.parent, name)
                 if is_campaign(file):
                     raise LidarpoolError(f"base {name!r} is a campaign; give a scenario.")
-                self._bases.append(_Base(file, section.vary, tables))
+                self._bases.append(_Base(file, section.vary, tables, alone))
         mistakes.tell()
         for one in self._bases:
             one.check(self._source, mistakes)
@@ -428,7 +437,12 @@ class _Varied:
             raise LidarpoolError(
                 f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
             )
-        self.count = min(section.count or grid, COUNT_MOST)
+        if section.count is None and grid > COUNT_MOST:
+            raise LidarpoolError(
+                f"{path}: count is missing: all values of each are {grid:,} jobs, of at most "
+                f"{COUNT_MOST:,}."
+            )
+        self.count = section.count or grid
         several = ("base",) if len(self._bases) > 1 else ()
         self.names = (*several, *section.vary)
         listed = ", ".join(base.name for base in self._bases[:8])
@@ -478,8 +492,9 @@ class _Base:
     """A scenario, and where the paths of a campaign lead in it."""
 
     def __init__(
-        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Row]]
+        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Row]], alone: bool
     ) -> None:
+        self._where = "vary" if alone else f"vary, of {path.name}"  # for messages
         self.scenario, self.name, self._folder = Scenario.load(path), path.name, path.parent
         self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
         self._fields: dict[str, FieldPath] = {}
@@ -487,11 +502,11 @@ class _Base:
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
-            with mistakes.noted(), prefixed("vary"):
+            with mistakes.noted(), prefixed(self._where):
                 self._fields[text], kind = find_field(self.scenario, text)
             if choice.sample is None or text not in self._fields:
                 continue
-            with mistakes.noted(), prefixed(f"vary: {text}"):
+            with mistakes.noted(), prefixed(f"{self._where}: {text}"):
                 table = file_of(self._folder, choice.sample.file)
                 if (key := (table, repr(kind))) not in tables:
                     tables[key] = read_rows(table, kind)
@@ -512,13 +527,14 @@ class _Base:
                 short, long = sorted((one, other), key=lambda field: len(field.keys))
                 if short.keys == long.keys:
                     raise LidarpoolError(
-                        f"vary: {other.text} and {one.text} lead to the same field: leave one out."
+                        f"{self._where}: {other.text} and {one.text} lead to the same field: "
+                        "leave one out."
                     )
                 added = self._vary[short.text].sample is not None
                 if long.keys[: len(short.keys)] == short.keys and not added:
                     raise LidarpoolError(
-                        f"vary: {short.text} is chosen as a whole, and {long.text} is a part of "
-                        "it: leave one out."
+                        f"{self._where}: {short.text} is chosen as a whole, and {long.text} is a "
+                        "part of it: leave one out."
                     )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
@@ -530,22 +546,29 @@ class _Base:
         trials: dict[str, list[Any]] = {t: c.ends for t, c in self._vary.items() if not c.sample}
         samples = {t: c.sample.count for t, c in self._vary.items() if c.sample}
         together: LidarpoolError | None = None
-        for turn in range(max([2, *map(len, trials.values())])):
+        turns = [-(-len(self.tables[text]) // max(1, most)) for text, (_, most) in samples.items()]
+        for turn in range(max([1, *map(len, trials.values()), *(1 + each for each in turns)])):
             values = {text: ends[turn % len(ends)] for text, ends in trials.items()}
-            rows = {
-                text: [row.entry for row in self.tables[text][: counts[turn % 2]]]
-                for text, counts in samples.items()
-            }
+            rows = {text: self._rows_of(text, turn, *counts) for text, counts in samples.items()}
             try:
-                found = self.scenario_of(values, rows, f"{source}: vary")
+                found = self.scenario_of(values, rows, f"{source}: {self._where}")
             except LidarpoolError as error:
                 together = error
                 break
             self._take_files(found, source, mistakes)
         if together is None:
             return
-        wrong = [f"{source}: vary: {line}" for text in trials for line in self._tried(text)[:1]]
+        wrong = [
+            f"{source}: {self._where}: {line}" for text in trials for line in self._tried(text)[:1]
+        ]
         mistakes.lines += wrong or str(together).splitlines()
+
+    def _rows_of(self, text: str, turn: int, least: int, most: int) -> list[Any]:
+        """Entries of a sample for a turn: the fewest first, then all rows in pieces."""
+        table = self.tables[text]
+        begin = (turn - 1) * most % max(1, len(table))
+        rows = table[begin : begin + most] if turn else table[:least]
+        return [row.entry for row in rows]
 
     def _tried(self, text: str) -> list[str]:
         """Lines on the values of a path that are not valid in the base."""

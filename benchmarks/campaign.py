@@ -1,0 +1,140 @@
+"""What a campaign costs beside its rays: `python -m benchmarks.campaign`.
+
+Jobs of 20 scans, one turn of a sensor with 64 channels, on a local cluster that has started before.
+The cost of a job beside its rays is the wall time less the casting time of all tasks, shared by the
+workers that cast. `--toy` makes the jobs so small that only their number counts, and `--picture`
+draws the memory of the driver, which has the scheduler in its process, and of LIDAR's worker.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+
+from lidarpool import Campaign
+from lidarpool.pipeline import GPU
+from lidarpool.run.connection import local_client
+from lidarpool.run.progress import Progress
+
+MIB = 1 << 20
+EVERY_S = 1.0  # between samples
+
+BASE = """
+scene: {preset: seed}
+sensor: {rays_per_revolution: %d, layers: %d, step_deg: 18}
+poses: [[0, 0, 1]]
+steps: 20
+cloud: {keep_every: 1}
+materials: [{objects: "*", reflectance: 0.4, class: 6}]
+"""
+CAMPAIGN = """
+base: base.yaml
+count: %d
+seed: 7
+vary:
+  weather.visibility_km: {log_uniform: [0.2, 20]}
+  poses.0.yaw_deg: {uniform: [0, 360]}
+keep: {format: kitti}
+splits: {train: 0.8, val: 0.1, test: 0.1}
+"""
+
+
+class Samples:
+    """Memory of this process and of LIDAR's worker, by jobs done."""
+
+    def __init__(self, lidar: int) -> None:
+        self.jobs: list[int] = []
+        self.driver: list[float] = []
+        self.lidar: list[float] = []
+        self.seconds = 0.0
+        self._me, self._worker = psutil.Process(), psutil.Process(lidar)
+        self._next = 0.0
+
+    def __call__(self, progress: Progress) -> None:
+        """Take a sample, if it is time to."""
+        now = time.monotonic()
+        if now >= self._next or progress.jobs_done == progress.jobs:
+            self._next = now + EVERY_S
+            self.jobs.append(progress.jobs_done)
+            self.driver.append(self._me.memory_info().rss / MIB)
+            self.lidar.append(self._worker.memory_info().rss / MIB)
+            self.seconds = progress.seconds
+
+
+def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, Any], Samples]:
+    """Run a campaign; returns its figures, and the samples of memory."""
+    (folder / "base.yaml").write_text(BASE % (rays, layers))
+    (folder / "campaign.yaml").write_text(CAMPAIGN % jobs)
+    campaign = Campaign.load(folder / "campaign.yaml")
+    local = local_client(gpu_workers=None, lidar_slots=5, other_workers=None, planning=False)
+    with local as client:
+        pids = client.run(lambda dask_worker: (dask_worker.state.total_resources, os.getpid()))
+        lidar = next(pid for resources, pid in pids.values() if resources.get("LIDAR"))
+        casting = sum(bool(resources.get(GPU)) for resources, _ in pids.values())
+        samples, used = Samples(lidar), time.process_time()
+        run = campaign.run(folder / "dataset", client=client, on_progress=samples)
+        used = time.process_time() - used
+    wall = samples.seconds
+    beside = (wall - run.casting_seconds / casting) / jobs
+    figures = {
+        "jobs": run.done,
+        "failed": len(run.failed),
+        "rays": run.rays,
+        "wall_s": wall,
+        "casting_s": run.casting_seconds,
+        "casting_workers": casting,
+        "beside_rays_ms_a_job": 1000 * beside,
+        "driver_and_scheduler_ms_a_job": 1000 * used / jobs,
+        "finishing_s": run.seconds - wall,
+        "casting_tasks": next((s.tasks for s in run.stages if s.stage == "intersect"), 0),
+        "misplaced": sum(stage.violations for stage in run.stages),
+        "driver_growth_mib": samples.driver[-1] - samples.driver[len(samples.driver) // 10],
+    }
+    return figures, samples
+
+
+def draw(samples: Samples, path: Path) -> None:
+    """Draw memory by jobs done."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 4), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(samples.jobs, samples.driver, color="#2a6fb0", label="driver, with the scheduler")
+    axes.plot(samples.jobs, samples.lidar, color="#e4752e", label="worker of LIDAR")
+    axes.set(xlabel="jobs done", ylabel="memory, MiB", ylim=(0, None), xlim=(0, samples.jobs[-1]))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:,.0f}")
+    axes.grid(visible=True, color="0.9")
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, loc="lower right")
+    figure.savefig(path, dpi=120)
+
+
+def main(arguments: list[str] | None = None) -> dict[str, Any]:
+    """Run from the command line."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--jobs", type=int, default=1000)
+    parser.add_argument("--toy", action="store_true", help="jobs of 1,000 rays")
+    parser.add_argument("--picture", type=Path, help="draw the memory here")
+    parser.add_argument("--json", type=Path, help="write the figures here")
+    chosen = parser.parse_args(arguments)
+    rays, layers = (100, 10) if chosen.toy else (1024, 64)
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+        figures, samples = measure(chosen.jobs, rays, layers, Path(folder))
+    for name, value in figures.items():
+        print(f"{name:<30} {value:,.1f}" if isinstance(value, float) else f"{name:<30} {value:,}")
+    if chosen.picture:
+        draw(samples, chosen.picture)
+    if chosen.json:
+        chosen.json.write_text(json.dumps(figures, indent=1) + "\n")
+    return figures
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,28 @@
+"""Partitions that grow with their work: `python examples/adaptive.py`.
+
+Jobs of this cluster are processes of this machine; with `dask_jobqueue.SLURMCluster` and others
+they are jobs of a queue.
+"""
+
+from dask_jobqueue.local import LocalCluster
+from distributed import Client, get_worker
+
+from poolpart import Partition, start_partitions
+
+
+def where(number: int) -> str:
+    """Name of the worker that runs this."""
+    return str(get_worker().name)
+
+
+if __name__ == "__main__":
+    local = {"host": "127.0.0.1", "dashboard_address": "127.0.0.1:0"}
+    with LocalCluster(cores=1, memory="1GB", scheduler_options=local) as cluster:
+        partitions = {"GPU": {"adapt": [0, 2], "idle_s": 2}, "IO": {"adapt": [0, 2], "slots": 4}}
+        start_partitions(cluster, partitions)
+        with Client(cluster) as client:
+            gpu, io = Partition("GPU", client), Partition("IO", client)
+            print("workers:", len(gpu), len(io))
+            names = set(gpu.map(where, range(200)))
+            print("200 tasks of GPU ran on", *sorted({name.partition("-")[0] for name in names}))
+            print("workers of IO:", len(io))
