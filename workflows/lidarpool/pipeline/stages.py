@@ -201,11 +201,6 @@ def _collected(
             if not isinstance(error, ScanError) and not folder_is_gone:
                 raise
             yield Failed(f"stage {COLLECT} failed: {error}", order.job)
-        except LidarpoolError as error:
-            # The folder of a job goes with it, and an order that came twice may be late.
-            if not isinstance(error.__cause__, FileNotFoundError):
-                raise
-            yield Failed(f"stage {COLLECT} failed: {error}", order.job)
 
 
 def _stored(
