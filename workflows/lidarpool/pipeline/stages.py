@@ -203,7 +203,6 @@ def _collected(
             yield Failed(f"stage {COLLECT} failed: {error}", order.job)
 
 
-
 def _stored(
     me: StageStart, storage: Storage | None, batch: CastBatch, stop: int, name: str
 ) -> Receipt:
