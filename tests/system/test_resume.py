@@ -138,7 +138,7 @@ def report_of(folder: Path) -> dict[str, Any]:
 MOMENTS = [
     ("COMMIT", 1),  # parts are in storage, and nothing is in the database
     ("driver.frame", 100),
-    ("COMMIT", 4),
+    ("COMMIT", 2),
     ("OPEN", 1),
     ("SAVE", 1),
     ("REMOVE", 1),
