@@ -362,6 +362,7 @@ def note(number, partition):
     return number
 
 
+@pytest.mark.slow
 def test_no_task_is_lost_or_run_again_while_workers_come_and_go(queue, monkeypatch):
     """Idle workers go at once, while tasks come one by one."""
     monkeypatch.setattr(poolpart.clusters, "_ADAPT_EVERY_S", 0.01)

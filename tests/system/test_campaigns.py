@@ -491,6 +491,7 @@ def test_killed_workers_change_no_byte(outside, files, whole):
 # -- others on the same cluster -------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("other", ["campaign", "survey"])
 def test_two_at_once_share_the_slots(other, files, whole, monkeypatch):
     """There are slots for the stages of both, and none for writing."""
