@@ -143,7 +143,7 @@ def test_jobs_that_cannot_be_made(client, tmp_path, numbers):
 
 def in_worker() -> bool:
     """Whether a worker calls: those of these tests are threads."""
-    return "-Dask-" in threading.current_thread().name
+    return "Dask-Default-Threads" in threading.current_thread().name
 
 
 @dataclass(frozen=True, eq=False)

@@ -388,7 +388,9 @@ def _write_parquet(
             return row.classes.get(int(found[1]), 0)
         value = getattr(row, name) if name not in columns else row.values.get(columns[name])
         if value is None or types[name] != pa.string():
-            return _plain(value)
+            plain = _plain(value)
+            # An older pyarrow refuses whole numbers beyond 2^53 as floats.
+            return float(plain) if types[name] == pa.float64() and value is not None else plain
         return _encoded(value if isinstance(value, str) else json.dumps(_plain(value))).decode()
 
     with pq.ParquetWriter(file, schema) as writer:

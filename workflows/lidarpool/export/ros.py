@@ -164,10 +164,13 @@ class Reader(reading.Reader):
         topic = _topic(self.sweeps, _frames(self.sweeps), sweep)
         connections = [one for one in self._bag.connections if one.topic == topic]
         time_ns = _start_ns(self.sweeps) + round(self.sweeps.begins_ns[sweep])
-        found = self._bag.messages(connections, time_ns, time_ns + 1)
-        connection, _, data = next(found, (None, 0, b""))
-        if connection is None:
+        found = next(self._bag.messages(connections, time_ns, time_ns + 1), None)
+        if found is None:  # rosbags 0.11.2 misses some by their time
+            every = self._bag.messages(connections)
+            found = next((message for message in every if message[1] == time_ns), None)
+        if found is None:
             raise ValueError(f"it has no message on {topic} at {time_ns} ns")
+        connection, _, data = found
         message: Any = _types().deserialize_cdr(data, connection.msgtype)
         coloured = any(field.name == "rgb" for field in message.fields)
         rows = message.data.view(_row(self.layout, coloured))
