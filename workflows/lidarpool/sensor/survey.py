@@ -18,7 +18,7 @@ from ..base.declared import FILLED_IN, written_as
 from ..base.errors import LidarpoolError
 from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored
 from .materials import Material, extinction
-from .noise import Noise
+from .noise import ALARMS_MOST, Noise
 from .optics import Precision, Returns
 from .sensor import Sensor
 from .trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
@@ -275,6 +275,8 @@ class Survey(CloudOptions, Weather):
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
             returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
+        for carried, noise in zip(self.carried, self.noise_each, strict=True):
+            _check_alarms(noise, carried.sensor)
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""
@@ -403,6 +405,20 @@ class Survey(CloudOptions, Weather):
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
         return spec.start_ns + _begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
+
+
+def _check_alarms(noise: Noise, sensor: Sensor) -> None:
+    """Check that false alarms end, and are not too many."""
+    if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
+        raise LidarpoolError(
+            f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "
+            "none: give max_range_m."
+        )
+    if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > ALARMS_MOST:
+        raise LidarpoolError(
+            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {mean:.3g} false alarms "
+            f"of each pulse; {ALARMS_MOST} are possible: make it or max_range_m smaller."
+        )
 
 
 def _begin_ns(sensor: Sensor, firing: int) -> float:
