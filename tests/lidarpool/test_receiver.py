@@ -15,7 +15,10 @@ from lidarpool import (
     Beams,
     LidarpoolError,
     Material,
+    Mounted,
     Noise,
+    Optics,
+    Pose,
     Returns,
     Scene,
     Sensor,
@@ -24,7 +27,7 @@ from lidarpool import (
 )
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.noise import THRESHOLD_SIGMAS
-from lidarpool.simulator.hits import BLOOMING, FALSE_ALARM, SURFACE
+from lidarpool.simulator.hits import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
 from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
@@ -296,6 +299,124 @@ def _moved(x):
     matrix = np.eye(4)
     matrix[0, 3] = x
     return matrix
+
+
+# -- crosstalk -----------------------------------------------------------------------------------
+
+HEARS = Noise(detection_range_m=FAR, crosstalk=True)
+
+
+def spinning(start_ns=0.0, firings=400, rate_hz=10.0, max_range_m=150.0, nm=905.0):
+    """A beam that turns about z, 10 mrad wide."""
+    optics = Optics(wavelength_nm=nm, divergence_mrad=10.0)
+    head = Spin(firings, 360, rate_hz)
+    return Sensor(Beams(np.zeros(1)), head, 0.0, max_range_m, optics=optics, start_ns=start_ns)
+
+
+def two(one, other, meshes, mounts=((0, 0, 0), (0, 0, 0)), steps=1, noise=HEARS, **options):
+    """Points of two sensors by column, and the rig and the survey; only the first hears."""
+    survey = Survey(
+        sensors=[
+            Mounted(one, Pose(mounts[0]), "one", noise=noise),
+            Mounted(other, Pose(mounts[1]), "other", noise=Noise()),
+        ],
+        poses=[(0, 0, 0)],
+        steps=steps,
+        materials=WHITE,
+        columns=("ray", "range", "intensity", "cause", "object"),
+        returns=Returns("all"),
+        keep_every=1,
+        **options,
+    )
+    rig = Rig(Scene.from_meshes(meshes), survey, "numpy")
+    batches = list(rig.cast(0, steps))
+    found = {
+        c.name: np.concatenate([c.make(batch) for batch in batches]) for c in survey.stored_columns
+    }
+    return found, rig, survey
+
+
+def ring(radius=30.0, sides=720):
+    """A wall around the z axis."""
+    angle = np.arange(sides + 1) * 2 * np.pi / sides
+    low = np.stack([np.cos(angle), np.sin(angle), np.full(sides + 1, -1)], axis=1)
+    high = low * [1, 1, -1]
+    vertices = np.concatenate([low, high]) * [radius, radius, 20.0]
+    a, b = np.arange(sides), np.arange(sides) + 1
+    faces = [np.stack([a, b, a + sides + 1], 1), np.stack([b, b + sides + 1, a + sides + 1], 1)]
+    return Mesh("R", vertices, np.concatenate(faces))
+
+
+def test_a_sensor_that_turns_alike_is_seen_by_each_ray_its_delay_farther_away():
+    delay = 200.0  # ns: the light comes so much later, as if 30 m farther away
+    found, *_ = two(spinning(), spinning(delay), [ring()])
+    there = found["cause"] == CROSSTALK
+    assert there.sum() == 400, "one of each pulse"
+    assert found["range"][there] == pytest.approx(30 + delay * 0.299792458 / 2, abs=0.01)
+    assert found["intensity"][there] == pytest.approx(1 / 9, rel=0.01), "of a wall at 30 m"
+    assert set(found["object"][there].tolist()) == {-1}
+    assert (found["cause"] == SURFACE).sum() == 400
+
+
+@pytest.mark.parametrize("delay", [1000.0, 100_000.0])
+def test_what_arrives_outside_the_gate_is_not_seen(delay):
+    # The gate of 150 m ends after 1001 ns; light from 30 m away arrives after 200 ns and the delay.
+    # After 100 µs the other sensor looks 0.36 degrees elsewhere, which is more than the beam.
+    found, *_ = two(spinning(), spinning(delay), [ring()])
+    assert set(found["cause"].tolist()) == {SURFACE}
+
+
+def test_other_wavelengths_and_hidden_spots_are_not_seen():
+    found, *_ = two(spinning(), spinning(200.0, nm=1550.0), [ring()])
+    assert set(found["cause"].tolist()) == {SURFACE}
+    # The other sensor stands on the far side of a wall, and lights the ring there.
+    between = wall("W", 5.0)
+    there = two(spinning(), spinning(200.0), [ring(), between], ((0, 0, 0), (6.0, 0, 0)))[0]
+    spots = there["cause"] == CROSSTALK
+    assert spots.sum() < 400
+    ahead = two(spinning(), spinning(200.0), [ring()], ((0, 0, 0), (0.05, 0, 0)))[0]
+    assert (ahead["cause"] == CROSSTALK).sum() > 200, "a little apart, most spots are in view"
+
+
+def test_counts_of_sensors_that_turn_against_each_other_are_those_of_all_pairs():
+    turns, f, g = 7, 20_000, 19_700
+    one = spinning(firings=f)
+    other = replace(spinning(), head=Spin(g, 360, 9.63, clockwise=True))
+    found, rig, survey = two(one, other, [ring()], steps=turns)
+    count = int((found["cause"] == CROSSTALK).sum())
+    # All pairs of pulses: light of the other arrives while the receiver waits, from what it sees.
+    i, j = np.arange(f * turns), np.arange(g * turns)
+    fired, arrives = one.head.times_ns(i), other.head.times_ns(j) + 60 / 0.299792458
+    first = np.searchsorted(arrives, fired)
+    stop = np.searchsorted(arrives, fired + 300 / 0.299792458)
+    row = np.repeat(i, stop - first)
+    place = np.arange(len(row)) - np.repeat(np.cumsum(stop - first) - (stop - first), stop - first)
+    off = one.head.azimuths(row) - other.head.azimuths(first[row] + place)
+    expected = int((np.abs(np.angle(np.exp(1j * off))) < 0.005).sum())
+    assert abs(count - expected) <= 2
+    rays = len(i) * 0.010 / (2 * np.pi)  # that look where the other does
+    open_for = 300 / 0.299792458 * 9.63 * g / 1e9  # pulses of the other while a receiver waits
+    assert within(count, rays * open_for)
+    whole = cast_between(rig, survey, [0, turns])
+    assert cast_between(rig, survey, range(turns + 1)) == whole
+    assert cast_between(rig, survey, [0, 2, 5, turns]) == whole
+
+
+@pytest.mark.parametrize(
+    ("one", "says"),
+    [
+        (spinning(max_range_m=float("inf")), "greatest range"),
+        (beam_along_x(1, 100.0), "no divergence"),
+    ],
+)
+def test_crosstalk_needs_a_gate_and_a_field_of_view(one, says):
+    with pytest.raises(LidarpoolError, match=says):
+        two(one, spinning(), [ring()])
+
+
+def test_crosstalk_needs_another_sensor():
+    with pytest.raises(LidarpoolError, match="needs several sensors"):
+        Survey(spinning(), poses=[(0, 0, 0)], steps=1, noise=HEARS)
 
 
 # -- all of it -----------------------------------------------------------------------------------

@@ -160,7 +160,7 @@ class Performance(_Part):
 
     def noise(self, gate_s: float, seed: int) -> Noise:
         """Return the noise of a sensor whose receiver waits so many seconds for returns."""
-        made: dict[str, float] = {"range_m": self.range_m or 0.0, "range_per_m": self.range_per_m}
+        made: dict[str, Any] = {"range_m": self.range_m or 0.0, "range_per_m": self.range_per_m}
         if self.angle_deg is not None:
             made["angle_deg"] = self.angle_deg
         if self.detection is not None:

@@ -26,7 +26,7 @@ TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 _RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
-_ALARM, _PEAK, _STRAY = range(20, 23)
+_ALARM, _PEAK, _STRAY, _OTHER = range(20, 24)
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -126,8 +126,12 @@ class Noise:
         ),
     ] = 0.0
 
+    crosstalk: Annotated[
+        bool, Field(description="whether it receives pulses of the other sensors of the survey")
+    ] = False
+
     def __post_init__(self) -> None:
-        needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light")
+        needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
         if self.detection_range_m is None:
             for name in needs:
                 if getattr(self, name) > 0:
@@ -234,6 +238,12 @@ class Noise:
     def detected_stray(self, energy: Real, scan: Whole, ray: Whole) -> NDArray[np.bool_]:
         """Whether stray light (n,) of retro-reflectors is detected, see `detected`."""
         return self._passes(_STRAY, energy, scan, ray, np.zeros(len(ray), np.int64))
+
+    def detected_other(
+        self, energy: Real, scan: Whole, ray: Whole, number: Whole
+    ) -> NDArray[np.bool_]:
+        """Whether pulses (n,) of other sensors are detected, see `detected`."""
+        return self._passes(_OTHER, energy, scan, ray, number)
 
     def _passes(
         self, purpose: int, energy: Real, scan: Whole, ray: Whole, number: Whole

@@ -275,8 +275,29 @@ class Survey(CloudOptions, Weather):
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
             returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
-        for carried, noise in zip(self.carried, self.noise_each, strict=True):
-            _check_alarms(noise, carried.sensor)
+        for number, noise in enumerate(self.noise_each):
+            _check_alarms(noise, self.carried[number].sensor)
+            if noise.crosstalk:
+                self._check_crosstalk(number)
+
+    def _check_crosstalk(self, number: int) -> None:
+        """Check that there are other sensors, and that what a sensor sees ends."""
+        if len(self.carried) == 1:
+            raise LidarpoolError(
+                "noise.crosstalk needs several sensors, and this survey has one: give sensors."
+            )
+        for carried in self.carried:
+            if not carried.sensor.max_range_m < float("inf"):
+                raise LidarpoolError(
+                    f"noise.crosstalk needs sensors with a greatest range, and {carried.name} has "
+                    "none: give its max_range_m."
+                )
+        wide, _ = self.returns_each[number].of(self.carried[number].sensor.optics)
+        if not wide:
+            raise LidarpoolError(
+                "noise.crosstalk needs a field of view as wide as the beam, and "
+                f"{self.carried[number].name} has no divergence: give returns.divergence_mrad."
+            )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""

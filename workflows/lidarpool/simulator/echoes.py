@@ -59,8 +59,7 @@ class EchoCaster:
         # Whether its returns are the caster's hits.
         self.plain = self._one_each and not self._noise.displaces
         divergence, self._gap_m = self._returns.of(self._sensor.optics)
-        given = caster, scene, surfaces, self._paths
-        self._receiver = Receiver(self._noise, self._sensor, self._gap_m, *given)
+        self._receiver = Receiver(number, survey, caster, scene, surfaces, self._paths)
         self._beam = disc(self._returns.subrays, divergence)
 
     def divided(self, pattern: Pattern) -> Pattern | None:

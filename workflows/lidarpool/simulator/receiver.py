@@ -1,9 +1,10 @@
-"""What a receiver adds to the returns of its pulses: false alarms, and stray light."""
+"""What a receiver adds to the returns of its pulses: false alarms, stray light, other pulses."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,9 +13,21 @@ from raybeam import Pattern
 
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
-from ..sensor import Noise, Sensor
+from ..sensor import Survey
 from ..sensor.optics import LIGHT_M_NS
-from .hits import BLOOMING, FALSE_ALARM, NO_SURFACE, Hits, Keys, Real, Whole, joined
+from .crosstalk import Crosstalk
+from .hits import (
+    BLOOMING,
+    CROSSTALK,
+    FALSE_ALARM,
+    NO_SURFACE,
+    Hits,
+    Keys,
+    Real,
+    Whole,
+    joined,
+    numbers,
+)
 from .motion import Clock, Poses, into_axes, products
 from .paths import Paths
 from .surfaces import Surfaces
@@ -49,29 +62,31 @@ def merged(parts: list[Hits]) -> Hits:
 
 
 class Receiver:
-    """Adds false alarms and stray light to the returns of one sensor."""
+    """Adds false alarms, stray light and pulses of other sensors to the returns of one sensor."""
 
     def __init__(
         self,
-        noise: Noise,
-        sensor: Sensor,
-        gap_m: float,
+        number: int,
+        survey: Survey,
         world: World,
         scene: Scene,
         surfaces: Surfaces,
         paths: Paths,
     ) -> None:
-        self._noise, self._sensor, self._gap_m = noise, sensor, gap_m
+        self._noise = noise = survey.noise_each[number]
+        self._sensor = survey.carried[number].sensor
+        _, self._gap_m = survey.returns_each[number].of(self._sensor.optics)
         self._world, self._surfaces, self._paths = world, surfaces, paths
         self._alarms = noise.false_alarm_hz > 0
-        self._retros: list[_Retro] = []
-        if noise.stray_light:
-            self._retros = [*_retros(scene, surfaces)]
+        self._retros = [*_retros(scene, surfaces)] if noise.stray_light else []
+        self._others: Crosstalk | None = None
+        if noise.crosstalk:
+            self._others = Crosstalk(number, survey, world, surfaces)
 
     @property
     def adds(self) -> bool:
         """Whether it adds anything."""
-        return self._alarms or bool(self._retros)
+        return self._alarms or bool(self._retros) or self._others is not None
 
     def added(
         self,
@@ -83,20 +98,36 @@ class Receiver:
         rows: Whole,
         start: int,
     ) -> Hits:
-        """Return the detected returns of rays (n,), and what else is detected.
+        """Return the detected returns of consecutive rays (n,), and what else is detected.
 
         `rows` are the rays of `beams` in their middles, from `start` on, as `Poses.rays` takes
         them.
         """
-        coloured = returns.colour is not None
         parts = [returns]
+        coloured = returns.colour is not None
+
+        def add(ray: Whole, distance: Real, energy: Real, cause: int) -> None:
+            parts.append(unreal(ray, distance, energy, cause, coloured=coloured))
+
         if self._alarms:
             row, since, energy = self._noise.false_alarms(self._sensor.gate_s, *keys.of(rays))
             distance = self._sensor.min_range_m + since * (LIGHT_M_NS * 1e9 / 2)
-            parts.append(unreal(rays[row], distance, energy, FALSE_ALARM, coloured=coloured))
-        if self._retros:
-            row, distance, energy = self._stray(returns, rays, beams, poses, rows, start, keys)
-            parts.append(unreal(rays[row], distance, energy, BLOOMING, coloured=coloured))
+            add(rays[row], distance, energy, FALSE_ALARM)
+        if self._retros or self._others is not None:
+            origins, directions = poses.rays(beams, rows, start)
+            origins = np.broadcast_to(origins, directions.shape)
+            if self._retros:
+                times = poses.times(rows)
+                found = self._stray(returns, rays, origins, directions, times, poses, keys)
+                row, distance, energy = found
+                add(rays[row], distance, energy, BLOOMING)
+            if self._others is not None:
+                own = origins, directions, poses
+                row, distance, energy = self._others.received(keys.scan, rays, *own)
+                order = np.lexsort((distance, row))
+                row, distance, energy = row[order], distance[order], energy[order]
+                seen = self._noise.detected_other(energy, *keys.of(rays[row]), numbers(row))
+                add(rays[row[seen]], distance[seen], energy[seen], CROSSTALK)
         if sum(len(part.ray) for part in parts) == len(returns.ray):
             return returns
         return merged(parts)
@@ -105,16 +136,13 @@ class Receiver:
         self,
         returns: Hits,
         rays: Whole,
-        beams: Pattern,
+        origins: Real,
+        directions: Real,
+        times: Real,
         poses: Poses,
-        rows: Whole,
-        start: int,
         keys: Keys,
     ) -> tuple[NDArray[np.intp], Real, Real]:
         """Stray light of retro-reflectors that is detected: rows of rays, distances, energies."""
-        origins, directions = poses.rays(beams, rows, start)
-        origins = np.broadcast_to(origins, directions.shape)
-        times = poses.times(rows)
         best = np.zeros(len(rays))
         ends = np.zeros((len(rays), 3))  # seen from the origins
         for retro in self._retros:
@@ -268,9 +296,7 @@ def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
 
 
 def _clusters(
-    triangles: NDArray[np.integer],
-    corners: Real,
-    actor: int | None = None,
+    triangles: NDArray[np.integer[Any]], corners: Real, actor: int | None = None
 ) -> Iterator[_Retro]:
     """Divide triangles into some that are near to each other."""
     if not len(triangles):
