@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Sensor, Survey
 from .device import needs_hits
 from .echoes import CHUNK_RAYS
 from .rig import rays_repeat
@@ -28,6 +28,9 @@ RAY_TURNED = 20  # by noise of angles, likewise
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
 SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+# Of a ray that is cast at a time: false alarms and stray light, and each pulse of another sensor.
+# Each return has a cause then.
+RECEIVED, CROSSED, RETURN_CAUSED = 120, 370, 10
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
@@ -68,6 +71,9 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         firings = (stop - first) * scans
         rays = firings * sensor.channels
         returns = rays * (RETURNS if several else 1)
+        if noise.false_alarm_hz and reported.mode in ("all", "dual"):
+            alarms = noise.false_alarm_hz * sensor.gate_s
+            returns += rays * (alarms if reported.mode == "all" else min(alarms, 1))
         points = returns / survey.keep_every
         repeats, by_head = rays_repeat(sensor, survey.path.moves)
         poses = firings if survey.path.moves or by_head else 0
@@ -82,6 +88,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
             found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            if noise.false_alarm_hz or noise.stray_light or noise.crosstalk:
+                found += RECEIVED * chunk / subrays
+                kept += RETURN_CAUSED * returns
+            if noise.crosstalk:
+                found += CROSSED * _others(survey, sensor) * chunk / subrays
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
         if by_numpy:  # as if it made all columns, and once more those of the device
             point = POINT + POINT_BYTE * columns + columns * made_there
@@ -92,6 +103,18 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         small = SCAN * scans + STATION * (1 + scans // steps)
         most = max(most, kept + max(casting, made_columns) + small)
     return int(most) + TRIANGLE * scene.counters
+
+
+def _others(survey: Survey, sensor: Sensor) -> float:
+    """Pulses of all sensors but one in the time in which that one fires once."""
+
+    def rate(one: Sensor) -> float:
+        first, stop = one.firings(0)
+        begin, end = one.begins_ns(np.array([first, stop], np.int64))
+        return float((stop - first) * one.channels / (end - begin))
+
+    every = sum(rate(carried.sensor) for carried in survey.carried)
+    return every / rate(sensor) - 1
 
 
 def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: bool = False) -> int:
