@@ -80,7 +80,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         here = 0 if made_there else rays  # rays whose hits are on the host
         made = 0 if repeats else rays
         turned = rays if noise.angle_deg and not echoes else 0
-        kept = (
+        kept: float = (
             (RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * max(made, turned)
         )
         casting = POSE * poses + RAY_MADE * made + RAY_TURNED * turned
