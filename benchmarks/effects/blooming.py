@@ -19,8 +19,9 @@ STEP_DEG = 0.1
 
 
 def on(survey: Survey) -> Survey:
-    """Switch it on, in a street whose lamp posts are retro-reflectors."""
-    materials = [Material("*", reflectance=0.3), Material("lamp-*", reflectance=1.0, retro=True)]
+    """Switch it on, in a street where five lamp posts are retro-reflectors."""
+    posts = [f"lamp-{number}" for number in range(1, 6)]
+    materials = [Material("*", reflectance=0.3), Material(posts, reflectance=1.0, retro=True)]
     return replace(survey, noise=NOISE, materials=materials)
 
 

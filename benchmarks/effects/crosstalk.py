@@ -22,10 +22,10 @@ LIGHT_M_NS = 0.299792458
 
 def on(survey: Survey) -> Survey:
     """Switch it on, with a second sensor of the same kind, whose scans are cast as well."""
-    sensor = survey.sensor
+    sensor, third_ns = survey.sensor, 1e9 / 3 / 10  # of a turn
     sensors = [
         Mounted(sensor, name="one", noise=NOISE),
-        Mounted(sensor, Pose((1.5, 0, 0)), name="other"),
+        Mounted(replace(sensor, start_ns=third_ns), Pose((1.5, 0, 0)), name="other"),
     ]
     return replace(survey, sensors=sensors)
 

@@ -18,6 +18,7 @@ from .motion import Clock, Poses, into_axes, products, turned
 from .surfaces import Surfaces
 from .world import World
 
+CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
 SLACK_NS = 10.0  # by which the time of a pulse at the receiver may be off before it is computed
@@ -76,7 +77,7 @@ class Crosstalk:
             reach = (lidar.max_range_m + sensor.max_range_m) / LIGHT_M_NS
             span = fired[order[0]] - reach, fired[order[-1]] + gate[1]
             spots = self._spots(other, spec.station, spec.start_ns, span, poses)
-            row, spot = self._open(fired, order, origins, spots, gate)
+            row, spot = self._open(fired, order, origins, directions, spots, gate)
             towards = spots.place[spot] - origins[row]
             far = np.sqrt(products(towards.T, towards.T))
             arrives = spots.time[spot] + far / LIGHT_M_NS
@@ -94,19 +95,41 @@ class Crosstalk:
         return rows, distances, energies
 
     def _open(
-        self, fired: Real, order: NDArray[np.intp], origins: Real, spots: _Spots, gate: Real
+        self,
+        fired: Real,
+        order: NDArray[np.intp],
+        origins: Real,
+        directions: Real,
+        spots: _Spots,
+        gate: Real,
     ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-        """Pairs of a ray and a spot whose light arrives while the ray's receiver may be open."""
+        """Pairs of a ray and a spot that it may see, whose light arrives while it waits."""
         times = fired[order]
         about = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
         away = spots.place - origins[order[about]]
-        arrives = spots.time + np.sqrt(products(away.T, away.T)) / LIGHT_M_NS
+        far = np.sqrt(products(away.T, away.T))
+        arrives = spots.time + far / LIGHT_M_NS
         first = np.searchsorted(times, arrives - gate[1] - SLACK_NS)
         stop = np.searchsorted(times, arrives - gate[0] + SLACK_NS, side="right")
-        each = np.maximum(stop - first, 0)
-        spot = np.repeat(np.arange(len(each)), each)
-        place = np.arange(len(spot)) - np.repeat(np.cumsum(each) - each, each)
-        return order[first[spot] + place], spot
+        # Rays that are fired one after the other look into a cone; few spots are in it.
+        begins = np.arange(0, len(order), CELL_RAYS)
+        ahead = directions[order]
+        sums = np.add.reduceat(ahead, begins, axis=0)
+        axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
+        least = np.minimum.reduceat(
+            products(axes[np.arange(len(order)) // CELL_RAYS].T, ahead.T), begins
+        )
+        opening = np.arccos(np.clip(least, -1, 1)) + np.arccos(self._cosine)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            opening_m = SLACK_NS * LIGHT_M_NS / far  # rays of a cell start at different places
+        spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
+        off = np.arccos(np.clip(products(axes[cell].T, away[spot].T) / far[spot], -1, 1))
+        seen = ~(off > opening[cell] + opening_m[spot])
+        spot, cell = spot[seen], cell[seen]
+        low = np.maximum(first[spot], cell * CELL_RAYS)
+        high = np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
+        pair, place = _expanded(low, high)
+        return order[place], spot[pair]
 
     def _spots(
         self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: Poses
@@ -162,6 +185,15 @@ class Crosstalk:
         # A retro-reflector sends the light of a sensor back to that one alone.
         share = table.reflectance[owners] * ~table.retro[owners]
         return np.asarray(share * cosine * at_right_angles(far) * np.exp(-both))
+
+
+def _expanded(
+    first: NDArray[np.intp], stop: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and number of each whole number of ranges (n,): (k,) each."""
+    each = np.maximum(stop - first, 0)
+    row = np.repeat(np.arange(len(each)), each)
+    return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(each) - each, each)
 
 
 def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -34,6 +35,7 @@ from .surfaces import Surfaces
 from .world import World
 
 CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
+TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
 CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
 STRAY_MOST = np.radians(30.0)  # no stray light comes from farther aside
 FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
@@ -145,16 +147,18 @@ class Receiver:
         """Stray light of retro-reflectors that is detected: rows of rays, distances, energies."""
         best = np.zeros(len(rays))
         ends = np.zeros((len(rays), 3))  # seen from the origins
-        for retro in self._retros:
-            turns, places = None, np.zeros(3)
-            if retro.actor is not None:
-                places, turns = poses.ways[retro.actor].poses(0, times)
-            starts = into_axes(origins - places, turns)
-            ahead = into_axes(directions, turns)
-            near = self._near(retro, starts, ahead)
+        cells: _Cells | None = None
+        actor, turns = None, None
+        for retro in self._retros:  # those of an actor follow each other
+            if cells is None or retro.actor != actor:
+                actor, turns, places = retro.actor, None, np.zeros(3)
+                if actor is not None:
+                    places, turns = poses.ways[actor].poses(0, times)
+                cells = _Cells(into_axes(origins - places, turns), into_axes(directions, turns))
+            near = self._near(retro, cells)
             if not len(near):
                 continue
-            energy, towards = self._leaks(retro, starts[near], ahead[near])
+            energy, towards = self._leaks(retro, cells.starts[near], cells.ahead[near])
             if turns is not None:  # back to the axes of the scene
                 towards = into_axes(towards, turns[near].transpose(0, 2, 1))
             more = energy > best[near]
@@ -170,39 +174,34 @@ class Receiver:
         row = row[seen]
         return row, distance[seen], best[row]
 
-    def _near(self, retro: _Retro, starts: Real, ahead: Real) -> NDArray[np.intp]:
+    def _near(self, retro: _Retro, cells: _Cells) -> NDArray[np.intp]:
         """Rays that may receive enough of the light of a retro-reflector, and perhaps others."""
-        first = np.arange(0, len(starts), CELL_RAYS)
-        sums = np.add.reduceat(ahead, first, axis=0)
-        axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
-        cell = np.arange(len(starts)) // CELL_RAYS
-        opening = np.arccos(
-            np.clip(np.minimum.reduceat(products(axes[cell].T, ahead.T), first), -1, 1)
-        )
-        away = np.linalg.norm(starts - starts[first][cell], axis=1)
-        moved = np.maximum.reduceat(away, first)
-        centre = retro.middle - starts[first]
+        centre = retro.middle - cells.begins
         far = np.sqrt(products(centre.T, centre.T))
-        radius = retro.radius + moved
+        radius = retro.radius + cells.moved
         with np.errstate(invalid="ignore", divide="ignore"):
             wide = np.where(far > radius, np.arcsin(radius / far), np.pi)
-            off = np.arccos(np.clip(products(axes.T, centre.T) / far, -1, 1))
-        least = np.maximum(far - radius, self._sensor.min_range_m)
-        reach = np.minimum(self._reach(retro, np.maximum(least, 1e-3)), STRAY_MOST)
-        cells = ~(off > opening + wide + reach)
-        return np.flatnonzero(cells[cell])
+            off = np.arccos(np.clip(products(cells.axes.T, centre.T) / far, -1, 1))
+        least = np.maximum(far - radius, max(self._sensor.min_range_m, 1e-3))
+        reach = np.minimum(self._reach(retro, least), STRAY_MOST) + wide
+        near = np.flatnonzero(~(off > cells.opening + reach)[cells.number])
+        # Of those cells, the rays themselves.
+        which = cells.number[near]
+        centre = retro.middle - cells.starts[near]
+        off = products(cells.ahead[near].T, centre.T) / np.sqrt(products(centre.T, centre.T))
+        inside = ~(off < np.cos(np.minimum(reach[which], np.pi)))
+        return near[inside]
 
     def _reach(self, retro: _Retro, distance: Real) -> Real:
         """Angles at which the light of a retro-reflector becomes too faint, radians: (n,)."""
-        whole = self._whole(retro.triangles[:1], distance)
+        whole = self._whole(np.repeat(retro.triangles[:1], len(distance)), distance)
         share = FAINTEST * self._noise.threshold / np.maximum(whole, 1e-300)
         return np.radians(np.sqrt(self._noise.stray_light / share))
 
     def _whole(self, triangle: NDArray[np.int32], distance: Real) -> Real:
         """Energies of beams that hit a retro-reflector: (n,)."""
-        many = np.repeat(triangle, len(distance))
         white = np.full(len(distance), 0xFFFFFFFF, np.uint32)
-        return self._paths.energy(many, np.ones(len(distance)), distance, white)
+        return self._paths.energy(triangle, np.ones(len(distance)), distance, white)
 
     def _leaks(self, retro: _Retro, starts: Real, ahead: Real) -> tuple[Real, Real]:
         """Energies of stray light in rays (n,), and where it is from, seen from there: (n, 3).
@@ -211,8 +210,9 @@ class Receiver:
         """
         across, up = _axes_across(ahead)
         best, ends = np.zeros(len(starts)), np.zeros((len(starts), 3))
-        for triangle, corners in zip(retro.triangles, retro.corners, strict=True):
-            towards = corners - starts[:, None]  # (n, 3 corners, 3)
+        nearest = _first_few(retro, starts, ahead)
+        for which in nearest.T:
+            towards = retro.corners[which] - starts[:, None]  # (n, 3 corners, 3)
             depth = (towards * ahead[:, None]).sum(axis=2)
             front = (depth > 0).all(axis=1)
             with np.errstate(invalid="ignore", divide="ignore"):
@@ -220,16 +220,15 @@ class Receiver:
                 x = (towards * across[:, None]).sum(axis=2) / depth
                 y = (towards * up[:, None]).sum(axis=2) / depth
                 off, point = _nearest(x, y, towards, depth)
-            middle = corners.mean(axis=0) - starts
+            middle = towards.mean(axis=1)
             point = point + INWARDS * (middle - point)
             distance = np.sqrt(products(point.T, point.T))
             angle = np.degrees(np.arctan(off))
             some = np.flatnonzero(front & (angle > 0) & (angle < np.degrees(STRAY_MOST)))
             share = np.minimum(self._noise.stray_light / angle[some] ** 2, 1)
-            energy = share * self._whole(np.array([triangle]), distance[some])
-            more = some[energy > best[some]]
-            best[more] = energy[energy > best[some]]
-            ends[more] = point[more]
+            energy = share * self._whole(retro.triangles[which[some]], distance[some])
+            more = energy > best[some]
+            best[some[more]], ends[some[more]] = energy[more], point[some[more]]
         return best, ends
 
     def _seen(
@@ -256,6 +255,22 @@ class Receiver:
         return beside
 
 
+class _Cells:
+    """Rays that are fired one after the other, with a cone around those of each cell."""
+
+    def __init__(self, starts: Real, ahead: Real) -> None:
+        self.starts, self.ahead = starts, ahead
+        first = np.arange(0, len(starts), CELL_RAYS)
+        self.number = np.arange(len(starts)) // CELL_RAYS  # cells of the rays
+        sums = np.add.reduceat(ahead, first, axis=0)
+        self.axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
+        cosine = np.minimum.reduceat(products(self.axes[self.number].T, ahead.T), first)
+        self.opening = np.arccos(np.clip(cosine, -1, 1))
+        self.begins = starts[first]
+        away = np.linalg.norm(starts - self.begins[self.number], axis=1)
+        self.moved = np.maximum.reduceat(away, first)
+
+
 @dataclass(frozen=True)
 class _Retro:
     """Triangles of retro-reflectors that are near to each other."""
@@ -264,11 +279,11 @@ class _Retro:
     corners: Real  # (k, 3, 3): in the scene's axes, or those of an actor
     actor: int | None = None
 
-    @property
+    @cached_property
     def middle(self) -> Real:
         return np.asarray(self.corners.reshape(-1, 3).mean(axis=0))
 
-    @property
+    @cached_property
     def radius(self) -> float:
         return float(np.linalg.norm(self.corners.reshape(-1, 3) - self.middle, axis=1).max())
 
@@ -306,6 +321,18 @@ def _clusters(
     for number in range(int(which.max()) + 1):
         some = np.flatnonzero(which == number)
         yield _Retro(triangles[some].astype(np.int32), corners[some], actor)
+
+
+def _first_few(retro: _Retro, starts: Real, ahead: Real) -> NDArray[np.intp]:
+    """Find some triangles whose middles are nearest to rays (n,) by angle: (n, k)."""
+    count = len(retro.triangles)
+    if count <= TRIANGLES_NEAR:
+        return np.broadcast_to(np.arange(count), (len(starts), count))
+    middles = retro.corners.mean(axis=1)
+    towards = middles[:, None] - starts  # (triangles, n, 3)
+    towards = towards.transpose(2, 0, 1)
+    cosine = products(towards, ahead.T[:, None]) / np.sqrt(products(towards, towards))
+    return np.argsort(-cosine, axis=0, kind="stable")[:TRIANGLES_NEAR].T
 
 
 def _axes_across(ahead: Real) -> tuple[Real, Real]:
