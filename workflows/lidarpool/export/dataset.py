@@ -74,7 +74,7 @@ class DataSet:
     format
         kitti, nuscenes, mcap, parquet or folder.
     layout
-        Of points in mcap: velodyne, autoware or ouster.
+        Of points in mcap: velodyne, autoware, ouster or images.
     """
 
     place: Storage

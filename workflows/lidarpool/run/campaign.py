@@ -32,6 +32,7 @@ from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet
 from ..export.jobs import JobRow, Tally, Value
 from ..export.sweeps import Sweeps
+from ..export.table import check_whole
 from ..pipeline import EXPORT, INTERSECT, LIDAR, Crew, JobError, SurveyDriver
 from ..pipeline.failures import raise_if_failed, was_killed
 from ..pipeline.task_book import StageTotals, TaskBook
@@ -162,6 +163,7 @@ def described_job(
         assert described.made is not None, "either of both"
         backend = options.pop("backend", None) or "auto"
         job = Job(described.made.scene, described.made.survey, backend=backend, **options)
+    check_whole(columns, job.survey.keep_every)
     there = {column.name for column in job.survey.stored_columns}
     if missing := [name for name in columns if name not in there]:
         survey = replace(job.survey, columns=(*job.survey.columns, *missing))
