@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,8 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor import Sensor
 from ..sensor.trajectory import matrices
-from . import pieces
+from . import pieces, reading
+from .boxes import Boxes
 from .pieces import Entry
 from .sweeps import MIXED_UP, Fired, Sweeps, plain_names
 
@@ -111,8 +113,8 @@ class Pieces(pieces.Pieces):
         fired_of(sweeps)
         self.folders = _folders(sweeps, entry)
 
-    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
-        """Return the file of a sweep."""
+    def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], Boxes | None]:
+        """Return the file of a sweep, and its boxes where there are actors."""
         sweeps = self.sweeps
         image = Image.of(sweeps, number, points)
         inside = sweeps.in_sensor(number, points.positions).astype(np.float32)
@@ -120,14 +122,48 @@ class Pieces(pieces.Pieces):
         columns |= dict(zip("xyz", inside.T, strict=True))
         arrays: dict[str, Any] = image.of_rays()
         for name, values in columns.items():
-            for plane, made in enumerate(image.filled(values), 1):
-                arrays[name if plane == 1 else f"{name}{plane}"] = made
+            for plane, made in enumerate(image.filled(values)):
+                if (key := _key(name, plane)) in arrays:
+                    raise LidarpoolError(f"Two arrays of an image would be {key!r}: rename one.")
+                arrays[key] = made
         arrays["pose"] = pose = np.eye(4)
         pose[:3, :3] = matrices(sweeps.pose.quaternions[number, None])[0]
         pose[:3, 3] = sweeps.pose.positions[number]
         memory = io.BytesIO()
         np.savez_compressed(memory, **arrays)
-        return {_file(sweeps, self.folders, number): memory.getvalue()}, None
+        boxes = Boxes.of(sweeps, number, points) if sweeps.actors and self.entry else None
+        return {_file(sweeps, self.folders, number): memory.getvalue()}, boxes
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: all columns of each point, with time and angles of its ray."""
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the file of the images."""
+        return _file(self.sweeps, _folders(self.sweeps, self.entry), sweep)
+
+    def read(self, sweep: int) -> reading.Points:
+        """Return the points of a sweep, in the order of their rays."""
+        with np.load(io.BytesIO(self.place.read(self.file(sweep)))) as archive:
+            arrays = dict(archive.items())
+        images = {name: array for name, array in arrays.items() if name not in ("pose", "scan")}
+        planes = next(n for n in count(1) if _key("range", n) not in images)
+        further = {_key(name, plane) for name in images for plane in range(1, planes)}
+        there = ~np.isnan(np.stack([images[_key("range", plane)] for plane in range(planes)]))
+
+        def of_points(name: str) -> NDArray[Any]:
+            made = [images.get(_key(name, plane), images[name]) for plane in range(planes)]
+            return np.stack(made).T[there.T]
+
+        columns = {name: of_points(name) for name in images if name not in further}
+        images["channel"] = np.indices(there.shape[1:], np.uint16)[0]
+        columns["channel"] = of_points("channel")
+        return np.stack([columns.pop(axis) for axis in "xyz"], axis=1), columns
+
+
+def _key(name: str, plane: int) -> str:
+    """Name of the array of a column in the image of a return, numbered from 0."""
+    return f"{name}{plane + 1}" if plane else name
 
 
 def _folders(sweeps: Sweeps, entry: Entry | None) -> list[str]:

@@ -138,6 +138,7 @@ def _messages(
         yield topic, message, time_ns
         if layout == "images":
             ranges = Image.of(sweeps, sweep, points).filled(points["range"])
+            ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
             for plane, image in enumerate(ranges, 1):
                 name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
                 yield name, make.image(image[::-1], frame, time_ns), time_ns

@@ -41,7 +41,7 @@ CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that
 _OWN = re.compile(
     r"run|campaign\.json|dataset\.json|README\.md|report\.(html|json)|pictures|splits|"
     r"jobs\.(csv|parquet)|\.?jobs|sweeps|boxes|sequences|poses|samples|maps|v1\.0-lidarpool|"
-    r"bags|points|job-.+|[0-9a-f]{16}-dataset"
+    r"bags|points|images|job-.+|[0-9a-f]{16}-dataset"
 )
 
 
