@@ -59,9 +59,9 @@ LISTED = ListedSensor(
 LINE = LineSensor(Beams.even(2, 4.0), Mirror(200, 36.0, width_deg=150.0), max_range_m=60)
 
 
-def short(name, **options):
+def short(name, range_m):
     """A sensor of a model, most of whose rays return nothing."""
-    return load_sensor(name, max_range_m=12, **options)
+    return load_sensor(name, max_range_m=range_m)
 
 
 SURVEYS = {
@@ -78,9 +78,9 @@ SURVEYS = {
         returns=replace(DUAL, mode="all"),
     ),
     "turns of 1808.6 firings": Survey(
-        short("velodyne/vlp16"), poses=[(0, 0, 2)], steps=108, columns=COLUMNS
+        short("velodyne/vlp16", 8), poses=[(0, 0, 2)], steps=73, columns=COLUMNS
     ),
-    "prisms": Survey(short("livox/mid40"), poses=[(0, 0, 2)], steps=3, columns=COLUMNS),
+    "prisms": Survey(short("livox/mid40", 60), poses=[(0, 0, 2)], steps=3, columns=COLUMNS),
     "list": Survey(LISTED, trajectory=MOVING, steps=25, columns=COLUMNS),
     "line": Survey(LINE, poses=[(0, 0, 30)], steps=25, columns=COLUMNS),
 }  # fmt: skip
