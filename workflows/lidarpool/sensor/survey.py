@@ -268,9 +268,9 @@ class Survey(CloudOptions, Weather):
 
     def _check_air(self, number: int) -> None:
         """Check that a sensor says what it detects, and that this is not too much."""
-        carried, noise = self.carried[number], self.noise_each[number]
+        carried = self.carried[number]
         sensor, name = carried.sensor, f" of {carried.name}" if carried.name else ""
-        if noise.detection_range_m is None:
+        if self.noise_each[number].detection_range_m is None:
             raise LidarpoolError(
                 f"Rain, snow, dust and fog that return light need noise.detection_range_m{name}: "
                 "it says what the sensor detects. A data sheet has it as the range at 10 %."
@@ -280,9 +280,7 @@ class Survey(CloudOptions, Weather):
             raise LidarpoolError(
                 f"Rain and snow need the width of the beam{name}: give returns.divergence_mrad."
             )
-        least, span = FAINTEST * noise.threshold, reach(sensor.min_range_m, sensor.max_range_m)
-        air = self.air(number)
-        if (met := sum(air.met(kind, least, *span) for kind in self.particles)) > PARTICLES_MOST:
+        if (met := self.met(number)) > PARTICLES_MOST:
             raise LidarpoolError(
                 f"A pulse{name} would return from {met:,.0f} drops or flakes, more than "
                 f"{PARTICLES_MOST}: make rain_mm_h, snow_mm_h or noise.detection_range_m smaller."
@@ -346,6 +344,14 @@ class Survey(CloudOptions, Weather):
         divergence, _ = self.returns_each[number].of(optics)
         overlap_m = self.noise_each[number].overlap_m
         return Air(self.takes(optics.wavelength_nm), EXIT_M, divergence, overlap_m)
+
+    def met(self, number: int) -> float:
+        """Drops and flakes that a pulse of a sensor may return from, on the average."""
+        if not self.particles:
+            return 0.0
+        sensor, least = self.carried[number].sensor, FAINTEST * self.noise_each[number].threshold
+        air, span = self.air(number), reach(sensor.min_range_m, sensor.max_range_m)
+        return sum(air.met(kind, least, *span) for kind in self.particles)
 
     @cached_property
     def steps_each(self) -> tuple[int, ...]:

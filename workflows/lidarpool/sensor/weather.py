@@ -31,6 +31,7 @@ NODES = 4096  # ranges at which tables and integrals are made
 # half of it are detected. That misses 2 % of the returns from rain, and 0.3 % of those from snow.
 FAINTEST = 0.5
 NEAREST_M, FARTHEST_M = 0.1, 1e4  # where particles are looked for
+LEAST_LEFT = 1e-200  # of the light, so that one can divide by it
 LARGE = 2.0  # light that a large particle takes, in its cross-sections: half of it by diffraction
 
 Real = NDArray[np.float64]
@@ -198,7 +199,8 @@ class Air(NamedTuple):
     def white(self, distance: Any) -> Any:
         """Energy of a white disc that fills the beam."""
         seen = np.maximum(distance, max(self.overlap_m, 1e-3))
-        return (REFERENCE_M / seen) ** 2 * np.exp(-2 * self.extinction * distance)
+        left = np.exp(-2 * self.extinction * distance)
+        return (REFERENCE_M / seen) ** 2 * np.maximum(left, LEAST_LEFT)
 
     def smallest(self, particles: Particles, energy: float, distance: Real) -> Real:
         """Diameters of particles that return an energy, millimetres; inf if none returns it."""
