@@ -115,7 +115,8 @@ def energies(axes: Any, weather: dict[str, Any]) -> None:
     alpha = survey.extinction(survey.sensor)
     white = 0.5 * (10 / distance) ** 2
     axes.plot(distance, white, color=CURVE, lw=1, ls=":", label="surface of 50 %, clear air")
-    axes.plot(distance, white * np.exp(-2 * alpha * distance), color=CURVE, lw=1.4, label="surface of 50 %, here")
+    here = white * np.exp(-2 * alpha * distance)
+    axes.plot(distance, here, color=CURVE, lw=1.4, label="surface of 50 %, here")
     scatters = survey.scatters(survey.sensor.optics.wavelength_nm)
     half = 0.299792458 * survey.sensor.optics.pulse_ns / 2
     from_air = survey.air(0).cloud(scatters, distance - half / 2, distance + half / 2)

@@ -330,6 +330,17 @@ def test_another_seed_is_another_sky():
     assert not np.array_equal(one["range"][:1000], other["range"][:1000])
 
 
+def test_what_is_no_surface_is_grey_and_of_no_class():
+    material = [Material("*", reflectance=0.2, semantic_class=7)]
+    found = cast(
+        [wall("W", 9)], snow_mm_h=1.0, materials=material, columns=(*COLUMNS, "red", "triangle")
+    )
+    air = found["cause"] == AIR
+    assert {*found["class"][air].tolist()} == {0} and {*found["class"][~air].tolist()} == {7}
+    assert {*found["red"].tolist()} == {188}
+    assert (found["triangle"][air] == -1).all() and (found["triangle"][~air] >= 0).all()
+
+
 # -- what fits together ----------------------------------------------------------------------------
 
 

@@ -346,7 +346,7 @@ class Survey(CloudOptions, Weather):
         return Air(self.takes(optics.wavelength_nm), EXIT_M, divergence, overlap_m)
 
     def met(self, number: int) -> float:
-        """Drops and flakes that a pulse of a sensor may return from, on the average."""
+        """Count drops and flakes that a pulse of a sensor may return from, on the average."""
         if not self.particles:
             return 0.0
         sensor, least = self.carried[number].sensor, FAINTEST * self.noise_each[number].threshold
