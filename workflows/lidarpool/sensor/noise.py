@@ -87,6 +87,15 @@ class Noise:
         ),
     ] = None
     seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
+    overlap_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1000,
+            description="from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "and dust do not return more",
+        ),
+    ] = 10.0
     range_at_threshold_m: Annotated[
         float,
         Field(
