@@ -38,7 +38,6 @@ def sensors(model: str | None, out: Path | None) -> None:
     target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
     if target.suffix.lower() != ".png":
         raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
-    draw_beams(target, load_sensor(model))
     click.echo(described.name)
     for figure, source in described.sources.items():
         click.echo(f"{figure:<11}  {source}")
@@ -49,6 +48,7 @@ def sensors(model: str | None, out: Path | None) -> None:
         click.echo(f"{'returns':<11}  {returns}")
         if sheet.missing:
             click.echo(f"{'unknown':<11}  {', '.join(sheet.missing)}")
+    draw_beams(target, load_sensor(model))
     click.echo(click.format_filename(target))
 
 
