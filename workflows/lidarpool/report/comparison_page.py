@@ -28,7 +28,7 @@ MOST_DOTS = 120_000
 A, B = "#4477aa", "#ee7733"
 ONLY_A, ONLY_B = theme.rgb("#2ca25f"), theme.rgb("#101418")  # no colours of residuals
 RANGES, RESIDUALS, FAR = "viridis", "RdBu_r", "plasma"
-SHARE = 0.97  # of residuals that the scale of their colours covers
+SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
 CLOSEST_M = 0.001  # end of the scale of distances
 
 
@@ -124,8 +124,7 @@ def draw_ranges(found: Comparison) -> Page:
     low, most = np.quantile(both, (0.01, 0.98)) if len(both) else (0.0, 1.0)
     norm = LogNorm(max(float(low), 0.01), max(float(most), float(low) * 1.01, 0.02))
     (in_a, in_b), residual = images.there, images.residual
-    limit = _limit(residual[in_a & in_b])
-    scale = Normalize(-1000 * limit, 1000 * limit)
+    scale = Normalize(-_limit(found), _limit(found))
     for k, words in enumerate(("A", "B", "A − B")):
         bottom = (height - top - (k + 1) * high - k * gap) / height
         axes = page.chart((LEFT, bottom, RIGHT - LEFT, high / height), ylabel="elevation, °")
@@ -182,8 +181,8 @@ def draw_rings(found: Comparison) -> Page:
     size = 3.4 * page.unit if len(rows) < 40 else 2 * page.unit
     axes.plot(middles, elevation, "o", color=A, ms=size, mew=0)
     axes.plot(means, elevation, "|", color=theme.SENSOR, ms=2 * size, mew=0.8 * page.unit)
-    span = np.abs(np.concatenate([lows, highs]))
-    axes.set_xlim(*(1.1 * np.array([-1, 1]) * max(np.quantile(span, 0.9), 1e-3)))
+    limit = _limit(found)
+    axes.set_xlim(-limit, limit)
     handles = [
         _dot("median", A), _dot("mean", theme.SENSOR, "|"), _dot("5 to 95 %", theme.UNSEEN, "_"),
     ]  # fmt: skip
@@ -203,15 +202,10 @@ def draw_rings(found: Comparison) -> Page:
         axes.set_xlim(left=min(0, axes.get_xlim()[0]))
         _key(page, axes, [_dot("A", A), _dot("B", B)])
         left += wide + apart
-    values = found.residuals
-    limit = _limit(values)
-    axes = page.chart((left, 0.13, wide, 0.64), xlabel="A − B, mm", ylabel="cells", yscale="log")
-    axes.hist(
-        1000 * np.clip(values, -2 * limit, 2 * limit),
-        bins=81,
-        range=(-2000 * limit, 2000 * limit),
-        color=A,
-    )
+    axes = page.chart((left, 0.13, wide, 0.64), xlabel="A − B, mm; more in the outer bins",
+                      ylabel="cells", yscale="log")  # fmt: skip
+    values = np.clip(1000 * found.residuals, -limit, limit)
+    axes.hist(values, bins=81, range=(-limit, limit), color=A)
     return page
 
 
@@ -238,6 +232,7 @@ def draw_distances(found: Comparison) -> Page:
         )  # fmt: skip
         most = max(most, float(np.quantile(ordered, 0.999)))
     axes.set_xlim(CLOSEST_M, max(2 * most, 0.01))
+    axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     for one in far["f_scores"]:
         axes.axvline(one["distance_m"], color=theme.LINE, lw=0.9 * page.unit, ls=(0, (4, 3)))
     _key(page, axes, [_dot("A to B", A), _dot("B to A", B)], loc="lower right")
@@ -245,11 +240,8 @@ def draw_distances(found: Comparison) -> Page:
         light = found.figures["intensity"]
         axes = page.chart((LEFT + 0.5, 0.13, 0.4, 0.64), xlabel="intensity in B",
                           ylabel="intensity in A")  # fmt: skip
-        theirs, mine = found.lights[1], found.lights[0]
-        most_b, most_a = (max(float(np.quantile(one, 0.995)), 1e-12) for one in (theirs, mine))
-        axes.hist2d(
-            theirs, mine, bins=120, range=((0, most_b), (0, most_a)), norm=LogNorm(), cmap="viridis"
-        )
+        mine, theirs = found.lights
+        axes.hist2d(theirs, mine, (_bins(theirs), _bins(mine)), norm=LogNorm(), cmap="viridis")
         axes.grid(False)
         told = f"rank correlation {light['rank_correlation']:.3f}"
         _name(page, axes, f"{told} of {light['pairs']:,} {light['of']}")
@@ -258,7 +250,7 @@ def draw_distances(found: Comparison) -> Page:
 
 def draw_above(found: Comparison) -> Page:
     """Draw both clouds from above, coloured by the distance to the other."""
-    height = 900
+    height = 830
     page = Page((WIDTH, height))
     page.title("From above", "the nearest neighbour in the other cloud; the farthest on top")
     above = found.above
@@ -288,9 +280,18 @@ def draw_above(found: Comparison) -> Page:
     return page
 
 
-def _limit(values: NDArray[Any]) -> float:
-    """End of a scale of residuals, metres."""
-    return max(float(np.quantile(np.abs(values), SHARE)), 1e-4) if len(values) else 1.0
+def _limit(found: Comparison) -> float:
+    """End of the scale of residuals, millimetres."""
+    told = found.figures["range_image"]["residual"]
+    return max(1000 * (abs(told["median_m"]) + SCALE * told["mad_m"]), 0.1) if told["cells"] else 1
+
+
+def _bins(values: NDArray[Any]) -> NDArray[Any]:
+    """Edges of bins of intensities, between whole numbers if they are such."""
+    most = max(float(np.quantile(values, 0.995)), 1e-12)
+    if most <= 300 and (values == np.round(values)).all():
+        return np.arange(-0.5, most + 1)
+    return np.linspace(0, most, 121)
 
 
 def _name(page: Page, axes: Axes, text: str) -> None:

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
+from ..base.words import counted
 from ..export.recordings import Turn
 
 Floats = NDArray[np.float64]
@@ -18,6 +20,7 @@ _ALIKE = 0.01  # by how much steps of azimuth may differ that are meant to be th
 _SECTOR_DEG = (
     90.0  # a gap as wide as this in all rings is none of returns, but of the field of view
 )
+_AGREE = 0.7  # share of rings from whose numbers the others' follow
 _FINEST_DEG = 1e-3  # points nearer in azimuth are of one pulse
 
 
@@ -26,7 +29,7 @@ class RangeImages:
     """Ranges and intensities of two sweeps in the same cells, (rings, columns)."""
 
     rings: NDArray[np.int64]  # (r,): as B numbers them, the highest first
-    elevation_deg: Floats  # (r,)
+    elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
     begin_deg: float  # azimuth of the first
     ranges: tuple[Reals, Reals]  # of A and B, metres; NaN without a return
@@ -106,23 +109,20 @@ class _Polar:
     ) -> tuple[Reals, Reals, float]:
         """Ranges and lights of cells, and the share of points that others in their cells hide.
 
-        `rows` (r,) are those of its rings, -1 for none. Of several points in a cell, the one
+        `rows` (r,) are those of its rings. Of several points in a cell, the one
         nearest to the middle is taken, and of several returns of a pulse the nearest.
         """
-        wanted = rows[self.ring] >= 0
-        ring = self.ring[wanted]
-        place = self.azimuth[wanted] / step - phase[ring]
+        place = self.azimuth / step - phase[self.ring]
         column = np.round(place)
         off = np.round(np.abs(place - column), 3)
-        cell = rows[ring] * shape[1] + column.astype(np.int64) % shape[1]
-        order = np.lexsort((self.ranges[wanted], off, cell))
+        cell = rows[self.ring] * shape[1] + column.astype(np.int64) % shape[1]
+        order = np.lexsort((self.ranges, off, cell))
         chosen = order[np.diff(cell[order], prepend=-1) > 0]
-
         ranges, light = np.full((2, *shape), np.nan, np.float32)
-        ranges.reshape(-1)[cell[chosen]] = self.ranges[wanted][chosen]
+        ranges.reshape(-1)[cell[chosen]] = self.ranges[chosen]
         if self.light is not None:
-            light.reshape(-1)[cell[chosen]] = self.light[wanted][chosen]
-        return ranges, light, 1 - len(chosen) / max(len(cell), 1)
+            light.reshape(-1)[cell[chosen]] = self.light[chosen]
+        return ranges, light, 1 - len(chosen) / len(cell)
 
 
 def range_images(
@@ -141,29 +141,26 @@ def range_images(
         with the same rings; a clause without a full stop.
     """
     first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
-    of_a, of_b, notes = _paired(first, second, names)
+    common = _common(first, second, names)
     steps = [first.step(), second.step()]
     step = azimuth_deg or (
         steps[1] if abs(steps[0] / steps[1] - 1) < _ALIKE else max(*steps, _FINEST_DEG)
     )
     columns = max(round(360 / step), 1)
-    high_first = np.argsort(-second.elevation[of_b], kind="stable")
-    of_a, of_b = of_a[high_first], of_b[high_first]
-    rows_a, rows_b = np.full(len(first.rings), -1), np.full(len(second.rings), -1)
-    rows_a[of_a] = rows_b[of_b] = np.arange(len(of_a))
-    phase_b = second.phases(step)
-    phase_a = np.zeros(len(first.rings))
-    apart = first.phases(step)[of_a] - phase_b[of_b]
-    phase_a[of_a] = phase_b[of_b] + apart - np.round(apart)
-    shape = len(of_a), columns
+    rows_a, rows_b, shape = common.rows_a, common.rows_b, (len(common.rings), columns)
+    phase_a, phase_b, middle = first.phases(step), second.phases(step), np.zeros(shape[0])
+    middle[rows_a] = phase_a  # of rings that B lacks, too
+    middle[rows_b] = phase_b
+    apart = phase_a - middle[rows_a]
+    phase_a = middle[rows_a] + apart - np.round(apart)
     image_a, light_a, hidden_a = first.image(rows_a, phase_a, step, shape)
     image_b, light_b, hidden_b = second.image(rows_b, phase_b, step, shape)
     seen = np.flatnonzero((np.isfinite(image_a) | np.isfinite(image_b)).any(axis=0))
     order, begin = _field(seen, columns, step)
     return RangeImages(
-        second.rings[of_b], second.elevation[of_b], step, begin,
+        common.rings, common.elevation, step, begin,
         (image_a[:, order], image_b[:, order]), (light_a[:, order], light_b[:, order]),
-        (hidden_a, hidden_b), notes,
+        (hidden_a, hidden_b), common.notes,
     )  # fmt: skip
 
 
@@ -173,32 +170,56 @@ def _spacing(elevation: Floats) -> float:
     return float(np.median(apart)) if len(apart) else 1.0
 
 
-def _paired(
-    a: _Polar, b: _Polar, names: tuple[str, str]
-) -> tuple[NDArray[np.int64], NDArray[np.int64], tuple[str, ...]]:
-    """Pair rings of A and B that look at the same elevation: their indices, and notes."""
+class _Common(NamedTuple):
+    """Rings of A and B in common rows, the highest first."""
+
+    rings: NDArray[np.int64]  # (r,): as B numbers them
+    elevation: Floats  # (r,)
+    rows_a: NDArray[np.int64]  # of each ring of A
+    rows_b: NDArray[np.int64]
+    notes: tuple[str, ...]
+
+
+def _common(a: _Polar, b: _Polar, names: tuple[str, str]) -> _Common:
+    """Find which rings look at the same elevation, whatever their numbers.
+
+    Some programs count from below, others from above or from 1: if one count can be had from the
+    other, rings of which only A or B has returns have a row, too.
+    """
+    apart = np.abs(a.elevation[:, None] - b.elevation)
     near = max(_spacing(b.elevation) / 2, 0.05)
-    _, of_a, of_b = np.intersect1d(a.rings, b.rings, return_indices=True)
-    same = np.abs(a.elevation[of_a] - b.elevation[of_b]) <= near
-    notes = []
-    if same.mean() < 0.9 if len(same) else True:
-        apart = np.abs(a.elevation[:, None] - b.elevation[None])
-        of_a = apart.argmin(axis=0)
-        mutual = apart[of_a].argmin(axis=1) == np.arange(len(b.rings))
-        of_b = np.flatnonzero(mutual & (apart.min(axis=0) <= near))
-        of_a = of_a[of_b]
-        if len(of_b) < max(1, min(len(a.rings), len(b.rings)) / 2):
-            raise LidarpoolError(
-                f"the rings of {names[0]} look at {a.elevation.min():.1f}° to "
-                f"{a.elevation.max():.1f}° and those of {names[1]} at {b.elevation.min():.1f}° to "
-                f"{b.elevation.max():.1f}°, at other angles: they are not of the same sensor"
-            )
-        notes.append("rings have other numbers in A than in B, and are matched by elevation")
+    of_a = apart.argmin(axis=0)
+    of_b = np.flatnonzero(apart[of_a].argmin(axis=1) == np.arange(len(b.rings)))
+    of_a, notes = of_a[of_b], []
+    for sign in (1, -1):
+        zero = int(np.median(b.rings[of_b] - sign * a.rings[of_a]))
+        numbers = sign * a.rings + zero
+        if np.mean(np.abs(numbers[of_a] - b.rings[of_b]) <= 1) >= _AGREE:
+            if sign < 0 or zero:
+                notes.append(f"ring n of A is ring {zero} {'+-'[sign < 0]} n of B")
+            break
     else:
-        of_a, of_b = of_a[same], of_b[same]
-    if alone := max(len(a.rings), len(b.rings)) - len(of_b):
-        notes.append(f"rings that only one of the two has, or that look elsewhere: {alone}")
-    return of_a, of_b, tuple(notes)
+        there = apart[of_a, of_b] <= near
+        numbers = -1 - np.arange(len(a.rings))
+        numbers[of_a[there]] = b.rings[of_b[there]]
+        notes.append("the rings are numbered in other orders, and matched by elevation")
+    if (alone := len(np.setxor1d(numbers, b.rings))) > 0:
+        notes.append(f"only one of the two has returns of {counted(alone, 'ring')}")
+    rings, first = np.unique(np.append(b.rings, numbers), return_index=True)
+    elevation = np.append(b.elevation, a.elevation)[first]
+    both, in_a, in_b = np.intersect1d(numbers, b.rings, return_indices=True)
+    off = np.abs(a.elevation[in_a] - b.elevation[in_b])
+    if len(both) < min(len(a.rings), len(b.rings)) / 2 or np.median(off) > 2 * near:
+        raise LidarpoolError(
+            f"the rings of {names[0]} look at {a.elevation.min():.1f}° to {a.elevation.max():.1f}° "
+            f"and those of {names[1]} at {b.elevation.min():.1f}° to {b.elevation.max():.1f}°, at "
+            "other angles: they are not of the same sensor"
+        )
+    order = np.argsort(-elevation, kind="stable")
+    row = np.empty(len(order), np.int64)
+    row[order] = np.arange(len(order))
+    rows_a, rows_b = (row[np.searchsorted(rings, one)] for one in (numbers, b.rings))
+    return _Common(rings[order], elevation[order], rows_a, rows_b, tuple(notes))
 
 
 def _field(seen: NDArray[np.intp], columns: int, step: float) -> tuple[NDArray[np.int64], float]:
