@@ -257,13 +257,14 @@ def _of_las(path: Path, name: str, light: str | None) -> Recording:
             first, records = struct.unpack("<II", start.read(104)[96:])
         if _RECORD * records > first:  # laspy would go through four thousand million of them
             raise ValueError("its header is wrong")
-        file = laspy.open(path, read_evlrs=False)
-        count = file.header.point_count
+        with laspy.open(path, read_evlrs=False) as file:
+            count = file.header.point_count
 
     def read(number: int) -> Read:
-        file.seek(number * CHUNK_POINTS)
         wanted = min(CHUNK_POINTS, count - number * CHUNK_POINTS)
-        points = file.read_points(wanted)
+        with laspy.open(path, read_evlrs=False) as file:
+            file.seek(number * CHUNK_POINTS)
+            points = file.read_points(wanted)
         if len(points) != wanted:
             raise ValueError(f"{count:,} points announced, and there are fewer")
         columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}

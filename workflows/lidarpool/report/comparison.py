@@ -347,7 +347,9 @@ def nearest(points: Floats, others: Floats) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def rank_correlation(a: NDArray[Any], b: NDArray[Any]) -> float | None:
-    """Spearman's rank correlation, ties with their mean rank; None if one is constant."""
+    """Spearman's rank correlation, ties with their mean rank; None if one is constant or empty."""
+    if not len(a):
+        return None
     ranks: list[Floats] = []
     for values in (a, b):
         _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)

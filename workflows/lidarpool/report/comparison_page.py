@@ -241,7 +241,8 @@ def draw_distances(found: Comparison) -> Page:
         axes = page.chart((LEFT + 0.5, 0.13, 0.4, 0.64), xlabel="intensity in B",
                           ylabel="intensity in A")  # fmt: skip
         mine, theirs = found.lights
-        axes.hist2d(theirs, mine, (_bins(theirs), _bins(mine)), norm=LogNorm(), cmap="viridis")
+        axes.hist2d(theirs, mine, (_bins(theirs), _bins(mine)), norm=LogNorm(), cmap="viridis",
+                    rasterized=True)  # fmt: skip
         axes.grid(False)
         told = f"rank correlation {light['rank_correlation']:.3f}"
         _name(page, axes, f"{told} of {light['pairs']:,} {light['of']}")

@@ -15,7 +15,7 @@ from ..export.recordings import Turn
 Floats = NDArray[np.float64]
 Reals = NDArray[np.float32]
 
-_TILT_DEG = 0.5  # that half of a ring's points may be off its cone, of rings nearer to each other
+_TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
 _ALIKE = 0.01  # by how much steps of azimuth may differ that are meant to be the same
 _SECTOR_DEG = (
     90.0  # a gap as wide as this in all rings is none of returns, but of the field of view
@@ -76,7 +76,7 @@ class _Polar:
             elevation[order][ends[:-1] + (share * (sizes - 1)).astype(np.intp)]
             for share in (0.25, 0.5, 0.75)
         )
-        if np.median(high - low) > max(_TILT_DEG, _spacing(middle)):
+        if np.median(high - low) > max(_TILT_DEG, _spacing(middle) / 2):
             raise LidarpoolError(
                 f"{name} has rings that are no cones around zero: its points are in the world's "
                 "axes, or of several poses, and the range image needs those of the sensor"
