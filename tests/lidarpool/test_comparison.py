@@ -265,9 +265,18 @@ def written(tmp_path_factory):
     for pose, begin in zip(sweeps.pose.positions, sweeps.begins_ns, strict=True):
         channel = np.broadcast_to(np.arange(LAYERS), ranges.shape).ravel()
         light = (0.2 + 0.1 * np.cos(np.radians(azimuth)) + 0.01 * np.arange(LAYERS)).ravel()
-        scan = np.repeat(np.arange(36), 10)[:, None] + 36 * len(clouds) + 0 * channel.reshape(-1, LAYERS)
-        columns = {"scan": scan.ravel(), "channel": channel, "object": 0 * channel,
-                   "intensity": light, "time": (begin + 1000 * scan.ravel()).astype(np.int64)}
+        scan = (
+            np.repeat(np.arange(36), 10)[:, None]
+            + 36 * len(clouds)
+            + 0 * channel.reshape(-1, LAYERS)
+        )
+        columns = {
+            "scan": scan.ravel(),
+            "channel": channel,
+            "object": 0 * channel,
+            "intensity": light,
+            "time": (begin + 1000 * scan.ravel()).astype(np.int64),
+        }
         clouds.append(Cloud(inside.reshape(-1, 3) + pose, columns))  # fmt: skip
     made = Cloud.joined(clouds)
     for name in ("ply", "laz", "las", "pcd", "mcap", "rosbag2"):
@@ -326,7 +335,7 @@ def test_a_survey_that_moved_is_compared_with_a_map(written):
 
 
 def test_sweeps_are_matched_by_time(written, tmp_path):
-    folder, made, sweeps = written
+    folder, _, sweeps = written
     later = replace(sweeps, begins_ns=sweeps.begins_ns + 1e8)  # by one turn
     (tmp_path / "cloud.ply").write_bytes((folder / "cloud.ply").read_bytes())
     later.save(tmp_path / "sweeps.npz")

@@ -16,10 +16,12 @@ Floats = NDArray[np.float64]
 Reals = NDArray[np.float32]
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
+_SAME = 0.15  # by how much single steps may differ from their mean
 _ALIKE = 0.01  # by how much steps of azimuth may differ that are meant to be the same
 _SECTOR_DEG = (
     90.0  # a gap as wide as this in all rings is none of returns, but of the field of view
 )
+_BLOCKS = 36  # of a turn, in each of which the pulses of a ring are evenly spaced
 _AGREE = 0.7  # share of rings from whose numbers the others' follow
 _FINEST_DEG = 1e-3  # points nearer in azimuth are of one pulse
 
@@ -92,27 +94,38 @@ class _Polar:
         steps = steps[steps > _FINEST_DEG]
         if not len(steps):
             return 1.0
-        # Gaps are several steps; of the rest, sums know the step better than any single one.
-        first = np.quantile(steps, 0.2)
-        count = np.round(steps / first)
-        near = (count >= 1) & (count <= 3)
-        return float(steps[near].sum() / count[near].sum())
+        # However many are lost, single steps are more than double ones.
+        counts, edges = np.histogram(np.log(steps), bins=100)
+        found = np.exp(edges[counts.argmax() : counts.argmax() + 2].mean())
+        for _ in range(10):  # the mean of those that are alike knows more than the bin
+            found = steps[np.abs(steps / found - 1) < _SAME].mean()
+        return float(found)
 
-    def phases(self, step: float) -> Floats:
-        """Where the pulses of each ring are within a step: (r,), in steps, -0.5 to 0.5."""
+    def phases(self, rows: NDArray[np.int64], count: int, step: float) -> Floats:
+        """Where pulses are within a step, in steps: (count, blocks), NaN where there are none."""
+        place = rows[self.ring] * _BLOCKS + self._block
         turn = np.exp(2j * np.pi * self.azimuth / step)
-        sums = np.bincount(self.ring, turn.real) + 1j * np.bincount(self.ring, turn.imag)
-        return np.asarray(np.angle(sums) / (2 * np.pi))
+        real, imaginary = (
+            np.bincount(place, part, count * _BLOCKS) for part in (turn.real, turn.imag)
+        )
+        none = np.bincount(place, minlength=count * _BLOCKS) == 0
+        phases = np.angle(real + 1j * imaginary) / (2 * np.pi)
+        return np.where(none, np.nan, phases).reshape(count, _BLOCKS)
+
+    @property
+    def _block(self) -> NDArray[np.int64]:
+        return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
     def image(
-        self, rows: NDArray[np.int64], phase: Floats, step: float, shape: tuple[int, int]
+        self, rows: NDArray[np.int64], phases: Floats, step: float, shape: tuple[int, int]
     ) -> tuple[Reals, Reals, float]:
         """Ranges and lights of cells, and the share of points that others in their cells hide.
 
-        `rows` (r,) are those of its rings. Of several points in a cell, the one
-        nearest to the middle is taken, and of several returns of a pulse the nearest.
+        `rows` (r,) are those of its rings, `phases` as the method gives them. Of several points in
+        a cell, the one nearest to the middle is taken, and of several returns of a pulse the
+        nearest.
         """
-        place = self.azimuth / step - phase[self.ring]
+        place = self.azimuth / step - phases[rows[self.ring], self._block]
         column = np.round(place)
         off = np.round(np.abs(place - column), 3)
         cell = rows[self.ring] * shape[1] + column.astype(np.int64) % shape[1]
@@ -131,8 +144,9 @@ def range_images(
     """Put two sweeps of one sensor into the same cells.
 
     A column is as wide as the step of azimuth from pulse to pulse, the coarser of the two. Each
-    ring's cells have their middles where its pulses are, so that none falls between two; a pulse of
-    A is in the cell of the pulse of B that is nearest.
+    ring's cells have their middles where its pulses are, in every 10 degrees, so that
+    none falls between two although heads turn unevenly; a pulse of A is in the cell of the pulse of
+    B that is nearest.
 
     Raises
     ------
@@ -146,15 +160,23 @@ def range_images(
     step = azimuth_deg or (
         steps[1] if abs(steps[0] / steps[1] - 1) < _ALIKE else max(*steps, _FINEST_DEG)
     )
-    columns = max(round(360 / step), 1)
-    rows_a, rows_b, shape = common.rows_a, common.rows_b, (len(common.rings), columns)
-    phase_a, phase_b, middle = first.phases(step), second.phases(step), np.zeros(shape[0])
-    middle[rows_a] = phase_a  # of rings that B lacks, too
-    middle[rows_b] = phase_b
-    apart = phase_a - middle[rows_a]
-    phase_a = middle[rows_a] + apart - np.round(apart)
-    image_a, light_a, hidden_a = first.image(rows_a, phase_a, step, shape)
-    image_b, light_b, hidden_b = second.image(rows_b, phase_b, step, shape)
+    rows_a, rows_b, count = common.rows_a, common.rows_b, len(common.rings)
+    phases_a, phases_b = first.phases(rows_a, count, step), second.phases(rows_b, count, step)
+    blocks, middle = np.arange(_BLOCKS), np.where(np.isnan(phases_b), phases_a, phases_b)
+    for row in middle:  # from block to block as the head turns on
+        known = np.flatnonzero(~np.isnan(row))
+        row[:] = np.interp(blocks, known, np.unwrap(row[known], period=1))
+    apart = phases_a - middle
+    for row in apart:
+        known = np.flatnonzero(~np.isnan(row))
+        if len(known):
+            row[known] = np.unwrap(row[known], period=1)
+            row -= np.round(np.median(row[known]))
+    phases_a = middle + apart
+    columns = max(round(360 / step - float(np.median(middle[:, -1] - middle[:, 0]))), 1)
+    shape = count, columns
+    image_a, light_a, hidden_a = first.image(rows_a, phases_a, step, shape)
+    image_b, light_b, hidden_b = second.image(rows_b, middle, step, shape)
     seen = np.flatnonzero((np.isfinite(image_a) | np.isfinite(image_b)).any(axis=0))
     order, begin = _field(seen, columns, step)
     return RangeImages(
