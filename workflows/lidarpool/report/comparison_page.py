@@ -204,8 +204,11 @@ def draw_rings(found: Comparison) -> Page:
         left += wide + apart
     axes = page.chart((left, 0.13, wide, 0.64), xlabel="A − B, mm; more in the outer bins",
                       ylabel="cells", yscale="log")  # fmt: skip
-    values = np.clip(1000 * found.residuals, -limit, limit)
-    axes.hist(values, bins=81, range=(-limit, limit), color=A)
+    width = np.ceil(limit / 25) if limit > 10 else limit / 25  # ranges are often whole millimetres
+    half = np.floor(limit / width) + 0.5
+    edges = np.arange(-half, half + 1) * width
+    values = np.clip(1000 * found.residuals, edges[0], edges[-1])
+    axes.hist(values, bins=edges.tolist(), color=A)
     return page
 
 
