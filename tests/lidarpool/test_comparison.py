@@ -10,6 +10,7 @@ import laspy
 import numpy as np
 import pytest
 from pypcd4 import PointCloud
+from tests.lidarpool.drives import the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey, compare
@@ -195,7 +196,7 @@ def test_the_first_of_several_returns_counts():
 @pytest.mark.parametrize(
     ("numbers", "note"),
     [
-        (np.arange(RINGS) + 1, "ring n of A is ring -1 + n of B"),
+        (np.arange(RINGS) + 1, "ring n of A is ring n - 1 of B"),
         (RINGS - 1 - np.arange(RINGS), "ring n of A is ring 15 - n of B"),
         (np.arange(RINGS) * 7 % RINGS, "the rings are numbered in other orders"),
     ],
@@ -349,6 +350,18 @@ def test_sweeps_are_matched_by_time(written, tmp_path):
         (tmp_path / name).write_bytes((folder / "pcd/000000.pcd").read_bytes())
     (tmp_path / "cloud.ply").unlink()
     assert compare(tmp_path, folder).figures["notes"][0] == "A has 2 sweeps, B 3: 2 pairs by order"
+
+
+@pytest.mark.parametrize("kind", ["kitti", "folder"])
+def test_sweeps_of_data_sets(tmp_path, kind):
+    scene = the_scene()
+    write_set(tmp_path, kind, scene, the_sweeps(scene))
+    found = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="front").figures
+    assert found["pairs"] == found["a"]["sweeps"] == 15  # of five jobs
+    assert found["distances"]["a_to_b"]["max_m"] == 0
+    assert "pairs of which one has no points are left out" in found["notes"]
+    other = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="rear/left", sweeps=[3]).figures
+    assert other["pairs"] == 1 and other["distances"]["a_to_b"]["median_m"] > 1
 
 
 def test_names_and_places_of_other_programs(tmp_path):

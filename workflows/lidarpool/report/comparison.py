@@ -19,8 +19,10 @@ from ..base.open3d_module import load_open3d
 from ..base.words import counted
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
+from ..export.folder import result_folder, staging
 from ..export.recordings import Recording, Turn, open_recording
 from ..sensor.noise import uniform
+from .page.words import millimetres, ratio
 from .range_image import RangeImages, range_images
 
 Floats = NDArray[np.float64]
@@ -56,8 +58,7 @@ class Comparison:
 
         LidarpoolError if the folder, which is made, cannot be written to.
         """
-        from ..export.folder import result_folder, staging
-        from .comparison_page import write_comparison
+        from .comparison_page import write_comparison  # brings Matplotlib, which takes a moment
 
         place = Path(folder)
         with (
@@ -160,10 +161,12 @@ def _pairs(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tup
                 raise LidarpoolError(f"{one.name} has no times of sweeps: leave out --match time.")
             times.append(np.fromiter(one.times(), np.float64))
         of_a, of_b = times
-        near = np.abs(of_a[:, None] - of_b).argmin(axis=0) if pairs else np.empty(0, int)
-        period = np.median(np.diff(of_b)) if len(of_b) > 1 else 1e8
-        close = np.flatnonzero(np.abs(of_a[near] - of_b[: len(near)]) <= period / 2)
-        pairs = [(int(near[j]), int(j)) for j in close]
+        if pairs:
+            order = np.argsort(of_a)
+            near = order[np.searchsorted((of_a[order][1:] + of_a[order][:-1]) / 2, of_b)]
+            period = np.median(np.diff(of_b)) if len(of_b) > 1 else 1e8
+            close = np.flatnonzero(np.abs(of_a[near] - of_b) <= period / 2)
+            pairs = [(int(near[j]), int(j)) for j in close]
     if not pairs:
         raise LidarpoolError(
             f"{a.name} with {counted(a.count, 'sweep')} and {b.name} with {b.count:,} have none of "
@@ -193,7 +196,7 @@ class _Comparing:
         self.above: list[Above] = []
         # Of cells with a return in both: residual, ring, intensities of A and B.
         self.cells: list[tuple[NDArray[Any], ...]] = []
-        # Of points of A, and of B: distance to the other, intensities of A and B.
+        # Of points of A, and of B: distance to the other, own intensity, that of the nearest.
         self.pairs: tuple[list[Any], list[Any]] = ([], [])
         # {ring: its elevation, cells with a return in both, in none, only in B, only in A}
         self.rings: dict[int, tuple[float, NDArray[np.int64]]] = {}
@@ -226,6 +229,7 @@ class _Comparing:
                 f"of each sweep, {budget:,} points and cells are compared at most, chosen by a hash"
             )
         if not len(a) or not len(b):
+            self.note("pairs of which one has no points are left out")
             return
         self._add_images(a, b, budget)
         for found, turn, other in zip(self.pairs, (a, b), (b, a), strict=True):
@@ -264,7 +268,6 @@ class _Comparing:
 
     def result(self, pairs: int) -> Comparison:
         """Return all figures, of so many pairs of sweeps; 0 of whole clouds."""
-        first, second = self.recordings
         for one, points in zip(self.recordings, self.points.tolist(), strict=True):
             if not points:
                 raise LidarpoolError(f"{one.name} has no points: there is nothing to compare.")
@@ -284,8 +287,10 @@ class _Comparing:
         correlation = rank_correlation(*lights)
         figures: dict[str, Any] = {
             "versions": {"lidarpool": __version__},
-            "a": {"name": first.name, "sweeps": first.count, "points": int(self.points[0])},
-            "b": {"name": second.name, "sweeps": second.count, "points": int(self.points[1])},
+            **{
+                key: {"name": one.name, "sweeps": None if one.whole else one.count, "points": count}
+                for key, one, count in zip("ab", self.recordings, self.points.tolist(), strict=True)
+            },
             "pairs": pairs,
             "notes": self.notes,
             "range_image": image,
@@ -443,15 +448,3 @@ def table(figures: dict[str, Any]) -> Iterator[str]:
     yield f"F-score  {scores}; Chamfer distance {millimetres(far['chamfer_m'])}"
     for note in figures["notes"]:
         yield f"note: {note}"
-
-
-def millimetres(value: float | None) -> str:
-    """Length in the unit that suits it."""
-    if value is None:
-        return "unknown"
-    return f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
-
-
-def ratio(value: float | None) -> str:
-    """Return a share, or words for none."""
-    return "undefined" if value is None else f"{value:.3f}"

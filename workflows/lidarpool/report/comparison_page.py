@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from markupsafe import Markup
@@ -17,8 +17,11 @@ from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..render import theme
 from ..render.page import FONT, Page, shortened
-from .comparison import Comparison, millimetres, ratio
 from .page.page import environment
+from .page.words import MINUS, millimetres, ratio
+
+if TYPE_CHECKING:
+    from .comparison import Comparison
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +30,7 @@ LEFT, RIGHT = 0.075, 0.845  # of charts, as shares of the width
 MOST_DOTS = 120_000
 A, B = "#4477aa", "#ee7733"
 ONLY_A, ONLY_B = theme.rgb("#2ca25f"), theme.rgb("#101418")  # no colours of residuals
+NONE = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
 RANGES, RESIDUALS, FAR = "viridis", "RdBu_r", "plasma"
 SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
 CLOSEST_M = 0.001  # end of the scale of distances
@@ -50,7 +54,7 @@ def write_comparison(folder: Path, found: Comparison) -> list[str]:
             summary=_summary(figures),
             facts=list(_facts(figures)),
             pictures=drawn,
-            length=millimetres,
+            length=_length,
             ratio=ratio,
         )
     )
@@ -60,6 +64,10 @@ def write_comparison(folder: Path, found: Comparison) -> list[str]:
 
 def _short(figures: dict[str, Any], which: str) -> str:
     return shortened(figures[which]["name"].rstrip("/").rpartition("/")[2], 40)
+
+
+def _length(value: float | None) -> str:
+    return millimetres(value).replace("-", MINUS)
 
 
 def _summary(figures: dict[str, Any]) -> str:
@@ -73,7 +81,7 @@ def _facts(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:
     image, light, far = figures["range_image"], figures["intensity"], figures["distances"]
     if image is not None:
         told = image["residual"]
-        yield millimetres(told["median_m"]).replace("-", "−"), "median of range residuals"
+        yield _length(told["median_m"]), "median of range residuals"
         yield millimetres(told["mad_m"]), "their median absolute deviation"
         if image["no_return"] is not None:
             yield ratio(image["no_return"]["f1"]), "F1 of cells without a return"
@@ -130,10 +138,10 @@ def draw_ranges(found: Comparison) -> Page:
         axes = page.chart((LEFT, bottom, RIGHT - LEFT, high / height), ylabel="elevation, °")
         if k < 2:
             painted = theme.mapped(RANGES, norm(np.nan_to_num(images.ranges[k], nan=low)).filled(0))
-            painted[~images.there[k]] = theme.rgb(theme.UNSEEN)
+            painted[~images.there[k]] = NONE
         else:
             painted = theme.mapped(RESIDUALS, scale(1000 * np.nan_to_num(residual)).data)
-            painted[~in_a & ~in_b] = theme.rgb(theme.UNSEEN)
+            painted[~in_a & ~in_b] = NONE
             painted[in_a & ~in_b], painted[~in_a & in_b] = ONLY_A, ONLY_B
             axes.set_xlabel("azimuth, °")
         # As the sensor sees it: what is to its left is on the left.
@@ -153,7 +161,7 @@ def draw_ranges(found: Comparison) -> Page:
     frame = (0.862, below / height, 0.014, share)
     page.colour_bar(theme.mapped(RESIDUALS, ramp), scale, "A − B, mm", frame)
     named = (("only A has a return", ONLY_A), ("only B has a return", ONLY_B),
-             ("no return", theme.UNSEEN))  # fmt: skip
+             ("no return", NONE))  # fmt: skip
     handles = [_dot(text, colour) for text, colour in named]
     _key(page, page.figure, handles, loc="upper right", bbox_to_anchor=(RIGHT, 1 - 40 / height),
          ncols=3)  # fmt: skip
@@ -303,7 +311,8 @@ def _name(page: Page, axes: Axes, text: str) -> None:
 
 
 def _dot(text: str, colour: Any, marker: str = "s") -> Line2D:
-    return Line2D([], [], ls="", marker=marker, color=colour, mec=colour, label=text, ms=4)
+    edge = theme.MUTED if marker == "s" else colour
+    return Line2D([], [], ls="", marker=marker, color=colour, mec=edge, mew=0.5, label=text, ms=4)
 
 
 def _key(page: Page, on: Any, handles: list[Line2D], **given: Any) -> None:

@@ -218,7 +218,8 @@ def _common(a: _Polar, b: _Polar, names: tuple[str, str]) -> _Common:
         numbers = sign * a.rings + zero
         if np.mean(np.abs(numbers[of_a] - b.rings[of_b]) <= 1) >= _AGREE:
             if sign < 0 or zero:
-                notes.append(f"ring n of A is ring {zero} {'+-'[sign < 0]} n of B")
+                other = f"n {'+-'[zero < 0]} {abs(zero)}" if sign > 0 else f"{zero} - n"
+                notes.append(f"ring n of A is ring {other} of B")
             break
     else:
         there = apart[of_a, of_b] <= near
