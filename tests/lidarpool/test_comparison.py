@@ -175,6 +175,20 @@ def test_no_pulse_falls_between_cells(shift):
     assert image["hidden_points"] == {"a": 0.0, "b": 0.0}
 
 
+def test_the_step_is_found_where_most_returns_are_lost():
+    rng = np.random.default_rng(0)
+    in_a, in_b = (rng.uniform(size=RANGES.shape) > share for share in (0.9, 0.3))
+    image = of_image(cloud(RANGES + 0.01, there=in_a), cloud(there=in_b))
+    assert image["azimuth_step_deg"] == pytest.approx(0.5, abs=1e-6)
+    assert image["residual"]["rmse_m"] == pytest.approx(0.01, abs=1e-5)
+    assert image["no_return"]["returns_in_both"] == (in_a & in_b).sum()
+    # Every second azimuth is not a loss: the cells are those of the coarser one.
+    even = np.arange(COLUMNS) % 2 == 0
+    image = of_image(cloud(), cloud(there=np.broadcast_to(even, RANGES.shape)))
+    assert image["azimuth_step_deg"] == pytest.approx(1, abs=1e-6)
+    assert image["no_return"]["returns_in_both"] == CELLS / 2
+
+
 def test_a_step_that_does_not_divide_the_turn():
     """As of a Velodyne: 1808.449 firings a turn."""
     azimuth = np.arange(COLUMNS) * 0.199066 + 3  # not all around: a sector of 143 degrees
@@ -221,7 +235,7 @@ def test_a_ring_that_only_one_sees_is_lost_in_the_other():
 def test_what_has_no_range_image_says_why():
     plain = Cloud(cloud().positions, {})
     for a, b, says in (
-        (plain, cloud(), "the cloud has no rings: the range image needs a column ring or channel"),
+        (plain, cloud(), "cloud A has no rings: the range image needs a column ring or channel"),
         (cloud(), Cloud(cloud().positions + 30, cloud().columns), "no cones around zero"),
         (cloud(), Cloud(cloud().positions * [1, 1, 9], cloud().columns), "not of the same sensor"),
     ):

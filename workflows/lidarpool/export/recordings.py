@@ -124,7 +124,10 @@ class Recording:
 
 
 def open_recording(
-    place: str | Path | Cloud | StoredCloud, sensor: str | None = None, light: str | None = None
+    place: str | Path | Cloud | StoredCloud,
+    sensor: str | None = None,
+    light: str | None = None,
+    name: str = "the cloud",
 ) -> Recording:
     """Open a cloud or recording: `KINDS`, or a cloud in memory.
 
@@ -136,6 +139,8 @@ def open_recording(
         Of several: name of a sensor, or topic of a bag.
     light
         Column of the intensity, if it has another name than usual.
+    name
+        Of a cloud in memory, for errors and reports.
 
     Raises
     ------
@@ -143,7 +148,7 @@ def open_recording(
         If it is none, or cannot be opened.
     """
     if isinstance(place, Cloud | StoredCloud):
-        return _of_cloud("the cloud", place, place.sweeps, sensor, light)
+        return _of_cloud(name, place, place.sweeps, sensor, light)
     path, name, kind = Path(place), str(place), Path(place).suffix.lower()
     if not path.exists():
         raise LidarpoolError(f"{name} does not exist: give {KINDS}.")

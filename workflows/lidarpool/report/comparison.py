@@ -123,8 +123,8 @@ def compare(
     if not distances_m or any(not 0 < one < np.inf for one in distances_m):
         raise LidarpoolError(f"distances_m is {list(distances_m)}; it must be lengths in metres.")
     recordings = (
-        open_recording(a, sensor_a, intensity_a),
-        open_recording(b, sensor_b, intensity_b),
+        open_recording(a, sensor_a, intensity_a, name="cloud A"),
+        open_recording(b, sensor_b, intensity_b, name="cloud B"),
     )
     found = _Comparing(recordings, tuple(sorted(distances_m)), azimuth_deg)
     first, second = recordings

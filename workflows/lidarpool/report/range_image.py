@@ -94,11 +94,18 @@ class _Polar:
         steps = steps[steps > _FINEST_DEG]
         if not len(steps):
             return 1.0
-        # However many are lost, single steps are more than double ones.
         counts, edges = np.histogram(np.log(steps), bins=100)
         found = np.exp(edges[counts.argmax() : counts.argmax() + 2].mean())
+
+        def alike(step: float) -> Floats:
+            return steps[np.abs(steps / step - 1) < _SAME]
+
+        for parts in (4, 3, 2):  # where most returns are lost, double steps may be the most
+            if len(alike(found / parts)) > len(alike(found)) / 4:
+                found /= parts
+                break
         for _ in range(10):  # the mean of those that are alike knows more than the bin
-            found = steps[np.abs(steps / found - 1) < _SAME].mean()
+            found = alike(found).mean()
         return float(found)
 
     def phases(self, rows: NDArray[np.int64], count: int, step: float) -> Floats:
@@ -157,12 +164,12 @@ def range_images(
     first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
     common = _common(first, second, names)
     steps = [first.step(), second.step()]
-    step = azimuth_deg or (
-        steps[1] if abs(steps[0] / steps[1] - 1) < _ALIKE else max(*steps, _FINEST_DEG)
-    )
+    alike = abs(steps[0] / steps[1] - 1) < _ALIKE
+    step = azimuth_deg or (steps[1] if alike else max(steps))
     rows_a, rows_b, count = common.rows_a, common.rows_b, len(common.rings)
     phases_a, phases_b = first.phases(rows_a, count, step), second.phases(rows_b, count, step)
-    blocks, middle = np.arange(_BLOCKS), np.where(np.isnan(phases_b), phases_a, phases_b)
+    own, other = (phases_b, phases_a) if alike or steps[0] < steps[1] else (phases_a, phases_b)
+    blocks, middle = np.arange(_BLOCKS), np.where(np.isnan(own), other, own)
     for row in middle:  # from block to block as the head turns on
         known = np.flatnonzero(~np.isnan(row))
         row[:] = np.interp(blocks, known, np.unwrap(row[known], period=1))
@@ -172,7 +179,8 @@ def range_images(
         if len(known):
             row[known] = np.unwrap(row[known], period=1)
             row -= np.round(np.median(row[known]))
-    phases_a = middle + apart
+    # Several pulses in a cell have no phase of their own.
+    phases_a = middle + apart if alike and abs(step / steps[1] - 1) < _SAME else middle
     columns = max(round(360 / step - float(np.median(middle[:, -1] - middle[:, 0]))), 1)
     shape = count, columns
     image_a, light_a, hidden_a = first.image(rows_a, phases_a, step, shape)
