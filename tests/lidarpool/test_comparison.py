@@ -10,7 +10,7 @@ import laspy
 import numpy as np
 import pytest
 from pypcd4 import PointCloud
-from tests.lidarpool.drives import the_scene, the_sweeps, write_set
+from tests.lidarpool.drives import points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey, compare
@@ -364,6 +364,20 @@ def test_sweeps_are_matched_by_time(written, tmp_path):
         (tmp_path / name).write_bytes((folder / "pcd/000000.pcd").read_bytes())
     (tmp_path / "cloud.ply").unlink()
     assert compare(tmp_path, folder).figures["notes"][0] == "A has 2 sweeps, B 3: 2 pairs by order"
+
+
+def test_one_of_several_sensors_is_chosen(tmp_path):
+    scene = the_scene()
+    of, made = the_sweeps(scene), points_of(scene, 0)
+    for name in ("ply", "mcap"):
+        Format(name).write(tmp_path / Format(name).file, made, of)
+    of.save(tmp_path / "sweeps.npz")
+    bag = tmp_path / "cloud.mcap"
+    for place, names in ((tmp_path, "sensors front, rear/left"), (bag, "/front/points, /rear")):
+        with pytest.raises(LidarpoolError, match=rf"{names}.*: choose one \(--sensor-a"):
+            compare(place, tmp_path, sensor_b="front")
+    found = compare(bag, tmp_path, sensor_a="/rear_left/points", sensor_b="rear/left").figures
+    assert found["pairs"] == 3 and found["distances"]["a_to_b"]["max_m"] < 2e-3
 
 
 @pytest.mark.parametrize("kind", ["kitti", "folder"])

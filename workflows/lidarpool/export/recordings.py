@@ -343,7 +343,8 @@ def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> s
         return wanted
     listed = f"{name} has the {what} {', '.join(known)}" if known else f"{name} has no {what}"
     if wanted is None:
-        raise LidarpoolError(f"{listed}: " + ("choose one." if known else "record one."))
+        advice = "choose one (--sensor-a, --sensor-b)" if known else "record one"
+        raise LidarpoolError(f"{listed}: {advice}.")
     raise LidarpoolError(f"{listed}, not {wanted!r}." + did_you_mean(wanted, known))
 
 
