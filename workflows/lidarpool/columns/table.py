@@ -148,6 +148,13 @@ OPTIONAL = (
         "reflectivity",
     ),
     Column(
+        "radial_velocity",
+        "float32",
+        "m/s",
+        "how fast the range grows: negative when surface and sensor come nearer; NaN without one",
+        "radial_velocity",
+    ),
+    Column(
         "return_number",
         "uint8",
         "",

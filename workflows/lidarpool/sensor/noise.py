@@ -24,6 +24,7 @@ THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 
 _RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
+_VELOCITY = 40
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -56,6 +57,9 @@ class Noise:
     angle_deg: Annotated[
         float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
     ] = 0.0
+    velocity_m_s: Annotated[
+        float, Field(ge=0, le=1000, description="standard deviation of radial velocities, m/s")
+    ] = 0.0
     dropout: Annotated[
         Share, Field(description="share of returns that are lost, whatever their energy")
     ] = 0.0
@@ -85,6 +89,10 @@ class Noise:
         """Return the reported ranges of returns (n,), metres, at least 0."""
         sigma = self.range_m + self.range_per_m * distance
         return np.maximum(distance + sigma * normal(self.seed, _RANGE, scan, ray, number), 0)
+
+    def velocities(self, velocity: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
+        """Return the reported radial velocities of returns (n,), m/s."""
+        return velocity + self.velocity_m_s * normal(self.seed, _VELOCITY, scan, ray, number)
 
     def angles(self, scan: Whole, ray: Whole) -> tuple[Real, Real]:
         """Deviations of beams, across and up: (n,) and (n,), radians."""

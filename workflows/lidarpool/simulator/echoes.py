@@ -73,6 +73,8 @@ class Echoes(ScanReturns):
     reported: Real  # (k,): distance with noise; `distance` has none
     # (k,): packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
     colour: NDArray[np.uint32] | None = None
+    # (k,): radial velocities, m/s; None if they are those of the rays as reported, or not needed.
+    velocity: Real | None = None
 
 
 @dataclass(frozen=True)

@@ -16,6 +16,7 @@ from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
+from .doppler import radial_velocities
 from .echoes import Echoes
 from .motion import Poses, products, turned
 from .surfaces import Surfaces, light_of
@@ -286,6 +287,25 @@ class BatchReturns:
         """Intensity without the loss by distance and air."""
         lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
         return np.asarray(self.intensity / lost)
+
+    @cached_property
+    def radial_velocity(self) -> NDArray[np.float64]:
+        """How fast the range grows, m/s, with noise; NaN of what is no light's return."""
+        found, noise = self.found, self.survey.noise
+        velocity = found.velocity
+        if velocity is None:
+            velocity = radial_velocities(
+                self._surfaces,
+                self._poses,
+                found.ray.astype(np.int64),
+                self._rays,
+                found.distance,
+                found.triangle,
+                self.time if self._poses.ways else np.zeros(len(self), np.int64),
+            )
+        if noise.velocity_m_s:
+            velocity = noise.velocities(velocity, self.scan, self.ray, self.return_number)
+        return velocity
 
     @property
     def return_number(self) -> NDArray[np.uint8]:

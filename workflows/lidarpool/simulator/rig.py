@@ -178,6 +178,10 @@ class Rig:
             pose = path.pose(specs[0].station)
             poses = Poses(np.array(pose.position), pose.rotation)
         poses = self._timed(poses, specs)
+        if path.moves:
+            begins = sensor.begins_ns(np.arange(first, stop, dtype=np.int64)) + late_ns
+            carrier = Clock(begins, sensor.beams.time_ns, (path,))
+            poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
             pattern, start = whole, first * channels % len(whole)
         else:
