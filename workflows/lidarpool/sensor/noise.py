@@ -57,9 +57,6 @@ class Noise:
     angle_deg: Annotated[
         float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
     ] = 0.0
-    velocity_m_s: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation of radial velocities, m/s")
-    ] = 0.0
     dropout: Annotated[
         Share, Field(description="share of returns that are lost, whatever their energy")
     ] = 0.0
@@ -74,6 +71,9 @@ class Noise:
         ),
     ] = None
     seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
+    velocity_m_s: Annotated[
+        float, Field(ge=0, le=1000, description="standard deviation of radial velocities, m/s")
+    ] = 0.0
 
     @property
     def loses(self) -> bool:

@@ -20,6 +20,24 @@ BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
 Real = NDArray[np.float64]
 
 
+def approach(
+    poses: Poses, ray: NDArray[np.integer[Any]], origins: Real, directions: Real
+) -> Real:
+    """How fast rays (n,) grow because their origins move, m/s: (n,); what stands still has that.
+
+    Origins and unit directions are (n, 3), in the scene's axes.
+    """
+    out = np.zeros(len(ray))
+    if poses.carrier is None:
+        return out
+    origins = np.broadcast_to(origins, directions.shape)
+    for begin in range(0, len(ray), BLOCK_HITS):
+        block = slice(begin, begin + BLOCK_HITS)
+        drift = poses.drift(ray[block], origins[block])
+        out[block] = -products(drift.T, directions[block].T)
+    return out
+
+
 def radial_velocities(
     surfaces: Surfaces,
     poses: Poses,
@@ -42,14 +60,15 @@ def radial_velocities(
     times
         (n,): when they are fired, nanoseconds since the survey's start; for actors.
     """
-    out = np.zeros(len(ray))
     origins, directions = rays
+    out = approach(poses, ray, origins, directions)
+    if not poses.ways:
+        return out
     origins = np.broadcast_to(origins, directions.shape)
     for begin in range(0, len(ray), BLOCK_HITS):
         block = slice(begin, begin + BLOCK_HITS)
-        ahead, start = directions[block], origins[block]
-        points = start + distance[block, None] * ahead
+        ahead = directions[block]
+        points = origins[block] + distance[block, None] * ahead
         velocity = surfaces.velocities(triangle[block], points, times[block], poses.ways)
-        velocity -= poses.drift(ray[block], start)
-        out[block] = products(velocity.T, ahead.T)
+        out[block] += products(velocity.T, ahead.T)
     return out

@@ -18,6 +18,7 @@ from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from .doppler import radial_velocities
 from .echoes import Echoes
+from .hits import FALSE_ALARM, NO_SURFACE
 from .motion import Poses, products, turned
 from .surfaces import Surfaces, light_of
 
@@ -238,7 +239,10 @@ class BatchReturns:
 
     @cached_property
     def cosine(self) -> NDArray[np.float64]:
-        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1."""
+        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
+
+        It means nothing where there is no surface.
+        """
         ways = self._poses.ways
         times = self.time if ways else np.zeros(len(self), np.int64)
         normals = self._surfaces.normals(self.found.triangle, times, ways)
@@ -290,10 +294,10 @@ class BatchReturns:
 
     @cached_property
     def radial_velocity(self) -> NDArray[np.float64]:
-        """How fast the range grows, m/s, with noise; NaN of what is no light's return."""
-        found, noise = self.found, self.survey.noise
-        velocity = found.velocity
+        """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
+        found, velocity = self.found, self.found.velocity
         if velocity is None:
+            times = self.time if self._poses.ways else np.zeros(len(self), np.int64)
             velocity = radial_velocities(
                 self._surfaces,
                 self._poses,
@@ -301,8 +305,12 @@ class BatchReturns:
                 self._rays,
                 found.distance,
                 found.triangle,
-                self.time if self._poses.ways else np.zeros(len(self), np.int64),
+                times,
             )
+            if found.cause is not None:
+                no_light = (found.cause >= FALSE_ALARM) & (found.triangle == NO_SURFACE)
+                velocity[no_light] = np.nan
+        noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
             velocity = noise.velocities(velocity, self.scan, self.ray, self.return_number)
         return velocity
@@ -318,6 +326,14 @@ class BatchReturns:
         return self.found.returns
 
     @property
+    def cause(self) -> NDArray[np.uint8]:
+        """Why the return is there, see `CAUSES` of the table of columns."""
+        if self.found.cause is None:
+            return np.zeros(len(self), np.uint8)
+        return self.found.cause
+
+    @property
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
-        return self._surfaces.materials.semantic_class[self.object]
+        classes, owners = self._surfaces.materials.semantic_class[self.object], self.object
+        return classes if self.found.cause is None else np.where(owners < 0, 0, classes)
