@@ -6,6 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
+from lidarpool.columns.table import TABLE
+from lidarpool.render.colouring import colours_of
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.robot import Hinge, LinkPath
 from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
@@ -269,3 +271,15 @@ def test_a_scanner_that_starts_late():
     back = scanner.sweep(way, number=0, start_s=1.5)["radial_velocity"]
     assert np.abs(ahead).max() == pytest.approx(np.abs(back).max(), rel=0.05)
     assert np.abs(ahead).max() > 4.5
+
+
+def test_velocities_are_blue_and_red():
+    values = np.array([-8.0, 0.0, 2.0, np.nan], np.float32)
+    made = colours_of(values, TABLE["radial_velocity"])
+    assert made.limits[0] == -made.limits[1]
+    nearer, still, farther, unknown = made.paint(values)
+    assert nearer[2] > nearer[0]
+    assert farther[0] > farther[2]
+    assert np.ptp(still) < 0.02
+    assert unknown.tolist() == [0.5, 0.5, 0.5]
+    assert made.scale is not colours_of(values, TABLE["range"]).scale

@@ -24,7 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS
+from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
 from . import reading
 from .boxes import Boxes
@@ -53,6 +53,8 @@ _LAYOUTS = {
         "itemsize": 48,
     }),
 }  # fmt: skip
+# Fields behind those of a layout: {name: type, columns that it needs}.
+_EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY})}
 
 
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
@@ -84,7 +86,8 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
     intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
-    blue, a field `rgb` follows, which makes points of `velodyne` and `autoware` 4 bytes longer.
+    blue, a field `rgb` follows, and where it has radial velocities, `radial_velocity`; each makes
+    points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -99,8 +102,8 @@ def _messages(
     cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any
 ) -> Iterator[tuple[str, Any, int]]:
     """Topics, messages and times in nanoseconds, sweep by sweep."""
-    coloured = {*COLOURS} <= {column.name for column in cloud.table}
-    row, field = _row(layout, coloured), types["sensor_msgs/msg/PointField"]
+    row = _row(layout, _extra({column.name for column in cloud.table}))
+    field = types["sensor_msgs/msg/PointField"]
     fields = [
         field(name, offset, _KINDS[kind.str[1:]], 1)
         for name, (kind, offset, *_) in (row.fields or {}).items()
@@ -172,8 +175,9 @@ class Reader(reading.Reader):
             raise ValueError(f"it has no message on {topic} at {time_ns} ns")
         connection, _, data = found
         message: Any = _types().deserialize_cdr(data, connection.msgtype)
-        coloured = any(field.name == "rgb" for field in message.fields)
-        rows = message.data.view(_row(self.layout, coloured))
+        held = {field.name for field in message.fields}
+        extra = [name for name in _EXTRA if name in held]
+        rows = message.data.view(_row(self.layout, extra))
         light = rows["intensity"].astype(np.float32)
         columns = {
             "intensity": light / 255 if self.layout == "autoware" else light,
@@ -210,16 +214,23 @@ def _start_ns(sweeps: Sweeps) -> int:
     return START_NS if sweeps.start_ns is None else sweeps.start_ns
 
 
-def _row(layout: str, coloured: bool) -> np.dtype[np.void]:
-    """Type of a point in a layout, with or without colours."""
+def _extra(columns: set[str]) -> list[str]:
+    """Names of fields that points have behind those of their layout."""
+    return [name for name, (_, needs) in _EXTRA.items() if needs <= columns]
+
+
+def _row(layout: str, extra: list[str]) -> np.dtype[np.void]:
+    """Type of a point in a layout, with fields behind it."""
     row = _LAYOUTS[layout]
-    if not coloured:
+    if not extra:
         return row
     kinds = {name: (kind, offset) for name, (kind, offset, *_) in (row.fields or {}).items()}
     end = max(offset + kind.itemsize for kind, offset in kinds.values())
-    kinds["rgb"] = np.dtype("<f4"), end
+    for name in extra:
+        kinds[name] = kind, _ = np.dtype(_EXTRA[name][0]), end
+        end += kind.itemsize
     formats, offsets = map(list, zip(*kinds.values(), strict=True))
-    size = max(row.itemsize, end + 4)
+    size = max(row.itemsize, end)
     return np.dtype({"names": [*kinds], "formats": formats, "offsets": offsets, "itemsize": size})
 
 
@@ -252,6 +263,8 @@ def _rows(
         }
     if "rgb" in (row.names or ()):
         values["rgb"] = as_float(*(there[name] for name in COLOURS))
+    if VELOCITY in (row.names or ()):
+        values[VELOCITY] = there[VELOCITY]
     rows = np.zeros(len(points), row)
     for name, column in values.items():
         rows[name] = column
