@@ -6,13 +6,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from lidarpool.columns.table import TABLE
-from lidarpool.render.colouring import colours_of
-from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.robot import Hinge, LinkPath
-from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
-from lidarpool.simulator.hits import AIR, FALSE_ALARM, Hits, joined
-from lidarpool.simulator.rig import Rig
 
 from lidarpool import (
     Material,
@@ -28,6 +21,13 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarpool.columns.table import TABLE
+from lidarpool.render.colouring import colours_of
+from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.robot import Hinge, LinkPath
+from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
+from lidarpool.simulator.hits import AIR, FALSE_ALARM, Hits, joined
+from lidarpool.simulator.rig import Rig
 
 from .casting import Cart, cast_between
 

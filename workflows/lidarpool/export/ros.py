@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from functools import cache
+from heapq import merge
 from pathlib import Path
 from typing import Any
 
@@ -28,9 +29,11 @@ from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
 from . import reading
 from .boxes import Boxes
+from .navigation import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import Placed, Sweeps, plain_names
 
 WORLD, CARRIER = "map", "base_link"  # frames
+_INSTRUMENTS = "imu", "gnss"
 # Of a survey without a date: at time 0, tf2 would take the newest frames for all times.
 START_NS = 1_000_000_000_000_000_000
 # As `ros2 bag play` must offer it, so that late listeners get the frames, too.
@@ -82,6 +85,10 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     on the carrier. The survey begins at its start, or at `START_NS` without one. `/actors` has
     a MarkerArray of the boxes of actors where their points of the sweep are.
 
+    Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
+    orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
+    PointStamped in `map`.
+
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
@@ -113,13 +120,19 @@ def _messages(
     actors = frames[len(sweeps.sensors) :]
     moving = [(CARRIER, sweeps.carrier), *zip(actors, sweeps.actor_poses, strict=True)]
     start_ns = _start_ns(sweeps)
+    measured = make.measured(sweeps, start_ns)
+    waiting = next(measured, None)
     on_carrier = [
         (CARRIER, frame, sweeps.mounts, number)
         for number, frame in enumerate(frames[: len(sweeps.sensors)])
     ]
+    on_carrier += _instruments(sweeps)
     yield "/tf_static", make.transforms(on_carrier, start_ns), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
+        while waiting is not None and waiting[2] <= time_ns:
+            yield waiting
+            waiting = next(measured, None)
         frame = frames[sweeps.sensor[sweep]]
         topic = _topic(sweeps, frames, sweep)
         rows = _rows(layout, row, points, sweeps, sweep)
@@ -140,6 +153,22 @@ def _messages(
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
+    while waiting is not None:
+        yield waiting
+        waiting = next(measured, None)
+
+
+def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
+    """Frames of the instruments on the carrier."""
+    there = sweeps.instruments
+    if there is None or there.folder is None:
+        return []
+    found = zip(_instrument_frames(sweeps), (there.imu, there.gnss), strict=True)
+    return [
+        (CARRIER, frame, Placed(np.array([one.position]), np.array([one.quaternion])), 0)
+        for frame, one in found
+        if one is not None
+    ]
 
 
 class Reader(reading.Reader):
@@ -201,7 +230,12 @@ def _types() -> Typestore:
 def _frames(sweeps: Sweeps) -> list[str]:
     """Frames of the sensors, then of the actors."""
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    return plain_names((WORLD, CARRIER, *named))[2:]
+    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2 : -len(_INSTRUMENTS)]
+
+
+def _instrument_frames(sweeps: Sweeps) -> list[str]:
+    """Frames of the IMU and the GNSS receiver."""
+    return plain_names((WORLD, CARRIER, *_frames(sweeps), *_INSTRUMENTS))[-len(_INSTRUMENTS) :]
 
 
 def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
@@ -300,6 +334,65 @@ class _Messages:
             )
             for parent, name, placed, which in frames
         ])  # fmt: skip
+
+    def measured(self, sweeps: Sweeps, start_ns: int) -> Iterator[tuple[str, Any, int]]:
+        """Topics, messages and times of what instruments measured, in the order of time."""
+        there = sweeps.instruments
+        if there is None:
+            return iter(())
+        imu, gnss = _instrument_frames(sweeps)
+        return merge(
+            self._imu(there, imu, start_ns),
+            self._gnss(there, gnss, start_ns),
+            key=lambda one: one[2],
+        )
+
+    def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[tuple[str, Any, int]]:
+        vector, turn, imu = (
+            self._types[f"{kind}"]
+            for kind in (
+                "geometry_msgs/msg/Vector3", "geometry_msgs/msg/Quaternion", "sensor_msgs/msg/Imu"
+            )
+        )  # fmt: skip
+        unknown = np.zeros(9)
+        unknown[0] = -1  # there is no orientation
+        rate, force = (
+            np.zeros((2, 9))
+            if there.imu is None
+            else [np.eye(3).ravel() * variance for variance in there.imu.variances]
+        )
+        for time, *numbers in there.rows(IMU_FILE):
+            time_ns, values = start_ns + int(time), [*map(float, numbers)]
+            message = imu(
+                self.header(frame, time_ns), turn(0.0, 0.0, 0.0, 1.0), unknown,
+                vector(*values[:3]), rate, vector(*values[3:]), force,
+            )  # fmt: skip
+            yield "/imu/data_raw", message, time_ns
+
+    def _gnss(
+        self, there: Instruments, frame: str, start_ns: int
+    ) -> Iterator[tuple[str, Any, int]]:
+        point, stamped, fix, status = (
+            self._types[kind]
+            for kind in (
+                "geometry_msgs/msg/Point", "geometry_msgs/msg/PointStamped",
+                "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/NavSatStatus",
+            )
+        )  # fmt: skip
+        variances = np.zeros(3) if there.gnss is None else np.array(there.gnss.variances)
+        known = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
+        for time, x, y, z, *place in there.rows(GNSS_FILE):
+            time_ns = start_ns + int(time)
+            if place:
+                message = fix(
+                    self.header(frame, time_ns),
+                    status(status.STATUS_FIX, status.SERVICE_GPS),
+                    *map(float, place), np.diag(variances).ravel(), known,
+                )  # fmt: skip
+                yield "/gnss/fix", message, time_ns
+            else:
+                message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
+                yield "/gnss/position", message, time_ns
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""

@@ -22,6 +22,7 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
+from .navigation import Instruments
 
 Floats = NDArray[np.float64]
 SWEEPS_FILE = "sweeps.npz"
@@ -69,6 +70,7 @@ class Sweeps:
     precision_m: float  # step to which positions were rounded
     epsg: int | None = None  # code of the coordinate system of the world
     start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
+    instruments: Instruments | None = None  # of the carrier, with files beside it
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -148,6 +150,7 @@ class Sweeps:
             survey.precision_m,
             survey.epsg,
             None if survey.start is None else nanoseconds(survey.start),
+            Instruments.of(survey),
         )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
@@ -185,6 +188,8 @@ class Sweeps:
     def packed(self) -> bytes:
         """Return it as a NumPy archive: the same sweeps give the same bytes."""
         words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
+        if self.instruments is not None:
+            words["instruments"] = self.instruments.words()
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
         placed = {"": self.pose, "mount_": self.mounts}
@@ -216,10 +221,12 @@ class Sweeps:
                 Placed(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])
                 for prefix in ("", "mount_", *(f"actor{k}_" for k in range(len(words["actors"]))))
             )
+            instruments = words.get("instruments")
             return cls(
                 pose=pose,
                 mounts=mounts,
                 actor_poses=tuple(actors),
+                instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )

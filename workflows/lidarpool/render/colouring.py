@@ -118,6 +118,4 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
         return colours
 
     limits = float(low), float(high)
-    return Colouring(
-        shade, column.name, unit, column.meaning, limits, logarithmic, scale=scale
-    )
+    return Colouring(shade, column.name, unit, column.meaning, limits, logarithmic, scale=scale)

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,8 @@ from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
+from ..export.navigation import FILES as INSTRUMENT_FILES
+from ..export.navigation import write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..export.table import EXPORTS, FORMATS
 from ..run.picture_file import PICTURE_FILE, Pictured
@@ -30,7 +33,7 @@ ROOM_BYTES = 32 << 20  # room for pictures and report
 CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
 _OF_CLOUD = ("hits", "intensity", "cloud")  # are drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
+FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, *INSTRUMENT_FILES, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
 _EXPORTS = tuple(FORMATS[name].file for name in EXPORTS)
 
@@ -114,7 +117,9 @@ def write_result(
     ):
         drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
         exports = [one.file for one in formats]
-        files = [CLOUD, *exports, *drawn, SWEEPS_FILE, *page, REPORT]
+        instruments = sweeps.instruments
+        measured = [] if instruments is None else instruments.files
+        files = [CLOUD, *exports, *drawn, SWEEPS_FILE, *measured, *page, REPORT]
 
         @cache
         def clear(storage: Storage) -> None:
@@ -123,6 +128,9 @@ def write_result(
                 storage.discard(name)
 
         sweeps.save(staged / SWEEPS_FILE)
+        if instruments is not None:
+            write_instruments(staged, result.survey, result.scene.origin)
+            sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
         Format("ply").write(staged / CLOUD, cloud, sweeps)
         for one in sorted(formats, key=lambda one: one.in_pieces):
             if storage and workers and one.in_pieces:

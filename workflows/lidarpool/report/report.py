@@ -124,6 +124,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "materials": len(survey.materials),
         "returns": asdict(survey.returns_each[0]),
         "noise": asdict(survey.noise_each[0]),
+        "navigation": None if survey.navigation is None else asdict(survey.navigation),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }

@@ -385,10 +385,8 @@ class LinkPath:
 
         The last two are zero unless they are asked for.
         """
-        within = True
-        if moving:
-            first, last = self.presence_ns
-            within = (first <= times_ns) & (times_ns <= last)
+        appears, leaves = self.presence_ns
+        within = (appears <= times_ns) & (times_ns <= leaves)
         times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
         positions, rotations = self.base.poses(station, times_ns)
         place, count = positions.T, len(times_ns)

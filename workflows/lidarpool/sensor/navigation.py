@@ -15,6 +15,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass
+from importlib.util import find_spec
 from itertools import accumulate
 from typing import Annotated, NamedTuple, Protocol
 
@@ -35,7 +36,6 @@ BLOCK = 1 << 14  # samples that are made at a time
 _GYROSCOPE, _ACCELEROMETER, _POSITION = (41, 42, 43), (44, 45, 46), (47, 48, 49)
 
 Real = NDArray[np.float64]
-Density = Annotated[float, Field(ge=0, le=1e3)]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 Place = Annotated[
@@ -43,7 +43,7 @@ Place = Annotated[
 ]
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 @checked_fields
 class Imu:
     """An inertial measurement unit on the carrier; without arguments it has no errors.
@@ -95,7 +95,7 @@ class Imu:
     ] = 0.0
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 @checked_fields
 class Gnss:
     """A GNSS receiver on the carrier; without arguments it has no errors.
@@ -106,9 +106,7 @@ class Gnss:
         If a number is outside its range.
     """
 
-    rate_hz: Annotated[
-        float, Field(ge=0.0001, le=1000, description="positions a second")
-    ] = 10.0
+    rate_hz: Annotated[float, Field(ge=0.0001, le=1000, description="positions a second")] = 10.0
     mount: Annotated[Pose, Field(description="pose of its antenna in the carrier's axes")] = CENTRE
     horizontal_m: Annotated[
         float,
@@ -149,7 +147,7 @@ class Gnss:
             )
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(frozen=True)
 @checked_fields
 class Navigation:
     """What measures the carrier's own motion, and writes it beside the cloud.
@@ -204,12 +202,18 @@ class Fixes(NamedTuple):
     positions: Real  # (k, 3): metres, the scene's local coordinates
 
 
-def check_navigation(navigation: Navigation, path: Trajectory) -> None:
-    """Check that instruments can be on a carrier; LidarpoolError if not."""
+def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
+    """Check that instruments can be on a carrier, in a coordinate system; LidarpoolError if not."""
     if path.stations > 1:
         raise LidarpoolError(
             f"navigation needs a carrier that drives or stands, and this one jumps between "
             f"{path.stations} poses: give a trajectory, or one pose."
+        )
+    gnss = navigation.gnss
+    if gnss and epsg and gnss.origin is None and find_spec("rasterio") is None:
+        raise LidarpoolError(
+            f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: pip install "
+            '"lidarpool[geo]", or give navigation.gnss.origin.'
         )
 
 
@@ -245,9 +249,10 @@ def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
     count = math.floor(survey.duration_ns * imu.rate_hz / 1e9 + 1e-6)
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
-        ends = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
+        ends: Real = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
         _, turns, speeds = _moved(path, imu.mount, ends)
-        _, halfway, _ = _moved(path, imu.mount, (ends[1:] + ends[:-1]) / 2)
+        middles = (ends[1:] + ends[:-1]) / 2
+        _, halfway, _ = _moved(path, imu.mount, middles)
         forces = np.diff(speeds, axis=0) * imu.rate_hz - gravity
         rates = _rotation_vectors(turns[:-1], turns[1:]) * imu.rate_hz
         yield ImuSamples(
@@ -275,7 +280,7 @@ def fixes(survey: Moving, block: int = BLOCK) -> Iterator[Fixes]:
     count = math.floor(survey.duration_ns * gnss.rate_hz / 1e9 + 1e-6) + 1
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
-        times = samples * 1e9 / gnss.rate_hz
+        times = np.asarray(samples * 1e9 / gnss.rate_hz, np.float64)
         places, _, _ = _moved(path, gnss.mount, times)
         yield Fixes(np.rint(times).astype(np.int64), places + errors.of(samples))
 
@@ -356,7 +361,7 @@ class _Errors:
         return out
 
     def _normal(self, purpose: int, samples: NDArray[np.int64]) -> Real:
-        """Normal deviates of samples along each axis: (k, 3)."""
+        """Make normal deviates for samples (k,) along each axis: (k, 3)."""
         high, low = np.divmod(samples, 1 << 32)
         return np.stack([normal(self._seed, purpose, high, low, axis) for axis in range(3)], axis=1)
 

@@ -20,9 +20,7 @@ BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
 Real = NDArray[np.float64]
 
 
-def approach(
-    poses: Poses, ray: NDArray[np.integer[Any]], origins: Real, directions: Real
-) -> Real:
+def approach(poses: Poses, ray: NDArray[np.integer[Any]], origins: Real, directions: Real) -> Real:
     """How fast rays (n,) grow because their origins move, m/s: (n,); what stands still has that.
 
     Origins and unit directions are (n, 3), in the scene's axes.

@@ -55,11 +55,10 @@ def joined(parts: list[Hits]) -> Hits:
     """
     *own, colours, causes, velocities = zip(*parts, strict=True)
     colour = None if parts[0].colour is None else np.concatenate(colours)
-    return Hits(
-        *map(np.concatenate, own),
-        colour,
-        _filled(parts, causes, np.uint8(SURFACE)),
-        _filled(parts, velocities, np.float64(np.nan)),
+    return Hits(*map(np.concatenate, own))._replace(
+        colour=colour,
+        cause=_filled(parts, causes, np.uint8(SURFACE)),
+        velocity=_filled(parts, velocities, np.float64(np.nan)),
     )
 
 
