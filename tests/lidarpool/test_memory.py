@@ -57,6 +57,10 @@ SURVEYS = {
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
     "colours": Survey(MANY, **STILL, **PAINT),
     "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
+    "velocities": Survey(MANY, **WAY, columns=["radial_velocity"]),
+    "velocities of sub-rays": Survey(
+        MANY, **WAY, columns=["radial_velocity"], returns=Returns("strongest", 7, 3.0)
+    ),
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
 }
 

@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from ..columns.table import VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .device import needs_hits
@@ -28,6 +29,7 @@ RAY_TURNED = 20  # by noise of angles, likewise
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
 SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+SUBRAY_MOVING = 110  # more of each, with radial velocities
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
@@ -49,6 +51,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     passing = any(material.transparent != "none" for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)
     textured = any(material.reflectance == "texture" for material in survey.materials)
+    moving = any(column.name == VELOCITY for column in survey.stored_columns)
     bodies = bool(scene.actors or scene.instances)
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     plain = all(
@@ -81,7 +84,9 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
-            found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            each = SUBRAY_PASSING if passing else SUBRAY
+            each += SUBRAY_MOVING * moving
+            found = each * chunk + RETURN * returns
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
         if by_numpy:  # as if it made all columns, and once more those of the device
             point = POINT + POINT_BYTE * columns + columns * made_there
