@@ -48,6 +48,9 @@ Place = Annotated[
 class Imu:
     """An inertial measurement unit on the carrier; without arguments it has no errors.
 
+    Its `mount` is its pose in the carrier's axes. Noise is named and measured as in kalibr's
+    `imu.yaml`.
+
     Raises
     ------
     LidarpoolError
@@ -57,7 +60,7 @@ class Imu:
     rate_hz: Annotated[
         float, Field(ge=0.001, le=100_000, description="samples a second; update_rate of kalibr")
     ] = 200.0
-    mount: Annotated[Pose, Field(description="its pose in the carrier's axes")] = CENTRE
+    mount: Pose = CENTRE
     gyroscope_noise_density: Annotated[
         float, Field(ge=0, le=100, description="angle random walk, rad/s/sqrt(Hz)")
     ] = 0.0
@@ -100,6 +103,8 @@ class Imu:
 class Gnss:
     """A GNSS receiver on the carrier; without arguments it has no errors.
 
+    Its `mount` is the pose of its antenna in the carrier's axes.
+
     Raises
     ------
     LidarpoolError
@@ -107,7 +112,7 @@ class Gnss:
     """
 
     rate_hz: Annotated[float, Field(ge=0.0001, le=1000, description="positions a second")] = 10.0
-    mount: Annotated[Pose, Field(description="pose of its antenna in the carrier's axes")] = CENTRE
+    mount: Pose = CENTRE
     horizontal_m: Annotated[
         float,
         Field(ge=0, le=1e6, description="standard deviation of white noise to the east and north"),
@@ -163,8 +168,8 @@ class Navigation:
         If a number is outside its range.
     """
 
-    imu: Annotated[Imu | None, Field(description="inertial measurement unit: imu.csv")] = None
-    gnss: Annotated[Gnss | None, Field(description="GNSS receiver: gnss.csv")] = None
+    imu: Imu | None = None
+    gnss: Gnss | None = None
     gravity_m_s2: Annotated[
         float, Field(ge=-100, le=100, description="gravity, downwards along the world's z axis")
     ] = 9.80665
