@@ -27,6 +27,8 @@ from lidarpool import (
 from lidarpool.export.formats import Format
 from lidarpool.export.navigation import GNSS_FILE, IMU_FILE, Instruments, write_instruments
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.run.campaign import described_job
+from lidarpool.scenario.campaign import CampaignJob, Described
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
 from lidarpool.sensor.trajectory import Stations, matrices
@@ -352,6 +354,10 @@ def test_scenarios(tmp_path):
 def test_what_does_not_fit():
     with pytest.raises(LidarpoolError, match="jumps between 2 poses"):
         Survey(Sensor.grid(), poses=[(0, 0, 1), (1, 0, 1)], navigation=Navigation(imu=Imu()))
+    survey = Survey(poses=[(0, 0, 1)], navigation=Navigation(imu=Imu()))
+    described = Described(0, "00", {}, made=CampaignJob(Scene.seed(), survey))
+    with pytest.raises(LidarpoolError, match="single surveys"):
+        described_job(described, ())
     with pytest.raises(LidarpoolError, match="rate_hz is 0"):
         Imu(rate_hz=0)
     with pytest.raises(LidarpoolError, match="origin is"):

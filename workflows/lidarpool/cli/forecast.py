@@ -27,7 +27,7 @@ from ..export.formats import Format
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..pipeline.policies import most_scans
-from ..report.output import ROOM_BYTES, refuse_to_replace
+from ..report.output import ROOM_BYTES, further_files, refuse_to_replace
 from ..run.checks import check_memory, find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
@@ -88,7 +88,7 @@ def forecast(
     with mistakes.noted():
         notes += _look_at_folder(out)
     try:
-        refuse_to_replace(out, lambda: identity_of(job), formats)
+        refuse_to_replace(out, lambda: identity_of(job), further_files(job.survey, formats))
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
     for one in formats:

@@ -29,6 +29,7 @@ from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
 from . import reading
 from .boxes import Boxes
+from .images import Image
 from .navigation import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import Placed, Sweeps, plain_names
 
@@ -56,6 +57,7 @@ _LAYOUTS = {
         "itemsize": 48,
     }),
 }  # fmt: skip
+_LAYOUTS["images"] = _LAYOUTS["velodyne"]
 # Fields behind those of a layout: {name: type, columns that it needs}.
 _EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY})}
 
@@ -150,6 +152,12 @@ def _messages(
             rows.nbytes, rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
+        if layout == "images":
+            ranges = Image.of(sweeps, sweep, points).filled(points["range"])
+            ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
+            for plane, image in enumerate(ranges, 1):
+                name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
+                yield name, make.image(image[::-1], frame, time_ns), time_ns
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
@@ -275,7 +283,7 @@ def _rows(
     there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
     light = np.clip(there["intensity"], 0, 1)
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
-    if layout == "velodyne":
+    if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
     elif layout == "autoware":
         values |= {
@@ -393,6 +401,14 @@ class _Messages:
             else:
                 message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
                 yield "/gnss/position", message, time_ns
+
+    def image(self, values: NDArray[np.float32], frame: str, time_ns: int) -> Any:
+        """Image of numbers (height, width)."""
+        height, width = values.shape
+        data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
+        header = self.header(frame, time_ns)
+        image = self._types["sensor_msgs/msg/Image"]
+        return image(header, height, width, "32FC1", 0, 4 * width, data)
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""
