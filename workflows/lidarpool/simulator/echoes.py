@@ -16,6 +16,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.disc import disc
 from ..sensor.optics import Mode, spread
+from .air import AirCaster
 from .doppler import radial_velocities
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products
@@ -55,6 +56,7 @@ class EchoCaster:
         self._sensor = survey.carried[number].sensor
         self._returns, self._noise = survey.returns_each[number], survey.noise_each[number]
         self._paths = Paths(caster, scene, survey, self._sensor, surfaces)
+        self._air = AirCaster(number, survey, surfaces) if survey.returns_light else None
         # Whether each ray that hits something has one return.
         several = self._returns.subrays > 1 or self._noise.loses
         self._one_each = surfaces.materials.plain and not several
@@ -113,6 +115,8 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window)
+                if self._air is not None:
+                    hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
                 hits = self._paths.with_velocities(hits, beams, here, window)
                 returns = separated(hits, self._gap_m, len(beam), planes)
                 returns = returns._replace(ray=start + returns.ray)
