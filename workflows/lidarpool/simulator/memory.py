@@ -90,9 +90,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
-            each = SUBRAY_PASSING if passing else SUBRAY
-            each += SUBRAY_MOVING * moving
-            found = each * chunk + RETURN * returns
+            subray = (SUBRAY_PASSING if passing else SUBRAY) + SUBRAY_MOVING * moving
+            found = subray * chunk + RETURN * returns
             if survey.returns_light:
                 found += AIR * chunk + AIR_HIT * in_air * chunk / subrays
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
