@@ -25,7 +25,13 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.export.formats import Format
-from lidarpool.export.navigation import GNSS_FILE, IMU_FILE, Instruments, write_instruments
+from lidarpool.export.navigation import (
+    GNSS_FILE,
+    IMU_FILE,
+    Instruments,
+    instrument_bytes,
+    write_instruments,
+)
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.campaign import described_job
 from lidarpool.scenario.campaign import CampaignJob, Described
@@ -278,6 +284,8 @@ def test_bags_have_the_instruments(tmp_path):
     rows = (tmp_path / IMU_FILE).read_text().splitlines()
     imu = [(time, message) for topic, time, message in messages if topic == "/imu/data_raw"]
     assert len(imu) == len(rows) - 1 == 52
+    written_bytes = sum((tmp_path / name).stat().st_size for name in found.instruments.files)
+    assert written_bytes < instrument_bytes(survey, 0) < 3 * written_bytes
     time, message = imu[0]
     assert (message.header.frame_id, message.orientation_covariance[0]) == ("imu_2", -1)
     assert message.angular_velocity_covariance[0] == pytest.approx(50 * 1e-6)

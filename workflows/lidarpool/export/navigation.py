@@ -30,6 +30,8 @@ _IMU = (
 _PLACE = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
+_ROW_BYTES, _MESSAGE_BYTES = 120, 500  # of a sample, at most: in its file, and in a bag
+
 Real = NDArray[np.float64]
 
 
@@ -96,6 +98,16 @@ class Instruments:
             next(file)
             for line in file:
                 yield line.rstrip("\n").split(",")
+
+
+def instrument_bytes(survey: Survey, bags: int) -> int:
+    """Disk that the files of a survey's instruments need at most, with so many bags."""
+    navigation = survey.navigation
+    if navigation is None:
+        return 0
+    rates = [one.rate_hz for one in (navigation.imu, navigation.gnss) if one is not None]
+    samples = sum(rates) * survey.duration_ns / 1e9
+    return int(samples * (_ROW_BYTES + bags * _MESSAGE_BYTES))
 
 
 def write_instruments(folder: Path, survey: Survey, origin: Real) -> None:
