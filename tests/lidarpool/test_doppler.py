@@ -310,3 +310,18 @@ def test_velocities_are_blue_and_red():
     assert np.ptp(still) < 0.02
     assert unknown.tolist() == [0.5, 0.5, 0.5]
     assert made.scale is not colours_of(values, TABLE["range"]).scale
+
+
+def test_false_alarms_have_no_velocity():
+    sensor = Sensor.grid(360, 16, 30.0, step_deg=360, max_range_m=200)
+    survey = Survey(
+        sensor, trajectory=Track([0, 1], [[0, 0, 1], [6, 0, 1]]), steps=1,
+        columns=["radial_velocity", "cause"], returns=Returns("all"),
+        noise=Noise(detection_range_m=100, false_alarm_hz=3e5, velocity_m_s=0.1),
+    )  # fmt: skip
+    returns = found_of(Rig(Scene.seed(), survey, "numpy"))
+    alarms = returns.cause == FALSE_ALARM
+    assert alarms.sum() > 100
+    assert np.isnan(returns.radial_velocity[alarms]).all()
+    rest = returns.radial_velocity[~alarms]
+    assert np.abs(rest + 6 * returns.directions[~alarms, 0]).max() < 0.5
