@@ -148,6 +148,7 @@ MORE = {
     "colours": {"columns": ("red", "blue", "time")},
     "textures": {"materials": [Material("*", "texture", scale=0.7)]},
     "gloss": {"materials": [Material("*", 0.4, roughness=0.3)]},
+    "velocities": {"columns": ("radial_velocity",), "noise": Noise(velocity_m_s=0.1)},
     "a measured material": {"materials": [Material("*", material="asphalt, dry")]},
 }
 

@@ -342,6 +342,30 @@ def test_bags_have_colours_as_rviz_and_foxglove_read_them(cloud, sweeps, layout,
     assert (before, first.width) == (0, len(wanted))
 
 
+def test_formats_hold_radial_velocities(cloud, sweeps, tmp_path):
+    decoder = pytest.importorskip("mcap_ros2.decoder").DecoderFactory()
+    velocity = np.random.default_rng(6).normal(0, 9, len(cloud)).astype(np.float32)
+    velocity[5] = np.nan  # of a false alarm
+    columns = {**cloud.columns, "radial_velocity": velocity}
+    moving = Cloud(cloud.positions, columns, sweeps=lambda: sweeps)
+    for name in ("c.mcap", "c.las", "c.parquet", "c.ply"):
+        assert "radial_velocity" not in moving.save(tmp_path / name)
+    first = of_sweep(moving, 0)["radial_velocity"]
+    with (tmp_path / "c.mcap").open("rb") as file:
+        reader = pytest.importorskip("mcap.reader").make_reader(file, decoder_factories=[decoder])
+        topics = [(channel.topic, read) for _, channel, _, read in reader.iter_decoded_messages()]
+    read = next(read for topic, read in topics if topic == "/front/points")
+    (field,) = (field for field in read.fields if field.name == "radial_velocity")
+    rows = np.frombuffer(read.data, np.uint8).reshape(-1, read.point_step)
+    found = rows[:, field.offset : field.offset + 4].copy().view("<f4")[:, 0]
+    np.testing.assert_array_equal(found, first)
+    np.testing.assert_array_equal(laspy.read(tmp_path / "c.las")["radial_velocity"], velocity)
+    Format("pcd", "velodyne").write(tmp_path / "pcd", moving, sweeps)
+    pcd = PointCloud.from_path(tmp_path / "pcd" / "000000.pcd")
+    np.testing.assert_array_equal(pcd.pc_data["radial_velocity"], first)
+    np.testing.assert_array_equal(read_cloud(tmp_path / "c.ply")["radial_velocity"], velocity)
+
+
 def test_e57_has_a_scan_with_its_pose_for_each_sweep(written, cloud):
     with pye57.E57(str(written("e57"))) as file:
         assert file.scan_count == 9  # of which none is empty

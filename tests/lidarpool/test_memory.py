@@ -66,6 +66,10 @@ SURVEYS = {
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
     "colours": Survey(MANY, **STILL, **PAINT),
     "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
+    "velocities": Survey(MANY, **WAY, columns=["radial_velocity"]),
+    "velocities of sub-rays": Survey(
+        MANY, **WAY, columns=["radial_velocity"], returns=Returns("strongest", 7, 3.0)
+    ),
     "false alarms": Survey(ALERT, **STILL, noise=Noise(**FAINT, false_alarm_hz=1e6), **EVERY),
     "stray light": Survey(ALERT, **WAY, noise=Noise(**FAINT, stray_light=1e-5), **SIGN),
     "crosstalk": Survey(sensors=BOTH, **STILL, noise=Noise(**FAINT, crosstalk=True)),

@@ -7,6 +7,7 @@ import os
 import laspy
 import numpy as np
 import pytest
+from rosbags.highlevel import AnyReader
 
 from lidarpool import Cloud, Scene, Survey, read_cloud
 from lidarpool.base.storage import Storage
@@ -75,6 +76,40 @@ def test_a_run_writes_what_its_scenario_asks_for_and_a_result_is_exported(
     (tmp_path / "s.yaml").write_text(SCENARIO.replace("laz, ", ""))
     assert lidarpool(*run, "-q").code == 0
     assert {path.name for path in out.iterdir()} == (made | {"pcd"}) - {"cloud.laz"}
+
+
+def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpool, tmp_path):
+    out, scenario = tmp_path / "out", tmp_path / "s.yaml"
+    text = SCENARIO.replace("[ply, laz, {format: mcap, layout: ouster}, kitti]", "[mcap]")
+    navigation = "navigation: {imu: {gyroscope_bias: 1.0e-3}, gnss: {horizontal_m: 0.1}}\n"
+    scenario.write_text(text + navigation)
+    run = ("run", scenario, "--out", out, "--scheduler", cluster, "--only", "cloud", "-q")
+    done = lidarpool(*run)
+    assert done.code == 0, done.err
+    measured = {"imu.csv", "gnss.csv"}
+    assert measured < {*json.loads((out / "report.json").read_text())["files"]}
+    assert len((out / "imu.csv").read_text().splitlines()) == 60  # after the header
+    assert lidarpool("export", out, "-f", "mcap", "--out", tmp_path / "again").code == 0
+    first, again = (_messages(folder / "cloud.mcap") for folder in (out, tmp_path / "again"))
+    assert first == again
+    assert first["/imu/data_raw"] == 59 and first["/gnss/position"] == 3
+    # Without them, their files go with the result that had them.
+    (tmp_path / "again" / "imu.csv").write_text("of a user")
+    scenario.write_text(text)
+    assert "another survey" in lidarpool(*run).err
+    assert lidarpool(*run, "--overwrite").code == 0
+    assert not measured & {path.name for path in out.iterdir()}
+    other = tmp_path / "again"
+    assert lidarpool(*run[:3], other, *run[4:], "--overwrite").code == 0
+    assert (other / "imu.csv").read_text() == "of a user"
+    scenario.write_text(text + navigation)
+    refused = lidarpool(*run[:3], other, *run[4:])
+    assert refused.code == 2 and "another survey" in refused.err
+
+
+def _messages(path):
+    with AnyReader([path]) as bag:
+        return {topic: found.msgcount for topic, found in bag.topics.items()}
 
 
 def test_what_is_no_result_or_has_been_cut_is_one_line(lidarpool, tmp_path):

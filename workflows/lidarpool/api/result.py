@@ -71,13 +71,14 @@ class Result(RunResult):
         """
         from ..export.folder import output_place, result_folder
         from ..export.formats import Format
-        from ..report.output import refuse_to_replace, write_result
+        from ..report.output import further_files, refuse_to_replace, write_result
 
         place = output_place(folder)
         wanted = [Format.of(entry) for entry in formats if entry != "ply"]
         with result_folder(place) as local:
             if not overwrite:
-                refuse_to_replace(place, lambda: self.identity, wanted)
+                further = further_files(self.survey, wanted)
+                refuse_to_replace(place, lambda: self.identity, further)
             write_result(local, place, self, only_cloud=only_cloud, formats=wanted)
 
     @checked

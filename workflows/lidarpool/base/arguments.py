@@ -45,9 +45,12 @@ _KINDS: dict[Any, tuple[tuple[type, ...], str]] = {
 # {class: an example}
 _EXAMPLES = {
     "Beams": "Beams.even(32, 40)",
+    "Gnss": "Gnss(horizontal_m=0.02)",
+    "Imu": "Imu(gyroscope_noise_density=1e-4)",
     "Material": "Material('Window*', reflectance=0.1)",
     "Mesh": "Mesh('hall', vertices, faces)",
     "Mounted": "Mounted(sensor, Pose((1, 0, 2)), 'roof')",
+    "Navigation": "Navigation(imu=Imu(), gnss=Gnss())",
     "Noise": "Noise(range_m=0.01)",
     "Planning": "Planning((0, 0), (10, 0), centres=[(5, 0)], radii=2)",
     "Pose": "Pose((0, 0, 1), yaw_deg=90)",

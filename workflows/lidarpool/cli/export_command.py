@@ -53,6 +53,7 @@ def export(
     from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
+    from ..export.navigation import FILES as INSTRUMENT_FILES
     from ..export.sweeps import SWEEPS_FILE, Sweeps
 
     # The report of a result is moved into place last.
@@ -60,7 +61,7 @@ def export(
     place = result if out is None else out
     if isinstance(result, Path) and result.is_file():
         raise LidarpoolError(f"{result} is a file: give its folder, {result.parent}.")
-    with local_result(result, needed) as made:
+    with local_result(result, (*needed, *INSTRUMENT_FILES)) as made:
         for name in needed:
             if not (made / name).exists():
                 raise LidarpoolError(

@@ -24,10 +24,11 @@ from ..base.errors import LidarpoolError, Mistakes
 from ..base.storage import Storage
 from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
+from ..export.navigation import instrument_bytes
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..pipeline.policies import most_scans
-from ..report.output import ROOM_BYTES, refuse_to_replace
+from ..report.output import ROOM_BYTES, further_files, refuse_to_replace
 from ..run.checks import check_memory, find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
@@ -88,7 +89,7 @@ def forecast(
     with mistakes.noted():
         notes += _look_at_folder(out)
     try:
-        refuse_to_replace(out, lambda: identity_of(job), formats)
+        refuse_to_replace(out, lambda: identity_of(job), further_files(job.survey, formats))
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
     for one in formats:
@@ -180,6 +181,7 @@ def _disk(job: Job, points: int, batch: int, exports: int, out: Path | Storage) 
     # A row of the PLY has doubles for coordinates at most; one piece exists twice.
     cloud = (point + 16) * (points + min(points, CHUNK_POINTS))
     result = cloud + (point + FORMAT_BYTES) * points * exports + ROOM_BYTES + 36 * faces
+    result += instrument_bytes(survey, exports)
     # What goes into storage is made in a folder for temporary files, but for the parts.
     folder = Path(tempfile.gettempdir()) if isinstance(out, Storage) else out
     free = shutil.disk_usage(_existing(folder)).free

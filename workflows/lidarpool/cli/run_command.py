@@ -22,7 +22,7 @@ from ..export.folder import local_result, result_folder
 from ..export.formats import Format
 from ..pipeline import LIDAR, OTHER
 from ..pipeline.database import FILE
-from ..report.output import CLOUD, refuse_to_replace, write_result
+from ..report.output import CLOUD, further_files, refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import slots_needed
 from ..run.cluster_file import ClusterFile
@@ -140,7 +140,8 @@ def _run(
     with result_folder(out) as folder:
         goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
         if not (options.overwrite or goes_on):
-            refuse_to_replace(out, lambda: identity_of(job), formats)
+            further = further_files(job.survey, formats)
+            refuse_to_replace(out, lambda: identity_of(job), further)
         store = _store(job, options, goes_on)
         with conducted(
             store,

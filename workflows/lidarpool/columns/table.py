@@ -21,6 +21,7 @@ Kind = Literal["number", "label"]  # a colour scale, or one colour for each valu
 
 NO_SURFACE = "no surface"  # instead of an object's name
 CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming")  # of a return
+VELOCITY = "radial_velocity"
 COORDINATES = ("world", "sensor")  # coordinate systems of points
 _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 
@@ -150,6 +151,13 @@ OPTIONAL = (
         "",
         "intensity without the loss by distance and air: reflectance times cosine of incidence",
         "reflectivity",
+    ),
+    Column(
+        VELOCITY,
+        "float32",
+        "m/s",
+        "how fast the range grows: negative while it shrinks; NaN of false alarms",
+        "radial_velocity",
     ),
     Column(
         "return_number",

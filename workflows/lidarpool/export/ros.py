@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 from collections.abc import Iterator
 from functools import cache
+from heapq import merge
 from pathlib import Path
 from typing import Any
 
@@ -24,14 +25,16 @@ from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.table import COLOURS
+from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
 from . import reading
 from .boxes import Boxes
 from .images import Image
+from .navigation import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import Placed, Sweeps, plain_names
 
 WORLD, CARRIER = "map", "base_link"  # frames
+_INSTRUMENTS = "imu", "gnss"
 # Of a survey without a date: at time 0, tf2 would take the newest frames for all times.
 START_NS = 1_000_000_000_000_000_000
 # As `ros2 bag play` must offer it, so that late listeners get the frames, too.
@@ -55,6 +58,8 @@ _LAYOUTS = {
     }),
 }  # fmt: skip
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
+# Fields behind those of a layout: {name: type, columns that it needs}.
+_EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY})}
 
 
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
@@ -82,11 +87,16 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     on the carrier. The survey begins at its start, or at `START_NS` without one. `/actors` has
     a MarkerArray of the boxes of actors where their points of the sweep are.
 
+    Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
+    orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
+    PointStamped in `map`.
+
     Layouts of a point: `velodyne` (22 bytes; its time in seconds since the sweep began),
     `autoware` (PointXYZIRCAEDT, 32 bytes; angles in radians, time_stamp in ns since the sweep
     began) and `ouster` (48 bytes; range in mm, t in ns since the sweep began). Whole numbers of
     intensity and reflectivity are 255 and 65,535 at 1 and above. Where the cloud has red, green and
-    blue, a field `rgb` follows, which makes points of `velodyne` and `autoware` 4 bytes longer.
+    blue, a field `rgb` follows, and where it has radial velocities, `radial_velocity`; each makes
+    points of `velodyne` and `autoware` 4 bytes longer.
     """
     folder = path.with_name(f"{path.name}.bag")
     try:
@@ -101,8 +111,8 @@ def _messages(
     cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any
 ) -> Iterator[tuple[str, Any, int]]:
     """Topics, messages and times in nanoseconds, sweep by sweep."""
-    coloured = {*COLOURS} <= {column.name for column in cloud.table}
-    row, field = _row(layout, coloured), types["sensor_msgs/msg/PointField"]
+    row = _row(layout, _extra({column.name for column in cloud.table}))
+    field = types["sensor_msgs/msg/PointField"]
     fields = [
         field(name, offset, _KINDS[kind.str[1:]], 1)
         for name, (kind, offset, *_) in (row.fields or {}).items()
@@ -112,13 +122,19 @@ def _messages(
     actors = frames[len(sweeps.sensors) :]
     moving = [(CARRIER, sweeps.carrier), *zip(actors, sweeps.actor_poses, strict=True)]
     start_ns = _start_ns(sweeps)
+    measured = make.measured(sweeps, start_ns)
+    waiting = next(measured, None)
     on_carrier = [
         (CARRIER, frame, sweeps.mounts, number)
         for number, frame in enumerate(frames[: len(sweeps.sensors)])
     ]
+    on_carrier += _instruments(sweeps)
     yield "/tf_static", make.transforms(on_carrier, start_ns), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
         time_ns = start_ns + round(sweeps.begins_ns[sweep])
+        while waiting is not None and waiting[2] <= time_ns:
+            yield waiting
+            waiting = next(measured, None)
         frame = frames[sweeps.sensor[sweep]]
         topic = _topic(sweeps, frames, sweep)
         rows = _rows(layout, row, points, sweeps, sweep)
@@ -145,6 +161,22 @@ def _messages(
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
+    while waiting is not None:
+        yield waiting
+        waiting = next(measured, None)
+
+
+def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
+    """Frames of the instruments on the carrier."""
+    there = sweeps.instruments
+    if there is None or there.folder is None:
+        return []
+    found = zip(_instrument_frames(sweeps), (there.imu, there.gnss), strict=True)
+    return [
+        (CARRIER, frame, Placed(np.array([one.position]), np.array([one.quaternion])), 0)
+        for frame, one in found
+        if one is not None
+    ]
 
 
 class Reader(reading.Reader):
@@ -180,8 +212,9 @@ class Reader(reading.Reader):
             raise ValueError(f"it has no message on {topic} at {time_ns} ns")
         connection, _, data = found
         message: Any = _types().deserialize_cdr(data, connection.msgtype)
-        coloured = any(field.name == "rgb" for field in message.fields)
-        rows = message.data.view(_row(self.layout, coloured))
+        held = {field.name for field in message.fields}
+        extra = [name for name in _EXTRA if name in held]
+        rows = message.data.view(_row(self.layout, extra))
         light = rows["intensity"].astype(np.float32)
         columns = {
             "intensity": light / 255 if self.layout == "autoware" else light,
@@ -223,7 +256,12 @@ def _types() -> Typestore:
 def _frames(sweeps: Sweeps) -> list[str]:
     """Frames of the sensors, then of the actors."""
     named = (*(name or "lidar" for name in sweeps.sensors), *sweeps.actors)
-    return plain_names((WORLD, CARRIER, *named))[2:]
+    return plain_names((WORLD, CARRIER, *named, *_INSTRUMENTS))[2 : -len(_INSTRUMENTS)]
+
+
+def _instrument_frames(sweeps: Sweeps) -> list[str]:
+    """Frames of the IMU and the GNSS receiver."""
+    return plain_names((WORLD, CARRIER, *_frames(sweeps), *_INSTRUMENTS))[-len(_INSTRUMENTS) :]
 
 
 def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
@@ -236,16 +274,23 @@ def _start_ns(sweeps: Sweeps) -> int:
     return START_NS if sweeps.start_ns is None else sweeps.start_ns
 
 
-def _row(layout: str, coloured: bool) -> np.dtype[np.void]:
-    """Type of a point in a layout, with or without colours."""
+def _extra(columns: set[str]) -> list[str]:
+    """Names of fields that points have behind those of their layout."""
+    return [name for name, (_, needs) in _EXTRA.items() if needs <= columns]
+
+
+def _row(layout: str, extra: list[str]) -> np.dtype[np.void]:
+    """Type of a point in a layout, with fields behind it."""
     row = _LAYOUTS[layout]
-    if not coloured:
+    if not extra:
         return row
     kinds = {name: (kind, offset) for name, (kind, offset, *_) in (row.fields or {}).items()}
     end = max(offset + kind.itemsize for kind, offset in kinds.values())
-    kinds["rgb"] = np.dtype("<f4"), end
+    for name in extra:
+        kinds[name] = kind, _ = np.dtype(_EXTRA[name][0]), end
+        end += kind.itemsize
     formats, offsets = map(list, zip(*kinds.values(), strict=True))
-    size = max(row.itemsize, end + 4)
+    size = max(row.itemsize, end)
     return np.dtype({"names": [*kinds], "formats": formats, "offsets": offsets, "itemsize": size})
 
 
@@ -278,6 +323,8 @@ def _rows(
         }
     if "rgb" in (row.names or ()):
         values["rgb"] = as_float(*(there[name] for name in COLOURS))
+    if VELOCITY in (row.names or ()):
+        values[VELOCITY] = there[VELOCITY]
     rows = np.zeros(len(points), row)
     for name, column in values.items():
         rows[name] = column
@@ -313,6 +360,65 @@ class _Messages:
             )
             for parent, name, placed, which in frames
         ])  # fmt: skip
+
+    def measured(self, sweeps: Sweeps, start_ns: int) -> Iterator[tuple[str, Any, int]]:
+        """Topics, messages and times of what instruments measured, in the order of time."""
+        there = sweeps.instruments
+        if there is None:
+            return iter(())
+        imu, gnss = _instrument_frames(sweeps)
+        return merge(
+            self._imu(there, imu, start_ns),
+            self._gnss(there, gnss, start_ns),
+            key=lambda one: one[2],
+        )
+
+    def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[tuple[str, Any, int]]:
+        vector, turn, imu = (
+            self._types[f"{kind}"]
+            for kind in (
+                "geometry_msgs/msg/Vector3", "geometry_msgs/msg/Quaternion", "sensor_msgs/msg/Imu"
+            )
+        )  # fmt: skip
+        unknown = np.zeros(9)
+        unknown[0] = -1  # there is no orientation
+        rate, force = (
+            np.zeros((2, 9))
+            if there.imu is None
+            else [np.eye(3).ravel() * variance for variance in there.imu.variances]
+        )
+        for time, *numbers in there.rows(IMU_FILE):
+            time_ns, values = start_ns + int(time), [*map(float, numbers)]
+            message = imu(
+                self.header(frame, time_ns), turn(0.0, 0.0, 0.0, 1.0), unknown,
+                vector(*values[:3]), rate, vector(*values[3:]), force,
+            )  # fmt: skip
+            yield "/imu/data_raw", message, time_ns
+
+    def _gnss(
+        self, there: Instruments, frame: str, start_ns: int
+    ) -> Iterator[tuple[str, Any, int]]:
+        point, stamped, fix, status = (
+            self._types[kind]
+            for kind in (
+                "geometry_msgs/msg/Point", "geometry_msgs/msg/PointStamped",
+                "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/NavSatStatus",
+            )
+        )  # fmt: skip
+        variances = np.zeros(3) if there.gnss is None else np.array(there.gnss.variances)
+        known = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
+        for time, x, y, z, *place in there.rows(GNSS_FILE):
+            time_ns = start_ns + int(time)
+            if place:
+                message = fix(
+                    self.header(frame, time_ns),
+                    status(status.STATUS_FIX, status.SERVICE_GPS),
+                    *map(float, place), np.diag(variances).ravel(), known,
+                )  # fmt: skip
+                yield "/gnss/fix", message, time_ns
+            else:
+                message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
+                yield "/gnss/position", message, time_ns
 
     def image(self, values: NDArray[np.float32], frame: str, time_ns: int) -> Any:
         """Image of numbers (height, width)."""

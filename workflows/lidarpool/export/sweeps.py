@@ -23,6 +23,7 @@ from ..sensor import Sensor, Survey
 from ..sensor.described import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
+from .navigation import Instruments
 
 Floats = NDArray[np.float64]
 SWEEPS_FILE = "sweeps.npz"
@@ -79,6 +80,7 @@ class Sweeps:
     precision_m: float  # step to which positions were rounded
     epsg: int | None = None  # code of the coordinate system of the world
     start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
+    instruments: Instruments | None = None  # of the carrier, with files beside it
     fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
 
     def __len__(self) -> int:
@@ -166,7 +168,8 @@ class Sweeps:
             survey.precision_m,
             survey.epsg,
             None if survey.start is None else nanoseconds(survey.start),
-            fired,
+            instruments=Instruments.of(survey),
+            fired=fired,
         )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
@@ -204,6 +207,8 @@ class Sweeps:
     def packed(self) -> bytes:
         """Return it as a NumPy archive: the same sweeps give the same bytes."""
         words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
+        if self.instruments is not None:
+            words["instruments"] = self.instruments.words()
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
         placed = {"": self.pose, "mount_": self.mounts}
@@ -239,6 +244,7 @@ class Sweeps:
                 Placed(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])
                 for prefix in ("", "mount_", *(f"actor{k}_" for k in range(len(words["actors"]))))
             )
+            instruments = words.get("instruments")
             fired = None
             if "rays" in arrays:
                 rays = json.loads(arrays["rays"].tobytes())
@@ -249,6 +255,7 @@ class Sweeps:
                 pose=pose,
                 mounts=mounts,
                 actor_poses=tuple(actors),
+                instruments=instruments and Instruments.from_words(instruments, Path(path).parent),
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )

@@ -43,7 +43,13 @@ _E57 = ("intensity", *_COLOURS)
 _LAS = ("laspy", "lazrs")
 _LABELS = ("object", "intensity", "class")
 _RINGS = ("channel", "intensity")
-_BAG = (False, ("rosbags",), ("scan", "object", "channel"), ("channel", *_COLOURS), LAYOUTS)
+_BAG = (
+    False,
+    ("rosbags",),
+    ("scan", "object", "channel"),
+    ("channel", *_COLOURS, "radial_velocity"),
+    LAYOUTS,
+)
 
 FORMATS = {
     "ply": FormatRow("cloud.ply", "ply"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from ..scene.colours import packed, unpacked
 from .theme import mapped, object_colours
 
 TURBO = mapped("turbo", np.linspace(0.07, 0.95, 256))  # (256, 3); its very ends are nearly black
+DIVERGING = mapped("coolwarm", np.linspace(0, 1, 256))  # (256, 3); its middle is pale
 MOST_ENTRIES = 12  # most labels without names that have a colour each
 MOST_COLOURS = 1 << 16  # of labels
 
@@ -35,11 +36,12 @@ class Colouring:
     name: str  # of the column
     unit: str  # of the limits
     meaning: str
-    limits: tuple[float, float] | None = None  # ends of the scale of `TURBO`; None for labels
+    limits: tuple[float, float] | None = None  # ends of the scale; None for labels
     logarithmic: bool = False
     # Name and colour of existing labels, those with most points first if there are many.
     labels: tuple[tuple[str, NDArray[np.float64]], ...] = ()
     values: tuple[int, ...] = ()  # of the column, that the labels stand for
+    scale: NDArray[np.float64] = field(default_factory=lambda: TURBO)  # (256, 3)
 
 
 def with_rgb(columns: Mapping[str, Column]) -> dict[str, Column]:
@@ -60,7 +62,7 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
 
     Labels have a colour each; labels without names and with too many values for a legend are on a
     scale like numbers. Numbers that are mostly small with a few large ones, and intensities of a
-    wide range, have a logarithmic scale. NaN is grey.
+    wide range, have a logarithmic scale. Velocities are blue below 0 and red above. NaN is grey.
     """
     if column is RGB:
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
@@ -98,6 +100,10 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
         span = high - low
         unit, size = next((entry for entry in _TIMES if span >= 0.1 * entry[1]), ("ns", 1.0))
         low, middle, high = low / size, middle / size, high / size
+    scale = TURBO
+    if unit == "m/s" and values.dtype.kind == "f":
+        high = max(-low, high)
+        low, scale = -high, DIVERGING
     skewed = high > _WIDE * low and middle - low < _SKEWED * (high - low)
     logarithmic = bool(low > 0 and (skewed or (not unit and high > _MANIFOLD * low)))
     ends = np.log([low, high]) if logarithmic else (low, high)
@@ -107,9 +113,9 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
         if logarithmic:
             numbers = np.log(np.clip(numbers, low, high))
         scaled = (numbers - ends[0]) * (255 / (ends[1] - ends[0] if high > low else 1.0))
-        colours = TURBO[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
+        colours = scale[np.clip(np.where(known, scaled, 0), 0, 255).astype(np.uint8)]
         colours[~known] = _GREY
         return colours
 
     limits = float(low), float(high)
-    return Colouring(shade, column.name, unit, column.meaning, limits, logarithmic)
+    return Colouring(shade, column.name, unit, column.meaning, limits, logarithmic, scale=scale)

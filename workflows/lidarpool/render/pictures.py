@@ -124,7 +124,9 @@ def draw_cloud(
             low, high = coloured.limits
             scale = LogNorm if coloured.logarithmic else Normalize
             page.colour_bar(
-                TURBO, scale(low, high if high > low else low + 1), (coloured.name + unit).rstrip()
+                coloured.scale,
+                scale(low, high if high > low else low + 1),
+                (coloured.name + unit).rstrip(),
             )
     page.show(shot, image)
     by = "height" if column is Z else column.name.replace("_", " ")

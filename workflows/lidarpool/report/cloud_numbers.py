@@ -46,7 +46,10 @@ class CountedCloud:
             self.by_object += np.bincount(owners, minlength=len(self.by_object))
             for name, values in chunk.columns.items():
                 low, high = self.limits.get(name, (np.inf, -np.inf))
-                self.limits[name] = min(low, values.min().item()), max(high, values.max().item())
+                self.limits[name] = (
+                    min(low, np.fmin.reduce(values).item()),
+                    max(high, np.fmax.reduce(values).item()),
+                )
             cell = ((chunk.positions - self.bounds[0]) / self._side).astype(np.int64)
             x, y, z = cell.clip(0, _CELLS - 1).T
             cell = (x * _CELLS + y) * _CELLS + z  # a product of whole numbers by `@` is slow

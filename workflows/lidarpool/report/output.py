@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Collection, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import nullcontext
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -16,12 +17,15 @@ from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
 from ..export.folder import LAST_FILE, staging
 from ..export.formats import Format, remove
+from ..export.navigation import FILES as INSTRUMENT_FILES
+from ..export.navigation import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..export.table import EXPORTS, FORMATS
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
 from ..scenario.scenario import Scenario
+from ..sensor import Survey
 from .cloud_numbers import CountedCloud
 from .report import make_report
 
@@ -32,15 +36,24 @@ _OF_CLOUD = ("hits", "intensity", "cloud")  # are drawn from the cloud's file
 _IMAGES = tuple(f"{name}.png" for name in PICTURES)
 FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
-_EXPORTS = tuple(FORMATS[name].file for name in EXPORTS)
+# What only some results have.
+_FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
+
+
+def further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
+    """Name the files that a result has besides those that all have."""
+    instruments = Instruments.of(survey)
+    measured = [] if instruments is None else instruments.files
+    return [*(one.file for one in formats), *measured]
 
 
 def refuse_to_replace(
-    place: Path | Storage, identity: Callable[[], Mapping[str, str]], formats: Sequence[Format] = ()
+    place: Path | Storage, identity: Callable[[], Mapping[str, str]], further: Sequence[str] = ()
 ) -> None:
     """Refuse a folder that holds the result of another survey, or files of no result.
 
     `identity` returns that of this result, see `RunResult.identity`: large scenes take a moment.
+    `further` are its `further_files`.
 
     Raises
     ------
@@ -61,7 +74,7 @@ def refuse_to_replace(
         here = identity()
         if earlier != {name: here[name] for name in _SURVEY}:
             raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
-    names = (*FILES, *(one.file for one in formats))
+    names = (*FILES, *further)
     if foreign := [name for name in names if name in there and name not in listed]:
         raise LidarpoolError(f"{place} holds {foreign[0]}, which no result there lists: {advice}")
 
@@ -113,8 +126,9 @@ def write_result(
         nullcontext() if only_cloud else _Pictures(result, staged) as pictures,
     ):
         drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
-        exports = [one.file for one in formats]
-        files = [CLOUD, *exports, *drawn, SWEEPS_FILE, *page, REPORT]
+        instruments = sweeps.instruments
+        further = further_files(result.survey, formats)
+        files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
 
         @cache
         def clear(storage: Storage) -> None:
@@ -123,6 +137,9 @@ def write_result(
                 storage.discard(name)
 
         sweeps.save(staged / SWEEPS_FILE)
+        if instruments is not None:
+            write_instruments(staged, result.survey, result.scene.origin)
+            sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
         Format("ply").write(staged / CLOUD, cloud, sweeps)
         for one in sorted(formats, key=lambda one: one.in_pieces):
             if storage and workers and one.in_pieces:
@@ -142,7 +159,7 @@ def write_result(
             _move(staged, folder, files, earlier, then)
         else:
             clear(storage)
-            for name in (*_EXPORTS, *FILES):
+            for name in (*_FURTHER, *FILES):
                 if (staged / name).exists():
                     storage.put(staged / name, name)
             with deferred_interrupts():
@@ -171,7 +188,7 @@ def _move(
         # A path of an earlier run would look like this one's; folders are not replaced.
         for name in _stale(earlier, files):
             remove(folder / name)
-        for name in (*_EXPORTS, *FILES):
+        for name in (*_FURTHER, *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
         flush(folder)
@@ -184,8 +201,8 @@ def _stale(earlier: Collection[str], files: Collection[str]) -> list[str]:
     Folders and files of formats only if they are replaced, or the earlier result lists them. If a
     killed run has removed the earlier report, they stay.
     """
-    exports = [name for name in _EXPORTS if name in files or name in earlier]
-    return exports + [name for name in FILES if name not in files]
+    further = [name for name in _FURTHER if name in files or name in earlier]
+    return further + [name for name in FILES if name not in files]
 
 
 class _Pictures:

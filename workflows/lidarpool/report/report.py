@@ -125,6 +125,7 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "materials": len(survey.materials),
         "returns": asdict(survey.returns_each[0]),
         "noise": asdict(survey.noise_each[0]),
+        "navigation": None if survey.navigation is None else asdict(survey.navigation),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }
@@ -140,8 +141,8 @@ def _columns(cloud: CountedCloud) -> list[dict[str, Any]]:
             "unit": column.unit,
             "meaning": column.meaning,
             "kind": column.kind,
-            "lowest": low,
-            "highest": high,
+            "lowest": _finite(low),
+            "highest": _finite(high),
         }
         for column in cloud.table
         for low, high in [cloud.limits.get(column.name, (0, 0))]

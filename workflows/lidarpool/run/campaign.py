@@ -163,6 +163,11 @@ def described_job(
         assert described.made is not None, "either of both"
         backend = options.pop("backend", None) or "auto"
         job = Job(described.made.scene, described.made.survey, backend=backend, **options)
+    if job.survey.navigation is not None:
+        raise LidarpoolError(
+            "navigation is for single surveys, since a data set has no place for its files: leave "
+            "it out of the campaign's base."
+        )
     check_whole(columns, job.survey.keep_every)
     there = {column.name for column in job.survey.stored_columns}
     if missing := [name for name in columns if name not in there]:

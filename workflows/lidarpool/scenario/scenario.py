@@ -46,6 +46,7 @@ from .sections import (
     CopiesSection,
     MaterialSection,
     MeshFile,
+    NavigationSection,
     NoiseSection,
     OutputSection,
     PlanningSection,
@@ -117,7 +118,7 @@ class Scenario(Section):
 
     Parameters
     ----------
-    scene, sensor, materials, returns, noise, weather, cloud, output, planning, pool
+    scene, sensor, materials, returns, noise, weather, navigation, cloud, output, planning, pool
         See `lidarpool.scenario.sections`.
     poses
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
@@ -204,6 +205,13 @@ class Scenario(Section):
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
     weather: Annotated[WeatherSection, may_be_empty(WeatherSection)] = WeatherSection()
+    navigation: Annotated[
+        NavigationSection | None,
+        told(
+            "IMU and GNSS receiver of the carrier, with errors that drift",
+            {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
+        ),
+    ] = None
     cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
@@ -724,6 +732,7 @@ class Scenario(Section):
                 materials=self._materials(scene),
                 returns=Returns(**dict(self.returns)),
                 noise=Noise() if own_noise else Noise(**dict(self.noise)),
+                navigation=self.navigation and self.navigation.navigation(),
                 **dict(self.weather),
                 **cloud,
             )

@@ -26,7 +26,7 @@ from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
 from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor
+from ..sensor import Gnss, Imu, Material, Mounted, Navigation, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
 from ..sensor.models import datasheet, load_sensor
@@ -509,6 +509,63 @@ class NoiseSection(Section, Noise):
 
 class WeatherSection(Section, Weather):
     """Extinction of the air, and returns from it."""
+
+
+class InstrumentPose(PoseSection):
+    """Position and angles of an instrument in the carrier's axes."""
+
+    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
+
+
+class ImuSection(Section, Imu):
+    """Inertial measurement unit of the carrier; its noise is named as in kalibr's imu.yaml."""
+
+    mount: Annotated[InstrumentPose, told("its pose in the carrier's axes")] = InstrumentPose()
+
+    def imu(self) -> Imu:
+        """Return it as an IMU."""
+        return Imu(**declared(self, Imu) | {"mount": self.mount.pose()})
+
+
+class GnssSection(Section, Gnss):
+    """GNSS receiver of the carrier."""
+
+    mount: Annotated[InstrumentPose, told("pose of its antenna in the carrier's axes")] = (
+        InstrumentPose()
+    )
+
+    def gnss(self) -> Gnss:
+        """Return it as a receiver."""
+        return Gnss(**declared(self, Gnss) | {"mount": self.mount.pose()})
+
+
+class NavigationSection(Section, Navigation):
+    """IMU and GNSS receiver of the carrier, with errors that drift: imu.csv and gnss.csv."""
+
+    imu: Annotated[
+        ImuSection | None,
+        told(
+            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
+            "/imu/data_raw",
+            {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
+        ),
+    ] = None
+    gnss: Annotated[
+        GnssSection | None,
+        told(
+            "GNSS receiver: positions in gnss.csv, /gnss/fix",
+            {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
+        ),
+    ] = None
+
+    def navigation(self) -> Navigation:
+        """Return them as instruments."""
+        return Navigation(
+            imu=self.imu and self.imu.imu(),
+            gnss=self.gnss and self.gnss.gnss(),
+            gravity_m_s2=self.gravity_m_s2,
+            seed=self.seed,
+        )
 
 
 class Obstacle(Section):

@@ -17,7 +17,7 @@ from ..base.arguments import as_array, checked
 from ..base.errors import LidarpoolError
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.trajectory import CENTRE, presence_ns
+from ..sensor.trajectory import CENTRE, presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import Actor, one_mesh
 from .mesh import Mesh
@@ -362,12 +362,40 @@ class LinkPath:
         LidarpoolError
             If the trajectory or the joints have no values for a time.
         """
+        place, turn, *_ = self._along(station, times_ns, moving=False)
+        return place.T, turn.transpose(2, 0, 1)
+
+    def velocities(self, station: int, times_ns: Float) -> tuple[Float, Float]:
+        """See `lidarpool.sensor.trajectory.velocities`: exact, through all joints.
+
+        At a given value of a joint they are those behind it.
+
+        Raises
+        ------
+        LidarpoolError
+            If the trajectory or the joints have no values for a time.
+        """
+        _, _, velocity, rate = self._along(station, times_ns, moving=True)
+        return velocity.T, rate.T
+
+    def _along(
+        self, station: int, times_ns: Float, moving: bool
+    ) -> tuple[Float, Float, Float, Float]:
+        """Return positions (3, k), rotations (3, 3, k), velocities and rates (3, k).
+
+        The last two are zero unless they are asked for.
+        """
+        appears, leaves = self.presence_ns
+        within = (appears <= times_ns) & (times_ns <= leaves)
         times_ns = np.clip(times_ns, *self.presence_ns)  # elsewhere poses do not count
         positions, rotations = self.base.poses(station, times_ns)
         place, count = positions.T, len(times_ns)
         turn = np.broadcast_to(np.eye(3)[..., None], (3, 3, count))
         if rotations is not None:
             turn = rotations.transpose(1, 2, 0)
+        velocity = rate = np.zeros((3, count))
+        if moving:
+            velocity, rate = (part.T for part in velocities(self.base, station, times_ns))
         at = times_ns / 1e9 + self.start_s
         low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
         first, last = self.times_s[[0, -1]]
@@ -376,18 +404,37 @@ class LinkPath:
                 f"The joints have values from {first:.9g} to {last:.9g} s; poses are asked for "
                 f"from {low:.9g} to {high:.9g} s."
             )
+        start = place
         for hinge in self.hinges:
             place, turn = _then(place, turn, hinge.before)
             value = np.interp(at, self.times_s, hinge.values)
+            if moving:
+                start, velocity = place, velocity + _cross(rate, place - start)
+                along = _times(turn, hinge.axis[:, None, None] * self._slopes(hinge, at))[:, 0]
             if hinge.slides:
                 place = place + _times(turn, hinge.axis[:, None, None] * value)[:, 0]
+                if moving:
+                    velocity = velocity + along
             else:  # Rodrigues, 1840
                 cross = np.cross(np.eye(3), hinge.axis)
                 square = cross @ cross
                 spin = np.sin(value) * cross[..., None] + (1 - np.cos(value)) * square[..., None]
                 turn = _times(turn, spin + np.eye(3)[..., None])
+                if moving:
+                    rate = rate + along
         place, turn = _then(place, turn, self.last)
-        return place.T, turn.transpose(2, 0, 1)
+        if moving:
+            velocity = (velocity + _cross(rate, place - start)) * within
+        return place, turn, velocity, rate * within
+
+    def _slopes(self, hinge: Hinge, at: Float) -> Float:
+        """Rates of a joint's value at times (k,), a second."""
+        if len(self.times_s) < 2:
+            return np.zeros(len(at))
+        slopes = np.diff(hinge.values) / np.diff(self.times_s)
+        segment = np.searchsorted(self.times_s, at, "right") - 1
+        inside = (self.times_s[0] <= at) & (at <= self.times_s[-1])
+        return np.asarray(slopes[np.clip(segment, 0, len(slopes) - 1)] * inside)
 
 
 def _times(one: Float, other: Float) -> Float:
@@ -395,6 +442,11 @@ def _times(one: Float, other: Float) -> Float:
     return np.asarray(
         (one[:, 0, None] * other[0] + one[:, 1, None] * other[1]) + one[:, 2, None] * other[2]
     )
+
+
+def _cross(one: Float, other: Float) -> Float:
+    """Cross products of vectors (3, k)."""
+    return np.cross(one, other, axis=0)
 
 
 def _then(place: Float, turn: Float, matrix: Float) -> tuple[Float, Float]:

@@ -2,6 +2,7 @@
 
 from .beams import Beams, Head, Mirror, Spin
 from .materials import Material
+from .navigation import Gnss, Imu, Navigation
 from .noise import Noise
 from .optics import Optics, Returns
 from .rays import ListedSensor, Prism, PrismSensor
@@ -12,12 +13,15 @@ from .trajectory_files import load_trajectory
 
 __all__ = [
     "Beams",
+    "Gnss",
     "Head",
+    "Imu",
     "LineSensor",
     "ListedSensor",
     "Material",
     "Mirror",
     "Mounted",
+    "Navigation",
     "Noise",
     "Optics",
     "Pose",

@@ -26,6 +26,7 @@ TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 _RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
+_VELOCITY = 40
 _ALARM, _PEAK, _STRAY, _OTHER = range(20, 24)
 
 _GAMMA = 0x9E3779B97F4A7C15
@@ -138,6 +139,9 @@ class Noise:
     crosstalk: Annotated[
         bool, Field(description="whether it receives pulses of the other sensors of the survey")
     ] = False
+    velocity_m_s: Annotated[
+        float, Field(ge=0, le=1000, description="standard deviation of radial velocities, m/s")
+    ] = 0.0
 
     def __post_init__(self) -> None:
         needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
@@ -185,6 +189,10 @@ class Noise:
         if self.walk_m and energy is not None:
             distance = distance - self.walk(energy)
         return np.maximum(distance + sigma * normal(self.seed, _RANGE, scan, ray, number), 0)
+
+    def velocities(self, velocity: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
+        """Return the reported radial velocities of returns (n,), m/s."""
+        return velocity + self.velocity_m_s * normal(self.seed, _VELOCITY, scan, ray, number)
 
     def walk(self, energy: Real) -> Real:
         """By how much returns (n,) appear nearer than one at the threshold, metres.

@@ -18,6 +18,7 @@ from ..base.declared import FILLED_IN, written_as
 from ..base.errors import LidarpoolError
 from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored
 from .materials import Material
+from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
 from .optics import Precision, Returns
 from .sensor import Sensor
@@ -190,6 +191,8 @@ class Survey(CloudOptions, Weather):
         Sub-rays of a beam, and which returns of a pulse are reported.
     noise
         Noise of ranges and angles, and lost returns.
+    navigation
+        IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
     **options
         The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
@@ -214,6 +217,7 @@ class Survey(CloudOptions, Weather):
     materials: Sequence[Material] = ()
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
+    navigation: Navigation | None = None
 
     def __post_init__(self) -> None:
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
@@ -255,6 +259,8 @@ class Survey(CloudOptions, Weather):
             )
 
     def _check_values(self) -> None:
+        if self.navigation is not None:
+            check_navigation(self.navigation, self.path, self.epsg)
         if self.start is not None and (self.start.tzinfo is None or self.start < START_FROM):
             raise LidarpoolError(
                 f"start is {self.start}; it must be a time from 2017 on, with its time zone: "

@@ -19,6 +19,8 @@ QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # firing are fired a little after its pose.
 CLOCK_S, _FIRING_S = 1e-6, 1e-3
 
+_STEP_NS = 5e5  # half of what difference quotients are taken over
+
 ALWAYS = (-np.inf, np.inf)
 
 Beyond = Literal["refuse", "hold", "absent"]
@@ -143,6 +145,37 @@ def presence_ns(path: Trajectory) -> tuple[float, float]:
     """
     first, last = getattr(path, "presence_ns", ALWAYS)
     return float(first), float(last)
+
+
+def velocities(
+    path: Trajectory, station: int, times_ns: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return velocities and angular velocities on a trajectory, derivatives of its poses.
+
+    Those of its own method `velocities` with the same arguments and values, which the classes of
+    this package have. For another class they are difference quotients over 1 ms.
+
+    Returns
+    -------
+    velocities
+        (k, 3): of the origin of its axes, m/s, in the scene's axes.
+    rates
+        (k, 3): angular velocities, rad/s, in the scene's axes.
+    """
+    if not path.moves:
+        return np.zeros((len(times_ns), 3)), np.zeros((len(times_ns), 3))
+    own = getattr(path, "velocities", None)
+    if own is not None:
+        linear, angular = own(station, times_ns)
+        return linear, angular
+    early, late = (np.clip(times_ns + h, 0, path.duration_ns) for h in (-_STEP_NS, _STEP_NS))
+    seconds = np.maximum(late - early, 1)[:, None] / 1e9
+    (one, before), (other, after) = (path.poses(station, at) for at in (early, late))
+    if before is None or after is None:
+        return (other - one) / seconds, np.zeros((len(times_ns), 3))
+    turn = np.einsum("nij,nkj->nik", after, before)
+    sines = np.stack([turn[:, k, j] - turn[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
+    return (other - one) / seconds, sines / (2 * seconds)
 
 
 @dataclass(frozen=True)
@@ -296,19 +329,7 @@ class Track:
         LidarpoolError
             If a time is not within the trajectory.
         """
-        assert self.start_s is not None  # set above
-        times, at = self.times_s, times_ns / 1e9 + self.start_s
-        low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
-        gap = max(times[0] - low, high - times[-1])
-        if self.beyond != "refuse":
-            at = at.clip(times[0], times[-1])
-        elif gap > _FIRING_S:
-            raise LidarpoolError(
-                f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
-                f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
-            )
-        segment = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
-        since = at - times.take(segment)
+        segment, since, _ = self._at(times_ns)
         if len(segment) and segment.max() == segment.min():
             segment = segment[:1]  # all are in one
         way, turn, rates = self._segments
@@ -321,6 +342,51 @@ class Track:
         for factor, table in ((np.sin(angle), turn[1]), (np.cos(angle), turn[2])):
             rotations = rotations + factor * table.take(segment, axis=1)
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
+
+    def velocities(
+        self, station: int, times_ns: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """See `velocities`: exact derivatives of its curves, at a given pose those behind it.
+
+        Raises
+        ------
+        LidarpoolError
+            If a time is not within the trajectory.
+        """
+        segment, since, within = self._at(times_ns)
+        way, _, _ = self._segments
+        linear = np.zeros((3, len(segment)))
+        for power in range(len(way) - 1, 0, -1):  # by Horner
+            linear = linear * since + power * way[power].take(segment, axis=1)
+        return (linear * within).T, (self._rates.take(segment, axis=1) * within).T
+
+    def _at(
+        self, times_ns: NDArray[np.float64]
+    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
+        """Return segments of times (k,), seconds since these began, and whether it moves then."""
+        assert self.start_s is not None  # set above
+        times, at = self.times_s, times_ns / 1e9 + self.start_s
+        low, high = at.min(initial=np.inf), at.max(initial=-np.inf)
+        gap = max(times[0] - low, high - times[-1])
+        within = np.ones(len(at), np.bool_)
+        if self.beyond != "refuse":
+            within = (times[0] <= at) & (at <= times[-1])
+            at = at.clip(times[0], times[-1])
+        elif gap > _FIRING_S:
+            raise LidarpoolError(
+                f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
+                f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
+            )
+        segment = np.clip(np.searchsorted(times, at, "right") - 1, 0, len(times) - 2)
+        return segment, at - times.take(segment), within
+
+    @cached_property
+    def _rates(self) -> NDArray[np.float64]:
+        """Angular velocities of segments in the scene's axes, rad/s: (3, s)."""
+        turns = self.quaternions
+        assert turns is not None  # set above
+        axis, rates = _between(turns, self.times_s)
+        return np.ascontiguousarray((matrices(turns[:-1]) @ (axis * rates)[..., None])[..., 0].T)
 
     @cached_property
     def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
@@ -343,14 +409,8 @@ class Track:
             ]
         turns = self.quaternions
         assert turns is not None  # set above
-        # From each pose to the next, in the axes of the first: conjugate(p) q.
-        (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (turns[:-1], turns[1:]))
-        axis = pw * q - qw * p - np.cross(p, q)
-        cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
-        axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
-        sine = np.linalg.norm(axis, axis=1, keepdims=True)
-        rates = 2 * np.arctan2(sine, np.abs(cosine)) / steps
-        x, y, z = (axis / np.where(sine > 0, sine, 1)).T
+        axis, rates = _between(turns, self.times_s)
+        x, y, z = axis.T
         zero = np.zeros_like(x)
         about = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
         start = matrices(turns[:-1])
@@ -358,6 +418,20 @@ class Track:
         table = np.stack([start + square, start @ about, -square]).reshape(3, -1, 9)
         columns = [np.ascontiguousarray(coefficient.T) for coefficient in way]
         return columns, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0]
+
+
+def _between(
+    quaternions: NDArray[np.float64], times_s: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axes (s, 3) and rates (s, 1), rad/s, of turns from each pose to the next, in its axes."""
+    # conjugate(p) q
+    (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (quaternions[:-1], quaternions[1:]))
+    axis = pw * q - qw * p - np.cross(p, q)
+    cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
+    axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
+    sine = np.linalg.norm(axis, axis=1, keepdims=True)
+    rates = 2 * np.arctan2(sine, np.abs(cosine)) / np.diff(times_s)[:, None]
+    return axis / np.where(sine > 0, sine, 1), rates
 
 
 def matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -170,6 +170,8 @@ def _inserted(
         both(hits.energy, energy),
         None if hits.colour is None else both(hits.colour, np.full(len(ray), grey)),
         both(causes, np.full(len(ray), AIR, np.uint8)),
+        # Those of the air are filled in by `Paths.with_velocities`.
+        None if hits.velocity is None else both(hits.velocity, np.full(len(ray), np.nan)),
     )
     row = np.cumsum(old) - 1
 

@@ -17,6 +17,7 @@ from ..sensor import Survey
 from ..sensor.disc import disc
 from ..sensor.optics import Mode, spread
 from .air import AirCaster
+from .doppler import radial_velocities
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products
 from .paths import Paths
@@ -42,6 +43,8 @@ class Echoes(ScanReturns):
     # (k,): packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
     colour: NDArray[np.uint32] | None = None
     cause: NDArray[np.uint8] | None = None  # (k,): why they are there; None if all are surfaces
+    # (k,): radial velocities, m/s; None if they are those of the rays' ends, or not needed.
+    velocity: Real | None = None
 
 
 class EchoCaster:
@@ -116,6 +119,7 @@ class EchoCaster:
                 hits, planes = self._paths.hits(beams, here, window)
                 if self._air is not None:
                     hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
+                hits = self._paths.with_velocities(hits, beams, here, window)
                 returns = separated(hits, self._gap_m, len(beam), planes)
                 returns = self._detected(returns._replace(ray=start + returns.ray), keys)
                 if self._receiver.adds:
@@ -167,10 +171,14 @@ class EchoCaster:
             groups=groups,
             tally=tally,
         )
-        energy = colour = None
+        energy = colour = velocity = None
         if self._noise.angle_deg:
-            origins, directions = poses.rays(pattern, found.ray, window[0])
+            origins, directions = rays = poses.rays(pattern, found.ray, window[0])
             times = poses.times(found.ray)
+            if self._paths.moving:
+                velocity = radial_velocities(
+                    self._surfaces, poses, found.ray, rays, found.distance, found.triangle, times
+                )
             if self._surfaces.materials.textured:
                 ends = directions * found.distance[:, None]
                 ends += origins
@@ -187,6 +195,7 @@ class EchoCaster:
             returns=one,
             reported=found.distance,
             colour=colour,
+            velocity=velocity,
         )
 
     def _tally(self, triangle: NDArray[np.int32]) -> Whole:
@@ -223,6 +232,7 @@ class EchoCaster:
             reported=thinned.distance,
             colour=thinned.colour,
             cause=thinned.cause,
+            velocity=thinned.velocity,
         )
 
 

@@ -31,13 +31,15 @@ class Hits(NamedTuple):
     energy: Real
     colour: NDArray[np.uint32] | None = None  # packed, see `Surfaces.colours`
     cause: NDArray[np.uint8] | None = None  # None if all are surfaces
+    velocity: Real | None = None  # radial, m/s, if a column has it; NaN if unknown
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
         colour = None if self.colour is None else self.colour[rows]
         cause = None if self.cause is None else self.cause[rows]
+        velocity = None if self.velocity is None else self.velocity[rows]
         own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
-        return Hits(*own, colour, cause)
+        return Hits(*own, colour, cause, velocity)
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
@@ -46,18 +48,28 @@ Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
 
 
 def joined(parts: list[Hits]) -> Hits:
-    """Concatenate hits; all have colours, or none, and those without a cause are surfaces."""
-    *own, colours, causes = zip(*parts, strict=True)
+    """Concatenate hits; all have colours, or none.
+
+    If some have a cause, those without are surfaces; if some have a velocity, that of those without
+    is unknown.
+    """
+    *own, colours, causes, velocities = zip(*parts, strict=True)
     colour = None if parts[0].colour is None else np.concatenate(colours)
-    cause = None
-    if any(one is not None for one in causes):
-        cause = np.concatenate(
-            [
-                np.zeros(len(part.ray), np.uint8) if part.cause is None else part.cause
-                for part in parts
-            ]
-        )
-    return Hits(*map(np.concatenate, own))._replace(colour=colour, cause=cause)
+    return Hits(*map(np.concatenate, own))._replace(
+        colour=colour,
+        cause=_filled(parts, causes, np.uint8(SURFACE)),
+        velocity=_filled(parts, velocities, np.float64(np.nan)),
+    )
+
+
+def _filled(parts: list[Hits], columns: tuple[Any, ...], value: np.generic) -> NDArray[Any] | None:
+    """Concatenate a column that some parts lack, with a value for those; None if all lack it."""
+    if all(column is None for column in columns):
+        return None
+    lacking = (np.full(len(part.ray), value) for part in parts)
+    return np.concatenate(
+        [full if one is None else one for one, full in zip(columns, lacking, strict=True)]
+    )
 
 
 @dataclass(frozen=True)

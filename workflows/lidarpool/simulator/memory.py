@@ -7,6 +7,7 @@ from functools import partial
 
 import numpy as np
 
+from ..columns.table import VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from .device import needs_hits
@@ -28,6 +29,7 @@ RAY_TURNED = 20  # by noise of angles, likewise
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
 SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+SUBRAY_MOVING = 110  # more of each, with radial velocities
 # Of a ray that is cast at a time: false alarms and stray light, and each pulse of another sensor.
 # Each return has a cause then.
 RECEIVED, CROSSED, RETURN_CAUSED = 120, 370, 10
@@ -53,6 +55,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     passing = any(material.transparent != "none" for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)
     textured = any(material.reflectance == "texture" for material in survey.materials)
+    moving = any(column.name == VELOCITY for column in survey.stored_columns)
     bodies = bool(scene.actors or scene.instances)
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
     plain = all(
@@ -93,7 +96,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
-            found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            subray = (SUBRAY_PASSING if passing else SUBRAY) + SUBRAY_MOVING * moving
+            found = subray * chunk + RETURN * returns
             if noise.false_alarm_hz or noise.stray_light or noise.crosstalk:
                 found += RECEIVED * chunk / subrays
                 kept += RETURN_CAUSED * returns

@@ -13,17 +13,21 @@ import raybeam.poses
 from raybeam import Motion, Pattern
 
 from ..sensor import Mounted, Trajectory
+from ..sensor.trajectory import velocities
 
 Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
 class Clock:
-    """Firing times of rays, in nanoseconds since the survey's start, and actors that move then."""
+    """Firing times of rays, in nanoseconds, and what moves then.
+
+    Actors move by times since the survey's start, a carrier by those since its station's.
+    """
 
     begins: Float  # (f,): of each firing
     delays: Float  # (m,): of each ray of a firing
-    ways: tuple[Trajectory, ...]  # of the actors
+    ways: tuple[Trajectory, ...]  # of the actors, or that of the carrier
     start: int = 0  # first ray
     subrays: int = 1  # of each ray
 
@@ -44,6 +48,8 @@ class Poses:
     motion: Motion | None = None
     clock: Clock | None = None
     by_head: bool = False
+    carrier: Clock | None = None  # if it moves; for its velocities
+    station: int = 0  # of the carrier
 
     @cached_property
     def given(self) -> dict[str, Any]:
@@ -68,11 +74,13 @@ class Poses:
 
     def part(self, start: int, stop: int, subrays: int) -> Poses:
         """Poses of the sub-rays of rays `start` to `stop`; `start` is the first of a pose."""
-        each, motion, clock = self.rays_per_pose, self.motion, self.clock
-        if clock is not None:
-            clock = replace(clock, start=start, subrays=subrays)
+        each, motion = self.rays_per_pose, self.motion
+        clock, carrier = (
+            None if one is None else replace(one, start=start, subrays=subrays)
+            for one in (self.clock, self.carrier)
+        )
         if each is None:
-            return replace(self, clock=clock)
+            return replace(self, clock=clock, carrier=carrier)
         poses = slice(start // each, -(-stop // each))
         if motion is not None:
             late = np.repeat(motion.delays, subrays)
@@ -85,7 +93,21 @@ class Poses:
             rays_per_pose=each * subrays,
             motion=motion,
             clock=clock,
+            carrier=carrier,
         )
+
+    def drift(self, ray: NDArray[np.integer[Any]], origins: Float) -> Float:
+        """Velocities of the carrier at starts of rays (n, 3), m/s: (n, 3).
+
+        A beam starts from a fixed point of the carrier: what a head that turns adds is left out,
+        because a sensor knows it.
+        """
+        if self.carrier is None:
+            return np.zeros((len(ray), 3))
+        (path,), times = self.carrier.ways, self.carrier.of(ray)
+        velocity, rate = velocities(path, self.station, times)
+        places, _ = path.poses(self.station, times)
+        return carried_at(velocity, rate, origins - places)
 
     def rays(
         self, pattern: Pattern, ray: NDArray[np.integer[Any]], start: int = 0
@@ -151,6 +173,11 @@ def poses_of_firings(
     rates = _turned_by(turns[:-1], turns[1:]) / seconds
     motion = Motion(delays, velocities, rates)
     return Poses(places, rotations, sensor.channels, motion, by_head=spins is not None)
+
+
+def carried_at(velocity: Float, rate: Float, lever: Float) -> Float:
+    """Velocities of points of bodies: of their origins, their rates, and levers, (n, 3) each."""
+    return velocity + np.cross(rate, lever)
 
 
 def turned(vectors: Float, rotation: Float | None) -> Float:

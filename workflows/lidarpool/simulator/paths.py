@@ -7,10 +7,11 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..columns.table import COLOURS
+from ..columns.table import COLOURS, VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from .hits import Hits, Planes, Real, joined
+from .doppler import BLOCK_HITS, approach
+from .hits import AIR, Hits, Planes, Real, joined
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
 from .world import World
@@ -28,6 +29,8 @@ class Paths:
         self._light = light_of(survey, sensor)
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
+        # Whether hits have radial velocities.
+        self.moving = any(column.name == VELOCITY for column in survey.stored_columns)
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
         reach = np.float32(np.abs(scene.bounds).max())
         self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
@@ -53,6 +56,8 @@ class Paths:
         origins = np.broadcast_to(origins, directions.shape)
         times = poses.times(ray)
         share, before = np.ones(len(ray)), np.zeros(len(ray))
+        # How fast the path to where the light is grows, but for the motion of its end.
+        growth = approach(poses, ray, origins, directions) if self.moving else None
         # What mirrors did to the directions so far: (n, 3, 3), if there are any.
         turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3)) if materials.mirrors.any() else None
         parts: list[Hits] = []
@@ -66,7 +71,11 @@ class Paths:
                 points = origins + step[:, None] * directions
                 colour = surfaces.colours(triangle, points, times, poses.ways)
             energy = share * self.energy(triangle, np.abs(along), distance, colour)
-            parts.append(Hits(ray, distance, triangle, energy, colour))
+            velocity = None
+            if growth is not None:
+                moved = self._velocities(triangle, origins, step, directions, times, poses)
+                velocity = growth + products(moved.T, directions.T)
+            parts.append(Hits(ray, distance, triangle, energy, colour, velocity=velocity))
             seen.append(normals if turns is None else np.einsum("nji,nj->ni", turns, normals))
             rows = surfaces.objects(triangle)
             on = np.flatnonzero(materials.passes[rows] | materials.mirrors[rows])
@@ -81,6 +90,9 @@ class Paths:
                 turns = turns[on]
                 along_turns = np.einsum("ni,nij->nj", normals[on], turns)
                 turns = turns - mirrored[:, :, None] * along_turns[:, None]
+            if growth is not None:  # a mirror that moves makes the path longer, too
+                bent = (directions[on] - ahead).T
+                growth = growth[on] + products(moved[on].T, bent)
             away = self._clear_m / np.maximum(np.abs(along), 1e-3)
             light = Pattern(ahead, ends + away[:, None] * ahead)
             # Light takes no time: it travels 300 m in a microsecond.
@@ -92,6 +104,7 @@ class Paths:
             ray, share, before = ray[on][which], share[which], before[which]
             times = times[on][which]
             turns = None if turns is None else turns[which]
+            growth = None if growth is None else growth[which]
             directions = light.directions[which]
             origins = light.origins[which]  # type: ignore[index]  # it has some
         hits, normals = joined(parts), seen[0]
@@ -103,3 +116,34 @@ class Paths:
             return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
 
         return hits, planes
+
+    def with_velocities(
+        self, hits: Hits, beams: Pattern, poses: Poses, window: tuple[int, int]
+    ) -> Hits:
+        """Give hits in the air, which is at rest, their radial velocities, if hits have any."""
+        if hits.velocity is None or hits.cause is None:
+            return hits
+        rows = np.flatnonzero((hits.cause == AIR) & np.isnan(hits.velocity))
+        ray = hits.ray[rows]
+        velocity = hits.velocity.copy()
+        velocity[rows] = approach(poses, ray, *poses.rays(beams, ray, window[0]))
+        return hits._replace(velocity=velocity)
+
+    def _velocities(
+        self,
+        triangle: NDArray[np.int32],
+        origins: Real,
+        step: Real,
+        directions: Real,
+        times: Real,
+        poses: Poses,
+    ) -> Real:
+        """Velocities of where light ends, m/s: (n, 3)."""
+        out = np.empty_like(directions)
+        for begin in range(0, len(triangle), BLOCK_HITS):
+            block = slice(begin, begin + BLOCK_HITS)
+            points = origins[block] + step[block, None] * directions[block]
+            out[block] = self._surfaces.velocities(
+                triangle[block], points, times[block], poses.ways
+            )
+        return out

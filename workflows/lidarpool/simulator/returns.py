@@ -16,7 +16,9 @@ from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
+from .doppler import radial_velocities
 from .echoes import Echoes
+from .hits import FALSE_ALARM, NO_SURFACE
 from .motion import Poses, products, turned
 from .surfaces import Surfaces, light_of
 
@@ -289,6 +291,29 @@ class BatchReturns:
         """Intensity without the loss by distance and air."""
         lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
         return np.asarray(self.intensity / lost)
+
+    @cached_property
+    def radial_velocity(self) -> NDArray[np.float64]:
+        """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
+        found, velocity = self.found, self.found.velocity
+        if velocity is None:
+            times = self.time if self._poses.ways else np.zeros(len(self), np.int64)
+            velocity = radial_velocities(
+                self._surfaces,
+                self._poses,
+                found.ray.astype(np.int64),
+                self._rays,
+                found.distance,
+                found.triangle,
+                times,
+            )
+            if found.cause is not None:
+                no_light = (found.cause >= FALSE_ALARM) & (found.triangle == NO_SURFACE)
+                velocity[no_light] = np.nan
+        noise = self.survey.noise_each[self.specs[0].sensor]
+        if noise.velocity_m_s:
+            velocity = noise.velocities(velocity, self.scan, self.ray, self.return_number)
+        return velocity
 
     @property
     def return_number(self) -> NDArray[np.uint8]:

@@ -178,6 +178,11 @@ class Rig:
             pose = path.pose(specs[0].station)
             poses = Poses(np.array(pose.position), pose.rotation)
         poses = self._timed(poses, specs)
+        if path.moves:
+            firings = np.arange(first, stop, dtype=np.int64)
+            begins = carried.sensor.begins_ns(firings) + late_ns
+            carrier = Clock(begins, carried.sensor.beams.time_ns, (path,))
+            poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
             pattern, start = whole, first * channels % len(whole)
         else:

@@ -17,8 +17,8 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
 
     So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
     grazes a road illuminates all of the road between them. A return's energy is the sum over its
-    hits, its distance their mean weighted by energy, its triangle and colour those of the
-    strongest. Hits without energy are dropped.
+    hits, its distance and velocity their means weighted by energy, its triangle and colour those of
+    the strongest. Hits without energy are dropped.
 
     The hits of all sub-rays, `each` of a beam, are in the order of rays; `gap_m` is half of the
     pulse's length. Returns are in the order of beams and distances; their `ray` is the beam.
@@ -58,7 +58,11 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     first = strongest[numbers(which[strongest]) == 0]
     colour = None if hits.colour is None else hits.colour[first]
     cause = None if hits.cause is None else hits.cause[first]
-    return Hits(beam[begins], distance, hits.triangle[first], energy / each, colour, cause)
+    velocity = None
+    if hits.velocity is not None:
+        velocity = np.bincount(which, hits.energy * hits.velocity) / energy
+    own = beam[begins], distance, hits.triangle[first], energy / each
+    return Hits(*own, colour, cause, velocity)
 
 
 def _continued(

@@ -16,7 +16,8 @@ from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey, Trajectory
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
-from .motion import into_axes, products
+from ..sensor.trajectory import velocities
+from .motion import carried_at, into_axes, products
 
 _log = logging.getLogger(__name__)
 
@@ -190,6 +191,24 @@ class Surfaces:
                 places, rotations = way.poses(0, times[moving].astype(np.float64))
                 points[moving] = into_axes(points[moving] - places, rotations)
         return self._lookup.at(rows, points)
+
+    def velocities(
+        self,
+        triangle: Triangles,
+        points: Real,
+        times: Real | NDArray[np.int64],
+        ways: tuple[Trajectory, ...],
+    ) -> Real:
+        """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
+        out = np.zeros((len(triangle), 3))
+        objects = self.objects(triangle) if ways else None
+        for number, way in enumerate(ways, self._standing):
+            rows = np.flatnonzero(objects == number) if way.moves else _NONE
+            if len(rows):
+                at = times[rows].astype(np.float64)
+                places, _ = way.poses(0, at)
+                out[rows] = carried_at(*velocities(way, 0, at), points[rows] - places)
+        return out
 
     @cached_property
     def _lookup(self) -> Lookup | None:

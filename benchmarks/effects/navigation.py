@@ -1,0 +1,103 @@
+"""Allan deviations of a carrier's IMU that stands for hours, against their closed forms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+
+from lidarpool import Gnss, Imu, Navigation, Survey
+from lidarpool.render import theme
+from lidarpool.sensor.navigation import fixes, imu_samples
+
+DRAWS = "effect-navigation.png"
+HOURS = 4
+# Of an industrial MEMS unit, by order of magnitude: 0.2 degrees per root hour, 6 degrees an hour.
+IMU = Imu(
+    rate_hz=100,
+    gyroscope_noise_density=6e-5,
+    gyroscope_bias=3e-5,
+    gyroscope_bias_time_s=60,
+    gyroscope_random_walk=6e-7,
+)
+GNSS = Gnss(
+    rate_hz=1, horizontal_m=0.02, vertical_m=0.04, drift_horizontal_m=0.6, drift_vertical_m=1.0,
+    drift_time_s=600,
+)  # fmt: skip
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with instruments, which cost stage 2 nothing."""
+    return replace(survey, navigation=Navigation(imu=IMU, gnss=GNSS))
+
+
+def allan(values: np.ndarray, size: int) -> tuple[float, int]:
+    """Overlapping Allan deviation of samples (n, axes), and how many clusters are disjoint."""
+    sums = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values, axis=0)])
+    means = (sums[size:] - sums[:-size]) / size
+    steps = means[size:] - means[:-size]
+    return float(np.sqrt((steps**2).mean() / 2)), values.size // size
+
+
+def parts(tau: np.ndarray) -> dict[str, np.ndarray]:
+    """Allan deviations of the three processes (IEEE Std 952-1997, annex C)."""
+    sigma, time = IMU.gyroscope_bias, IMU.gyroscope_bias_time_s
+    bracket = 1 - time / (2 * tau) * (3 - 4 * np.exp(-tau / time) + np.exp(-2 * tau / time))
+    return {
+        r"white noise, $N/\sqrt{\tau}$": IMU.gyroscope_noise_density / np.sqrt(tau),
+        "Gauss-Markov bias": np.sqrt(2 * sigma**2 * time / tau * bracket),
+        r"random walk, $K\sqrt{\tau/3}$": IMU.gyroscope_random_walk * np.sqrt(tau / 3),
+    }
+
+
+def picture(path: Path) -> None:
+    """Draw Allan deviations, and the errors of positions over the hours."""
+    from matplotlib.figure import Figure
+
+    from lidarpool.sensor.trajectory import CENTRE, Stations
+
+    still = SimpleNamespace(
+        navigation=Navigation(imu=IMU, gnss=GNSS, seed=2),
+        path=Stations((CENTRE,)),
+        duration_ns=HOURS * 3600e9,
+    )
+    rates = np.concatenate([block.rates for block in imu_samples(still)])
+    sizes = np.unique(np.geomspace(1, len(rates) / 9, 40).astype(int))
+    tau = sizes / IMU.rate_hz
+    found, clusters = np.array([allan(rates, size) for size in sizes.tolist()]).T
+    figure = Figure(figsize=(10.4, 4.3), dpi=90, layout="constrained")
+    left, right = figure.subplots(1, 2)
+    to_hour = np.degrees(1) * 3600
+    known = parts(tau)
+    total = np.sqrt(sum(one**2 for one in known.values()))
+    for (name, one), colour in zip(known.items(), theme.OBJECT_COLOURS, strict=False):
+        left.loglog(tau, one * to_hour, "--", color=colour, lw=1, label=name)
+    left.loglog(tau, total * to_hour, color=theme.INK, lw=1.2, label="closed form, all three")
+    room = found / np.sqrt(2 * np.maximum(clusters - 3, 1)) * to_hour
+    left.errorbar(
+        tau, found * to_hour, room, fmt="o", ms=3.2, color=theme.SENSOR, lw=0.9,
+        label=f"simulated, {HOURS} h at {IMU.rate_hz:.0f} Hz, 3 axes, 1 σ",
+    )  # fmt: skip
+    left.set(
+        xlabel="averaging time τ, s", ylabel="Allan deviation of angular velocity, °/h",
+        ylim=(total.min() * to_hour / 6, None),
+    )  # fmt: skip
+    left.set_title("gyroscopes of a carrier that stands", fontsize=9)
+    where = np.concatenate([block.positions for block in fixes(still)])
+    hours = np.arange(len(where)) / GNSS.rate_hz / 3600
+    colours = {"east": "#4477aa", "north": "#44aa77", "up": "#ee7733"}
+    for axis, (name, colour) in enumerate(colours.items()):
+        right.plot(hours, where[:, axis], color=colour, lw=0.5, label=name)
+    for sign in (-1, 1):
+        right.axhline(sign * GNSS.drift_vertical_m, color="#ee7733", lw=0.8, ls=":")
+        right.axhline(sign * GNSS.drift_horizontal_m, color="#4477aa", lw=0.8, ls=":")
+    right.set(xlabel="time, h", ylabel="error of position, m", xlim=(0, HOURS))
+    right.set_title("GNSS of the same carrier; dotted: one σ of the drift", fontsize=9)
+    for axes in (left, right):
+        axes.grid(color=theme.LINE, lw=0.5)
+    left.legend(fontsize=7.5, frameon=False, loc="upper right")
+    for line in right.legend(fontsize=7.5, frameon=False, loc="lower right").get_lines():
+        line.set_linewidth(2)
+    figure.savefig(path)

@@ -1,0 +1,327 @@
+"""Radial velocities: closed forms, derivatives of trajectories, and batches."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from lidarpool import (
+    Material,
+    Mesh,
+    Mounted,
+    Noise,
+    Pose,
+    Returns,
+    Scanner,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    load_sensor,
+)
+from lidarpool.columns.table import TABLE
+from lidarpool.render.colouring import colours_of
+from lidarpool.scene.actors import Actor, box
+from lidarpool.scene.robot import Hinge, LinkPath
+from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
+from lidarpool.simulator.hits import AIR, FALSE_ALARM, Hits, joined
+from lidarpool.simulator.rig import Rig
+
+from .casting import Cart, cast_between
+
+SPEED, RADIUS = 25.0, 50.0  # of the train
+RATE = SPEED / RADIUS
+
+
+def circle(radius, seconds, count=40_000, before=0.0):
+    """A train's way: counter-clockwise, its axes along the track."""
+    times = np.linspace(-before, seconds, count)
+    angle = RATE * times
+    places = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0 * angle], axis=1)
+    yaw = np.degrees(angle) + 90
+    turns = quaternions_of(rotations_of(np.stack([yaw, 0 * yaw, 0 * yaw], axis=1)))
+    return Track(times, places, turns, smooth=True, start_s=0.0)
+
+
+@dataclass(frozen=True)
+class Wobble:
+    """A trajectory of a user's class, with or without derivatives of its own."""
+
+    moves: bool = True
+    stations: int = 1
+    duration_ns: float = np.inf
+
+    def pose(self, station, time_ns=0.0):
+        return Pose.of(*(part[0] for part in self.poses(station, np.array([time_ns]))))
+
+    def poses(self, station, times_ns):
+        t = times_ns / 1e9
+        places = np.stack([np.sin(t), np.cos(2 * t), 0.1 * t**2], axis=1)
+        return places, rotations_of(np.stack([40 * t, 0 * t, 0 * t], axis=1))
+
+
+def wall_around():
+    """A box to look at from inside, far from round."""
+    room = box("Room", (260.0, 240.0, 30.0))
+    return Mesh("Room", room.vertices - [0, 0, 4], room.faces)
+
+
+def found_of(rig):
+    """All returns of a survey of one sensor."""
+    (returns,) = rig.cast(0, rig.survey.scan_count)
+    return returns
+
+
+def true_ends(returns):
+    """Where rays end without noise, (n, 3)."""
+    return returns.origins + returns.found.distance[:, None] * returns.directions
+
+
+def differences(path, times_ns, step_ns=2e5):
+    """Velocities and rates from poses around times, to the fourth order of the step."""
+
+    def at(offset):
+        places, turns = path.poses(0, times_ns + offset * step_ns)
+        return places, np.broadcast_to(np.eye(3), (len(places), 3, 3)) if turns is None else turns
+
+    weights = {-2: 1 / 12, -1: -2 / 3, 1: 2 / 3, 2: -1 / 12}
+    linear = sum(w * at(k)[0] for k, w in weights.items()) / (step_ns / 1e9)
+    slope = sum(w * at(k)[1] for k, w in weights.items()) / (step_ns / 1e9)
+    spin = np.einsum("nij,nkj->nik", slope, at(0)[1])  # skew-symmetric
+    return linear, np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+
+
+def test_a_train_on_a_circle_passes_a_still_sensor():
+    # Every point of the train moves with the rate of the circle, around its middle.
+    train = Actor(box("Train", (20.0, 3.0, 3.5)), circle(RADIUS, 1.1, before=0.1))
+    sensor = Sensor.grid(720, 16, 40.0, step_deg=360)
+    survey = Survey(sensor, poses=[(40, 12, 1)], steps=10, columns=["radial_velocity"])
+    scene = Scene.from_meshes([wall_around()]).with_actors([train])
+    returns = found_of(Rig(scene, survey, "numpy"))
+    ends, ahead = true_ends(returns), returns.directions
+    on_train = returns.object == 1
+    assert on_train.sum() > 500
+    about = np.cross([0, 0, RATE], ends)
+    expected = np.where(on_train, (about * ahead).sum(axis=1), 0.0)
+    assert np.abs(returns.radial_velocity - expected).max() < 1e-6
+    assert returns.radial_velocity[on_train].min() < -5
+    assert returns.radial_velocity[on_train].max() > 5
+    (column,) = (c for c in survey.stored_columns if c.name == "radial_velocity")
+    stored = returns.column(column)
+    assert stored.dtype == np.float32
+    assert (np.abs(stored - expected) <= 1e-6 + np.spacing(np.abs(stored))).all()
+
+
+def test_a_sensor_on_the_train_sees_the_world_turn():
+    # The sensor leans out of the train; the train itself keeps its distance.
+    way = circle(RADIUS, 1.0, before=0.1)
+    sensor = load_sensor("velodyne/hdl64e-s2")  # its beams start beside the axis
+    mount = Pose((3.0, 2.5, 3.0), yaw_deg=30, pitch_deg=10)
+    train = Actor(box("Train", (20.0, 3.0, 3.5)), way)
+    scene = Scene.from_meshes([wall_around()]).with_actors([train])
+    survey = Survey(
+        sensors=[Mounted(sensor, mount)], trajectory=way, steps=36, columns=["radial_velocity"]
+    )
+    returns = found_of(Rig(scene, survey, "numpy"))
+    about = np.cross([0, 0, RATE], returns.origins)
+    expected = np.where(returns.object == 1, 0.0, -(about * returns.directions).sum(axis=1))
+    assert {*returns.object.tolist()} == {0, 1}
+    assert np.abs(returns.radial_velocity - expected).max() < 2e-6
+    assert np.ptp(returns.radial_velocity) > 1.5 * SPEED
+
+
+def hinges():
+    before = np.eye(4)
+    before[:3, 3] = 0.5, -0.2, 1.0
+    before[:3, :3] = rotations_of(np.array([20.0, 30.0, -10.0]))
+    values = np.array([0.0, 0.4, -0.3, 1.0])
+    one = Hinge(before, np.array([0, 0.6, 0.8]), False, values)
+    other = Hinge(before, np.array([1.0, 0, 0]), True, values[::-1] * 2)
+    return one, other, one
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        replace(circle(30.0, 3.0, 31), smooth=False),
+        circle(30.0, 3.0, 31),
+        LinkPath(circle(30.0, 3.0, 31), hinges(), hinges()[0].before, np.arange(4.0), 0.0),
+        LinkPath(Stations((Pose((1, 2, 3), 40),)), hinges(), np.eye(4), np.arange(4.0), 0.0),
+    ],
+    ids=["linear", "smooth", "links", "links of a robot that stands"],
+)
+def test_velocities_are_the_derivatives_of_poses(path):
+    # Off the given poses, at which a linear path has corners.
+    times = (np.arange(29)[:, None] * 0.1 + [0.013, 0.05, 0.087]).ravel() * 1e9
+    for found, expected in zip(velocities(path, 0, times), differences(path, times), strict=True):
+        assert np.abs(found).max() > 0.3
+        np.testing.assert_allclose(found, expected, atol=2e-8)
+
+
+def test_actors_that_wait_do_not_move():
+    way = Track([1, 2], [[0, 0, 0], [5, 0, 0]], start_s=0.0, duration_s=4, beyond="hold")
+    linear, angular = velocities(way, 0, np.array([0.5, 1.0, 1.5, 2.0, 3.0]) * 1e9)
+    assert linear[:, 0].tolist() == [0, 5, 5, 5, 0]
+    assert not angular.any()
+    linear, _ = velocities(Stations((Pose((1, 2, 3)),)), 0, np.zeros(4))
+    assert linear.shape == (4, 3)
+    assert not linear.any()
+
+
+def test_a_class_without_derivatives_gets_differences():
+    times = np.linspace(0.5, 3, 40) * 1e9
+    for found, expected in zip(
+        velocities(Wobble(), 0, times), differences(Wobble(), times, 2e6), strict=True
+    ):
+        np.testing.assert_allclose(found, expected, atol=1e-6)
+
+
+def test_a_mirror_that_moves_counts_twice():
+    # The virtual image of a wall, in a mirror that comes nearer.
+    plane = np.array([[0, -9, -9], [0, 9, -9], [0, 9, 9], [0, -9, 9]], float)
+    faces = np.array([[0, 1, 2], [0, 2, 3]])
+    way = Track([0, 2], [[10, 0, 0], [4, 0, 0]], np.tile([0, 0, 0, 1.0], (2, 1)))
+    mirror = Actor(Mesh("Mirror", plane, faces), way)
+    behind = Mesh("Wall", plane * 5 + [-20, 0, 0], faces)
+    sensor = Sensor.grid(180, 3, 20.0, step_deg=360)
+    survey = Survey(
+        sensor, poses=[(0, 0, 0)], steps=1, columns=["radial_velocity"],
+        materials=[Material("*"), Material("Mirror", transparent="mirror", reflectance=0.0)],
+    )  # fmt: skip
+    scene = Scene.from_meshes([behind]).with_actors([mirror])
+    returns = found_of(Rig(scene, survey, "numpy"))
+    seen = returns.directions[:, 0] > 0.5
+    assert seen.sum() > 20
+    cosine = returns.directions[seen, 0]
+    times = returns.time[seen] / 1e9
+    np.testing.assert_allclose(returns.range[seen], (20 + 2 * (10 - 3 * times)) / cosine, rtol=1e-6)
+    np.testing.assert_allclose(returns.radial_velocity[seen], -6 * cosine, rtol=1e-9)
+
+
+SENSORS = {
+    "one return each": {},
+    "angles": {"noise": Noise(angle_deg=0.2, velocity_m_s=0.05, seed=3)},
+    "sub-rays": {
+        "returns": Returns("all", subrays=7, divergence_mrad=5),
+        "noise": Noise(range_m=0.1, velocity_m_s=0.05),
+    },
+}
+
+
+@pytest.mark.parametrize("backend", ["embree", "numpy"])
+@pytest.mark.parametrize("options", SENSORS.values(), ids=SENSORS)
+def test_batches_do_not_matter(options, backend):
+    sensor = Sensor.grid(90, 8, 40.0, step_deg=90)
+    cart = Cart(stations=1)
+    carrier = Mounted(sensor, Pose((0.3, 0.1, 1.0), 20))
+    survey = Survey(
+        sensors=[carrier], trajectory=cart, steps=8, columns=["radial_velocity"], **options
+    )
+    scene = Scene.seed().with_actors([Actor(box("Car", (4.0, 2.0, 2.0)), circle(8.0, 1.5, 40))])
+    rig = Rig(scene, survey, backend)
+    whole = cast_between(rig, survey, [0, 8])
+    assert whole == cast_between(rig, survey, range(9)) == cast_between(rig, survey, [0, 3, 5, 8])
+
+
+def test_sub_rays_of_a_plain_beam_see_what_one_ray_sees():
+    sensor = Sensor.grid(90, 8, 40.0, step_deg=90)
+    cart = Cart(stations=1)
+    survey = Survey(sensor, trajectory=cart, steps=4, columns=["radial_velocity"])
+    one = found_of(Rig(Scene.seed(), survey, "numpy"))
+    # The same rays, by the road of those whose returns may be lost.
+    lossy = replace(survey, noise=Noise(dropout=1e-12))
+    other = found_of(Rig(Scene.seed(), lossy, "numpy"))
+    assert other.found.velocity is not None
+    assert one.found.velocity is None
+    np.testing.assert_allclose(one.radial_velocity, other.radial_velocity, atol=1e-9)
+
+
+def test_noise_of_velocities():
+    sensor = Sensor.grid(1000, 40, 30.0, step_deg=360)
+    survey = Survey(
+        sensor, poses=[(0, 0, 1)], steps=2, columns=["radial_velocity"],
+        noise=Noise(velocity_m_s=0.2, seed=5),
+    )  # fmt: skip
+    found = found_of(Rig(Scene.seed(), survey, "numpy")).radial_velocity
+    # Of n normal values the standard deviation is known to 1 / sqrt(2 n): five of these.
+    assert abs(found.std() / 0.2 - 1) < 5 / np.sqrt(2 * len(found))
+    assert abs(found.mean()) < 5 * 0.2 / np.sqrt(len(found))
+    other = replace(survey, noise=Noise(velocity_m_s=0.2, seed=6))
+    assert (found_of(Rig(Scene.seed(), other, "numpy")).radial_velocity != found).mean() > 0.99
+
+
+def test_velocities_of_what_is_no_surface():
+    ray = np.arange(2)
+    own = ray, np.ones(2), np.zeros(2, np.int32), np.ones(2)
+    surface = Hits(*own, velocity=np.array([1.0, 2.0]))
+    others = Hits(*own, cause=np.array([AIR, FALSE_ALARM], np.uint8))
+    made = joined([surface, others])
+    assert made.velocity[:2].tolist() == [1, 2]
+    assert np.isnan(made.velocity[2:]).all()
+    assert joined([others]).velocity is None
+    assert made.cause.tolist() == [0, 0, AIR, FALSE_ALARM]
+
+
+@pytest.mark.parametrize("subrays", [1, 7])
+def test_drops_are_at_rest(subrays):
+    # A moving carrier in rain, before a wall and among cars.
+    sensor = Sensor.grid(720, 16, 30.0, step_deg=360)
+    way = Track([0, 2], [[0, 0, 1], [12, 4, 1]])
+    survey = Survey(
+        sensors=[Mounted(sensor, Pose((0.5, 0, 1), 20))], trajectory=way, steps=3, rain_mm_h=60,
+        columns=["radial_velocity", "cause"], noise=Noise(detection_range_m=100),
+        returns=Returns("all", subrays=subrays, divergence_mrad=3),
+    )  # fmt: skip
+    car = Actor(box("Car", (4.0, 2.0, 2.0)), circle(8.0, 1.5, 40))
+    returns = found_of(Rig(Scene.seed().with_actors([car]), survey, "numpy"))
+    air = returns.cause == AIR
+    assert 100 < air.sum() < 0.9 * len(returns)
+    assert not np.isnan(returns.radial_velocity).any()
+    expected = -(np.array([6.0, 2.0, 0.0]) * returns.directions).sum(axis=1)
+    # Sub-rays leave the middle by 1.5 mrad; a drop and what is behind it may be one return.
+    room = 1e-9 if subrays == 1 else 0.012
+    still = air if subrays == 1 else air & (np.abs(returns.radial_velocity - expected) < 0.5)
+    assert still.sum() > 0.95 * air.sum()
+    assert np.abs(returns.radial_velocity - expected)[still].max() < room
+    cuts = cast_between(Rig(Scene.seed().with_actors([car]), survey, "embree"), survey, [0, 1, 3])
+    assert cuts == cast_between(
+        Rig(Scene.seed().with_actors([car]), survey, "embree"), survey, [0, 3]
+    )
+
+
+def test_a_scanner_that_starts_late():
+    way = Track([0, 1, 2], [[0, 0, 1], [5, 0, 1], [0, 0, 1]])
+    scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=["radial_velocity"])
+    ahead = scanner.sweep(way, number=0)["radial_velocity"]
+    back = scanner.sweep(way, number=0, start_s=1.5)["radial_velocity"]
+    assert np.abs(ahead).max() == pytest.approx(np.abs(back).max(), rel=0.05)
+    assert np.abs(ahead).max() > 4.5
+
+
+def test_velocities_are_blue_and_red():
+    values = np.array([-8.0, 0.0, 2.0, np.nan], np.float32)
+    made = colours_of(values, TABLE["radial_velocity"])
+    assert made.limits[0] == -made.limits[1]
+    nearer, still, farther, unknown = made.paint(values)
+    assert nearer[2] > nearer[0]
+    assert farther[0] > farther[2]
+    assert np.ptp(still) < 0.02
+    assert unknown.tolist() == [0.5, 0.5, 0.5]
+    assert made.scale is not colours_of(values, TABLE["range"]).scale
+
+
+def test_false_alarms_have_no_velocity():
+    sensor = Sensor.grid(360, 16, 30.0, step_deg=360, max_range_m=200)
+    survey = Survey(
+        sensor, trajectory=Track([0, 1], [[0, 0, 1], [6, 0, 1]]), steps=1,
+        columns=["radial_velocity", "cause"], returns=Returns("all"),
+        noise=Noise(detection_range_m=100, false_alarm_hz=3e5, velocity_m_s=0.1),
+    )  # fmt: skip
+    returns = found_of(Rig(Scene.seed(), survey, "numpy"))
+    alarms = returns.cause == FALSE_ALARM
+    assert alarms.sum() > 100
+    assert np.isnan(returns.radial_velocity[alarms]).all()
+    rest = returns.radial_velocity[~alarms]
+    assert np.abs(rest + 6 * returns.directions[~alarms, 0]).max() < 0.5

@@ -1,0 +1,171 @@
+"""Files of a carrier's IMU and GNSS receiver, beside the cloud: imu.csv and gnss.csv.
+
+A row for each sample, in order of time. They are written once, and bags are made from them, so that
+all formats have the same numbers, however long the survey.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..sensor import Survey
+from ..sensor.navigation import fixes, geodetic, imu_samples
+from ..sensor.trajectory import Pose, quaternions_of
+
+IMU_FILE, GNSS_FILE = "imu.csv", "gnss.csv"
+FILES = (IMU_FILE, GNSS_FILE)
+
+_IMU = (
+    "time_ns",
+    *(f"angular_velocity_{axis}_rad_s" for axis in "xyz"),
+    *(f"specific_force_{axis}_m_s2" for axis in "xyz"),
+)
+_PLACE = ("time_ns", "x_m", "y_m", "z_m")
+_GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
+
+_ROW_BYTES, _MESSAGE_BYTES = 120, 500  # of a sample, at most: in its file, and in a bag
+
+Real = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Instrument:
+    """What bags say of an instrument besides its samples."""
+
+    position: list[float]  # on the carrier, metres
+    quaternion: list[float]  # x, y, z, w
+    # Of white noise: of angular velocities and specific forces; of positions to the east, the north
+    # and up, where those that drift are added.
+    variances: list[float]
+
+
+@dataclass(frozen=True)
+class Instruments:
+    """The instruments of a survey, and where their files are."""
+
+    imu: Instrument | None
+    gnss: Instrument | None
+    folder: Path | None = None  # None as long as they are not written
+
+    @classmethod
+    def of(cls, survey: Survey) -> Instruments | None:
+        """Return those of a survey; None if it has none."""
+        navigation = survey.navigation
+        if navigation is None or (navigation.imu is None and navigation.gnss is None):
+            return None
+        imu, gnss = navigation.imu, navigation.gnss
+        inertial = satellite = None
+        if imu is not None:
+            densities = imu.gyroscope_noise_density, imu.accelerometer_noise_density
+            inertial = _instrument(imu.mount, [imu.rate_hz * one**2 for one in densities])
+        if gnss is not None:
+            level = gnss.horizontal_m**2 + gnss.drift_horizontal_m**2
+            up = gnss.vertical_m**2 + gnss.drift_vertical_m**2
+            satellite = _instrument(gnss.mount, [level, level, up])
+        return cls(inertial, satellite)
+
+    @property
+    def files(self) -> list[str]:
+        """Names of their files."""
+        both = zip(FILES, (self.imu, self.gnss), strict=True)
+        return [name for name, one in both if one is not None]
+
+    def words(self) -> dict[str, Any]:
+        """Return them for a file of JSON, without their place."""
+        both = {"imu": self.imu, "gnss": self.gnss}
+        return {name: one and asdict(one) for name, one in both.items()}
+
+    @classmethod
+    def from_words(cls, words: dict[str, Any], folder: Path) -> Instruments:
+        """Return what `words` gave, with files in a folder if they are there."""
+        imu, gnss = (words[name] and Instrument(**words[name]) for name in ("imu", "gnss"))
+        made = cls(imu, gnss, folder)
+        there = all((folder / name).exists() for name in made.files)
+        return made if there else cls(imu, gnss)
+
+    def rows(self, name: str) -> Iterator[list[str]]:
+        """Yield the rows of a file, without its header; none if it is not written."""
+        if self.folder is None or name not in self.files:
+            return
+        with (self.folder / name).open(encoding="ascii") as file:
+            next(file)
+            for line in file:
+                yield line.rstrip("\n").split(",")
+
+
+def instrument_bytes(survey: Survey, bags: int) -> int:
+    """Disk that the files of a survey's instruments need at most, with so many bags."""
+    navigation = survey.navigation
+    if navigation is None:
+        return 0
+    rates = [one.rate_hz for one in (navigation.imu, navigation.gnss) if one is not None]
+    samples = sum(rates) * survey.duration_ns / 1e9
+    return int(samples * (_ROW_BYTES + bags * _MESSAGE_BYTES))
+
+
+def write_instruments(folder: Path, survey: Survey, origin: Real) -> None:
+    """Write the files of a survey's instruments, so many samples at a time.
+
+    `origin` is that of the scene, (3,). OSError if one cannot be written.
+    """
+    instruments = Instruments.of(survey)
+    for name in () if instruments is None else instruments.files:
+        with (folder / name).open("w", encoding="ascii", newline="\n") as file:
+            for line in _imu_lines(survey) if name == IMU_FILE else _gnss_lines(survey, origin):
+                file.write(line)
+
+
+def _imu_lines(survey: Survey) -> Iterator[str]:
+    yield ",".join(_IMU) + "\n"
+    form = "%d" + ",%.10g" * 6 + "\n"
+    for times, rates, forces in imu_samples(survey):
+        rows = zip(times.tolist(), *rates.T.tolist(), *forces.T.tolist(), strict=True)
+        yield "".join(form % row for row in rows)
+
+
+def _gnss_lines(survey: Survey, origin: Real) -> Iterator[str]:
+    to_geodetic = _to_geodetic(survey)
+    yield ",".join(_PLACE if to_geodetic is None else (*_PLACE, *_GEODETIC)) + "\n"
+    form = "%d" + ",%.4f" * 3
+    form += ("" if to_geodetic is None else ",%.9f,%.9f,%.4f") + "\n"
+    for times, positions in fixes(survey):
+        places = positions + origin
+        columns = [*places.T, *(() if to_geodetic is None else to_geodetic(places).T)]
+        rows = zip(times.tolist(), *(column.tolist() for column in columns), strict=True)
+        yield "".join(form % row for row in rows)
+
+
+def _to_geodetic(survey: Survey) -> Callable[[Real], Real] | None:
+    """Return what makes latitudes, longitudes and heights of world coordinates, if they are known.
+
+    Heights are taken for ellipsoidal ones.
+    """
+    gnss = survey.navigation and survey.navigation.gnss
+    if gnss and gnss.origin is not None:
+        at = gnss.origin
+        return lambda places: geodetic(places, at)
+    if survey.epsg is None:
+        return None
+    transform = import_module("rasterio.warp").transform
+    system = f"EPSG:{survey.epsg}"
+
+    def by_code(places: Real) -> Real:
+        x, y, z = places.T
+        longitude, latitude = transform(system, "EPSG:4326", x.tolist(), y.tolist())
+        return np.column_stack([latitude, longitude, z])
+
+    return by_code
+
+
+def _instrument(mount: Pose, variances: list[float]) -> Instrument:
+    turn = np.eye(3) if mount.rotation is None else mount.rotation
+    quaternion = quaternions_of(turn[None])[0]
+    quaternion *= -1 if quaternion[3] < 0 else 1
+    return Instrument([*mount.position], quaternion.tolist(), variances)

@@ -1,0 +1,407 @@
+"""IMU and GNSS receiver of a carrier, and their errors, which drift.
+
+Truth comes from the carrier's trajectory: what an inertial measurement unit reports are means over
+its sampling interval, so that sums of its samples are the carrier's turns and changes of velocity,
+whatever the trajectory does in between. To these come errors: white noise, a Gauss-Markov process
+of first order for a bias that wanders about zero, and a random walk for one that wanders off
+(IEEE Std 952-1997, annex C; Farrell 2008, chapter 4; Woodman 2007). Parameters are named as in the
+`imu.yaml` of kalibr, whose model is the first and the last of the three.
+
+The rotation of the Earth and its curvature are left out.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from itertools import accumulate
+from typing import Annotated, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import Field, Strict
+
+from ..base.arguments import checked_fields
+from ..base.declared import Seed, written_as
+from ..base.errors import LidarpoolError
+from .noise import normal
+from .trajectory import CENTRE, Pose, Trajectory, velocities
+
+BLOCK = 1 << 14  # samples that are made at a time
+
+# Purposes of random numbers: of gyroscopes, accelerometers and the position, in each the white
+# noise, the Gauss-Markov process and the random walk.
+_GYROSCOPE, _ACCELEROMETER, _POSITION = (41, 42, 43), (44, 45, 46), (47, 48, 49)
+
+Real = NDArray[np.float64]
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-360, le=360)]
+Place = Annotated[
+    tuple[Latitude, Longitude, Annotated[float, Field(ge=-1e5, le=1e6)]], Strict(False)
+]
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Imu:
+    """An inertial measurement unit on the carrier; without arguments it has no errors.
+
+    Its `mount` is its pose in the carrier's axes. Noise is named and measured as in kalibr's
+    `imu.yaml`.
+
+    Raises
+    ------
+    LidarpoolError
+        If a number is outside its range.
+    """
+
+    rate_hz: Annotated[
+        float, Field(ge=0.001, le=100_000, description="samples a second; update_rate of kalibr")
+    ] = 200.0
+    mount: Pose = CENTRE
+    gyroscope_noise_density: Annotated[
+        float, Field(ge=0, le=100, description="angle random walk, rad/s/sqrt(Hz)")
+    ] = 0.0
+    gyroscope_bias: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=100,
+            description="standard deviation of a bias that wanders about zero (Gauss-Markov of "
+            "first order), rad/s",
+        ),
+    ] = 0.0
+    gyroscope_bias_time_s: Annotated[
+        float, Field(ge=0.001, le=1e9, description="its correlation time")
+    ] = 300.0
+    gyroscope_random_walk: Annotated[
+        float, Field(ge=0, le=100, description="of the bias, rad/s^2/sqrt(Hz)")
+    ] = 0.0
+    accelerometer_noise_density: Annotated[
+        float, Field(ge=0, le=1000, description="velocity random walk, m/s^2/sqrt(Hz)")
+    ] = 0.0
+    accelerometer_bias: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1000,
+            description="standard deviation of a bias that wanders about zero, m/s^2",
+        ),
+    ] = 0.0
+    accelerometer_bias_time_s: Annotated[
+        float, Field(ge=0.001, le=1e9, description="its correlation time")
+    ] = 300.0
+    accelerometer_random_walk: Annotated[
+        float, Field(ge=0, le=1000, description="of the bias, m/s^3/sqrt(Hz)")
+    ] = 0.0
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Gnss:
+    """A GNSS receiver on the carrier; without arguments it has no errors.
+
+    Its `mount` is the pose of its antenna in the carrier's axes.
+
+    Raises
+    ------
+    LidarpoolError
+        If a number is outside its range.
+    """
+
+    rate_hz: Annotated[float, Field(ge=0.0001, le=1000, description="positions a second")] = 10.0
+    mount: Pose = CENTRE
+    horizontal_m: Annotated[
+        float,
+        Field(ge=0, le=1e6, description="standard deviation of white noise to the east and north"),
+    ] = 0.0
+    vertical_m: Annotated[float, Field(ge=0, le=1e6, description="the same, up")] = 0.0
+    drift_horizontal_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1e6,
+            description="standard deviation of an error that drifts (Gauss-Markov of first order), "
+            "to the east and north",
+        ),
+    ] = 0.0
+    drift_vertical_m: Annotated[float, Field(ge=0, le=1e6, description="the same, up")] = 0.0
+    drift_time_s: Annotated[
+        float, Field(ge=0.001, le=1e9, description="correlation time of the drift")
+    ] = 600.0
+    origin: Annotated[
+        tuple[float, float, float] | None,
+        written_as(Place | None),
+        Field(
+            description="latitude and longitude, degrees, and ellipsoidal height, metres, of the "
+            "world's zero, x to the east and y to the north; by default by cloud.epsg",
+            examples=[[48.7758, 9.1829, 290.0]],
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        given = self.origin
+        if given is not None and not (
+            len(given) == 3 and np.isfinite(given).all() and abs(given[0]) <= 90
+        ):
+            raise LidarpoolError(
+                f"origin is {given}; it must be latitude and longitude, degrees, and height, "
+                "metres: (48.8, 9.2, 290)."
+            )
+
+
+@dataclass(frozen=True)
+@checked_fields
+class Navigation:
+    """What measures the carrier's own motion, and writes it beside the cloud.
+
+    Parameters
+    ----------
+    imu, gnss
+        An IMU and a GNSS receiver; None for none.
+
+    Raises
+    ------
+    LidarpoolError
+        If a number is outside its range.
+    """
+
+    imu: Imu | None = None
+    gnss: Gnss | None = None
+    gravity_m_s2: Annotated[
+        float, Field(ge=-100, le=100, description="gravity, downwards along the world's z axis")
+    ] = 9.80665
+    seed: Annotated[Seed, Field(description="the same seed gives the same errors")] = 0
+
+
+class Moving(Protocol):
+    """The part of a `Survey` that is asked here."""
+
+    @property
+    def navigation(self) -> Navigation | None:
+        """Instruments."""
+
+    @property
+    def path(self) -> Trajectory:
+        """Trajectory of the carrier, of one station."""
+
+    @property
+    def duration_ns(self) -> float:
+        """How long the survey lasts."""
+
+
+class ImuSamples(NamedTuple):
+    """Some consecutive samples of an IMU, in its own axes."""
+
+    times_ns: NDArray[np.int64]  # (k,): end of the interval, since the survey's start
+    rates: Real  # (k, 3): mean angular velocities over the interval before, rad/s
+    forces: Real  # (k, 3): mean specific forces, m/s^2: at rest, upwards, gravity
+
+
+class Fixes(NamedTuple):
+    """Some consecutive positions of a GNSS receiver's antenna."""
+
+    times_ns: NDArray[np.int64]  # (k,): since the survey's start
+    positions: Real  # (k, 3): metres, the scene's local coordinates
+
+
+def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
+    """Check that instruments can be on a carrier, in a coordinate system; LidarpoolError if not."""
+    if path.stations > 1:
+        raise LidarpoolError(
+            f"navigation needs a carrier that drives or stands, and this one jumps between "
+            f"{path.stations} poses: give a trajectory, or one pose."
+        )
+    gnss = navigation.gnss
+    if gnss and epsg and gnss.origin is None and find_spec("rasterio") is None:
+        raise LidarpoolError(
+            f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: pip install "
+            '"lidarpool[geo]", or give navigation.gnss.origin.'
+        )
+
+
+def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
+    """Yield the samples of a survey's IMU, so many at a time; how many changes nothing.
+
+    A sample ends at each whole multiple of its interval within the survey.
+    """
+    navigation, path = survey.navigation, survey.path
+    if navigation is None or navigation.imu is None:
+        return
+    imu, seed = navigation.imu, navigation.seed
+    step_s, three = 1 / imu.rate_hz, np.ones(3)
+    gyroscope = _Errors(
+        seed,
+        _GYROSCOPE,
+        step_s,
+        three * imu.gyroscope_noise_density * math.sqrt(imu.rate_hz),
+        three * imu.gyroscope_bias,
+        imu.gyroscope_bias_time_s,
+        three * imu.gyroscope_random_walk,
+    )
+    accelerometer = _Errors(
+        seed,
+        _ACCELEROMETER,
+        step_s,
+        three * imu.accelerometer_noise_density * math.sqrt(imu.rate_hz),
+        three * imu.accelerometer_bias,
+        imu.accelerometer_bias_time_s,
+        three * imu.accelerometer_random_walk,
+    )
+    gravity = np.array([0.0, 0.0, -navigation.gravity_m_s2])
+    count = math.floor(survey.duration_ns * imu.rate_hz / 1e9 + 1e-6)
+    for first in range(0, count, block):
+        samples = np.arange(first, min(first + block, count))
+        ends: Real = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
+        _, turns, speeds = _moved(path, imu.mount, ends)
+        middles = (ends[1:] + ends[:-1]) / 2
+        _, halfway, _ = _moved(path, imu.mount, middles)
+        forces = np.diff(speeds, axis=0) * imu.rate_hz - gravity
+        rates = _rotation_vectors(turns[:-1], turns[1:]) * imu.rate_hz
+        yield ImuSamples(
+            np.rint(ends[1:]).astype(np.int64),
+            rates + gyroscope.of(samples),
+            np.einsum("nij,ni->nj", halfway, forces) + accelerometer.of(samples),
+        )
+
+
+def fixes(survey: Moving, block: int = BLOCK) -> Iterator[Fixes]:
+    """Yield the positions of a survey's GNSS receiver, so many at a time, from its start on."""
+    navigation, path = survey.navigation, survey.path
+    if navigation is None or navigation.gnss is None:
+        return
+    gnss = navigation.gnss
+    errors = _Errors(
+        navigation.seed,
+        _POSITION,
+        1 / gnss.rate_hz,
+        np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
+        np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
+        gnss.drift_time_s,
+        np.zeros(3),
+    )
+    count = math.floor(survey.duration_ns * gnss.rate_hz / 1e9 + 1e-6) + 1
+    for first in range(0, count, block):
+        samples = np.arange(first, min(first + block, count))
+        times = np.asarray(samples * 1e9 / gnss.rate_hz, np.float64)
+        places, _, _ = _moved(path, gnss.mount, times)
+        yield Fixes(np.rint(times).astype(np.int64), places + errors.of(samples))
+
+
+def _moved(path: Trajectory, mount: Pose, times_ns: Real) -> tuple[Real, Real, Real]:
+    """Positions (k, 3), rotations (k, 3, 3) and velocities (k, 3) of something on a carrier."""
+    times_ns = np.minimum(times_ns, path.duration_ns)
+    places, turns = path.poses(0, times_ns)
+    if turns is None:
+        turns = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
+    speeds, rates = velocities(path, 0, times_ns)
+    levers = np.einsum("nij,j->ni", turns, np.array(mount.position))
+    own = np.eye(3) if mount.rotation is None else mount.rotation
+    return places + levers, turns @ own, speeds + np.cross(rates, levers)
+
+
+def _rotation_vectors(before: Real, after: Real) -> Real:
+    """Rotation vectors (k, 3), radians, from rotations (k, 3, 3) to others, in their axes."""
+    turn = np.einsum("nji,njk->nik", before, after)
+    sines = np.stack([turn[:, k, j] - turn[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
+    sines /= 2
+    sine = np.linalg.norm(sines, axis=1)
+    cosine = (np.einsum("nii->n", turn) - 1) / 2
+    scale = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
+    return np.asarray(sines * scale[:, None])
+
+
+class _Errors:
+    """White noise, a Gauss-Markov process and a random walk along three axes.
+
+    Both processes are sums over hashes from the first sample on, in one order: samples must be
+    asked for in order, and in which pieces does not matter.
+    """
+
+    def __init__(
+        self,
+        seed: int,
+        purposes: tuple[int, int, int],
+        step_s: float,
+        white: Real,  # (3,): standard deviation of a sample
+        bias: Real,  # (3,): standard deviation of the Gauss-Markov process
+        bias_time_s: float,
+        walk: Real,  # (3,): of the random walk in a second
+    ) -> None:
+        self._seed, self._purposes = seed, purposes
+        self._white, self._bias, self._walk = white, bias, walk * math.sqrt(step_s)
+        # To single precision, in which an exponential is the same on every machine.
+        self._kept = float(np.float32(math.exp(-step_s / bias_time_s)))
+        self._driven = bias * math.sqrt(1 - self._kept**2)
+        self._biases: Real = np.zeros(3)  # of the last sample
+        self._walked: Real = np.zeros(3)
+
+    def of(self, samples: NDArray[np.int64]) -> Real:
+        """Return the errors of the next samples (k,): (k, 3)."""
+        white, driven, steps = self._purposes
+        out = np.zeros((len(samples), 3))
+        if self._white.any():
+            out += self._white * self._normal(white, samples)
+        if self._bias.any():
+            noise = self._normal(driven, samples)
+            noise[samples > 0] *= self._driven
+            noise[samples == 0] *= self._bias  # a bias that has been there for long
+            kept = self._kept
+            for axis in range(3):
+                made = accumulate(
+                    noise[:, axis].tolist(),
+                    lambda bias, step: kept * bias + step,
+                    initial=float(self._biases[axis]),
+                )
+                out[:, axis] += (values := np.array(list(made))[1:])
+                self._biases[axis] = values[-1]
+        if self._walk.any():
+            noise = self._walk * self._normal(steps, samples)
+            noise[0] += self._walked
+            walked = np.cumsum(noise, axis=0)
+            self._walked = walked[-1]
+            out += walked
+        return out
+
+    def _normal(self, purpose: int, samples: NDArray[np.int64]) -> Real:
+        """Make normal deviates for samples (k,) along each axis: (k, 3)."""
+        high, low = np.divmod(samples, 1 << 32)
+        return np.stack([normal(self._seed, purpose, high, low, axis) for axis in range(3)], axis=1)
+
+
+def geodetic(positions: Real, origin: tuple[float, float, float]) -> Real:
+    """Latitudes, longitudes (degrees) and ellipsoidal heights of points east, north and up of one.
+
+    Through Cartesian coordinates of WGS 84; Bowring's (1985) latitude is exact to 1e-9 degrees
+    below a height of 10 km.
+
+    Parameters
+    ----------
+    positions
+        (k, 3): metres.
+    origin
+        Latitude, longitude and height.
+    """
+    lat, lon = math.radians(origin[0]), math.radians(origin[1])
+    (sp, cp), (sl, cl) = (math.sin(lat), math.cos(lat)), (math.sin(lon), math.cos(lon))
+    wide = _A / math.sqrt(1 - _E2 * sp * sp)
+    east, north, up = positions.T
+    x = (wide + origin[2]) * cp * cl - sl * east - sp * cl * north + cp * cl * up
+    y = (wide + origin[2]) * cp * sl + cl * east - sp * sl * north + cp * sl * up
+    z = (wide * (1 - _E2) + origin[2]) * sp + cp * north + sp * up
+    level = np.hypot(x, y)
+    small = _A * math.sqrt(1 - _E2)
+    far = np.hypot(z, level)
+    slope = (small * z) / (_A * level) * (1 + _E2 / (1 - _E2) * small / far)
+    cos = 1 / np.sqrt(1 + slope * slope)
+    sin = slope * cos
+    bow = np.arctan2(z + _E2 / (1 - _E2) * small * sin**3, level - _E2 * _A * cos**3)
+    across = _A / np.sqrt(1 - _E2 * np.sin(bow) ** 2)
+    height = level * np.cos(bow) + z * np.sin(bow) - _A * _A / across
+    return np.column_stack([np.degrees(bow), np.degrees(np.arctan2(y, x)), height])
+
+
+_A, _F = 6378137.0, 1 / 298.257223563  # of WGS 84
+_E2 = _F * (2 - _F)

@@ -1,0 +1,72 @@
+"""Radial velocities: how fast the range of each return grows, as a coherent lidar measures it.
+
+The velocity of the point that was hit, less that of the ray's origin, along the ray: what the
+Doppler shift 2 v / wavelength of FMCW lidars shows (Hexsel, Vhavle and Chen 2022). Both are
+derivatives of the trajectories' own curves (`lidarpool.sensor.trajectory.velocities`).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from .motion import Poses, products
+from .surfaces import Surfaces
+
+BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
+
+Real = NDArray[np.float64]
+
+
+def approach(poses: Poses, ray: NDArray[np.integer[Any]], origins: Real, directions: Real) -> Real:
+    """How fast rays (n,) grow because their origins move, m/s: (n,); what stands still has that.
+
+    Origins and unit directions are (n, 3), in the scene's axes.
+    """
+    out = np.zeros(len(ray))
+    if poses.carrier is None:
+        return out
+    origins = np.broadcast_to(origins, directions.shape)
+    for begin in range(0, len(ray), BLOCK_HITS):
+        block = slice(begin, begin + BLOCK_HITS)
+        drift = poses.drift(ray[block], origins[block])
+        out[block] = -products(drift.T, directions[block].T)
+    return out
+
+
+def radial_velocities(
+    surfaces: Surfaces,
+    poses: Poses,
+    ray: NDArray[np.integer[Any]],
+    rays: tuple[Real, Real],
+    distance: Real,
+    triangle: NDArray[np.int32],
+    times: Real | NDArray[np.int64],
+) -> Real:
+    """Return the radial velocities of straight rays (n,) that end on triangles, m/s: (n,).
+
+    Parameters
+    ----------
+    rays
+        Their origins and unit directions, (n, 3) each, in the scene's axes.
+    distance
+        (n,): where they end, metres; without noise.
+    triangle
+        (n,): what they hit; what is in the air, -1, is at rest.
+    times
+        (n,): when they are fired, nanoseconds since the survey's start; for actors.
+    """
+    origins, directions = rays
+    out = approach(poses, ray, origins, directions)
+    if not poses.ways:
+        return out
+    origins = np.broadcast_to(origins, directions.shape)
+    for begin in range(0, len(ray), BLOCK_HITS):
+        block = slice(begin, begin + BLOCK_HITS)
+        ahead = directions[block]
+        points = origins[block] + distance[block, None] * ahead
+        velocity = surfaces.velocities(triangle[block], points, times[block], poses.ways)
+        out[block] += products(velocity.T, ahead.T)
+    return out
