@@ -401,10 +401,10 @@ def test_a_function_makes_jobs():
     assert other.identity["make"] != found.identity["make"]
 
 
-def test_noise_of_a_function_that_has_a_seed_or_no_effect_is_kept():
-    for noise in (Noise(), Noise(range_m=1, seed=4)):
-        made = Campaign(lambda number, rng, noise=noise: job(noise=noise), count=3).describe(1)
-        assert made.made.survey.noise == noise
+def test_noise_of_a_function_that_has_a_seed_is_kept():
+    noise = Noise(range_m=1, seed=4)
+    made = Campaign(lambda number, rng: job(noise=noise), count=3).describe(1)
+    assert made.made.survey.noise == noise
 
 
 @pytest.mark.parametrize(

@@ -27,8 +27,10 @@ from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.noise import raw
-from lidarpool.simulator.echoes import Hits, chosen, separated
+from lidarpool.simulator.echoes import chosen
+from lidarpool.simulator.hits import Hits
 from lidarpool.simulator.rig import Rig
+from lidarpool.simulator.separation import separated
 from raybeam import available_backends
 
 COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "returns", "class")

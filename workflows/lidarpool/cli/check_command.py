@@ -238,7 +238,7 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
                 turns += f"{one['metres_a_turn']:,.3f} m"
             firings = counted(one["firings"], "firing")
             yield f"{one['name'] or 'sensor':<11} {one['model']}, {firings}{turns}"
-    returns = job.survey.returns
+    returns = job.survey.returns_each[0]
     if drive or returns != type(returns)():
         rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"

@@ -214,7 +214,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     Also returns how many rays were cast.
     """
     rig = Rig(scene, survey, backend)
-    all_rays = survey.ray_count * survey.returns.subrays
+    all_rays = survey.ray_count * max(returns.subrays for returns in survey.returns_each)
     least, most = SAMPLE_SCANS
     few = max(1, SAMPLE_MOST * survey.scan_count // all_rays)
     count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, min(least, few), most)
@@ -268,9 +268,11 @@ def _look_at_folder(out: Path | Storage) -> list[str]:
 
 def _worker_bytes(job: Job) -> int:
     """Memory of a GPU worker, without what it casts."""
-    sensors = [carried.sensor for carried in job.survey.carried]
-    each = job.survey.returns.subrays
-    rays = sum(min((s.period or 0) * s.channels * each, PATTERN_RAYS) for s in sensors)
+    each = zip(job.survey.carried, job.survey.returns_each, strict=True)
+    rays = sum(
+        min((carried.sensor.period or 0) * carried.sensor.channels * returns.subrays, PATTERN_RAYS)
+        for carried, returns in each
+    )
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
     images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
     coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())

@@ -19,6 +19,8 @@ from ..base.words import did_you_mean
 
 Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
 
+NO_SURFACE = "no surface"  # instead of an object's name
+CAUSES = ("surface", "air", "false alarm", "crosstalk", "blooming")  # of a return
 COORDINATES = ("world", "sensor")  # coordinate systems of points
 _OPEN3D = ("positions", "normals", "colors")  # Open3D, which writes the files
 
@@ -121,7 +123,9 @@ CHANNEL = Column(
     kind="label",
     file_name="ring",
 )
-OBJECT = Column("object", "int32", "", "object that was hit", "object", kind="label")
+OBJECT = Column(
+    "object", "int32", "", "object that was hit; -1 for no surface", "object", kind="label"
+)
 
 AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
 ALWAYS = (*AXES, CHANNEL, OBJECT)  # the columns that every part holds; `scan` follows from its rows
@@ -164,6 +168,14 @@ OPTIONAL = (
         "",
         "semantic class of the material; 0 for none",
         "semantic_class",
+        kind="label",
+    ),
+    Column(
+        "cause",
+        "uint8",
+        "",
+        "why the return is there: " + "; ".join(f"{n} {what}" for n, what in enumerate(CAUSES)),
+        "cause",
         kind="label",
     ),
     Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),

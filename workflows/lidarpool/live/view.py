@@ -342,7 +342,7 @@ class View:
         rows, _ = self._finder.find(_HITS_SAMPLE)
         if self.pictured is not None and "object" in self.columns:
             owners = self._finder.points.values("object", rows)
-            rows = rows[owners < len(self.pictured.scene.names)]
+            rows = rows[(owners >= 0) & (owners < len(self.pictured.scene.names))]
         return (positions(self._finder.points, rows) - self.origin).astype(np.float32)
 
     def _range(self, sweep: int) -> Answer:

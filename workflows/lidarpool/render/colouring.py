@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..columns.table import COLOURS, Column
+from ..columns.table import COLOURS, NO_SURFACE, Column
 from ..scene.colours import packed, unpacked
 from .theme import mapped, object_colours
 
@@ -74,7 +74,11 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
             if len(found) > MOST_ENTRIES:
                 found = found[np.argsort(-counts, kind="stable")]
             words = [
-                names[value] if 0 <= value < len(names) else f"{column.name} {value}"
+                names[value]
+                if 0 <= value < len(names)
+                else NO_SURFACE
+                if value < 0
+                else f"{column.name} {value}"
                 for value in found.tolist()
             ]
             labels = tuple(zip(words, palette[found % len(palette)], strict=True))

@@ -17,13 +17,14 @@ _ENOUGH = 12  # points in a cell from which a density is estimated
 class CountedCloud:
     """A cloud that computes its statistics while its points are read for something else.
 
-    `by_object` are the points of each object, `limits` are {column: minimum and maximum}, and
-    `bounds` (2, 3) the lowest and highest coordinates in the world.
+    `by_object` are the points of each object, `no_surface` those of none, `limits`
+    are {column: minimum and maximum}, and `bounds` (2, 3) the lowest and highest coordinates in the
+    world.
     """
 
     def __init__(self, cloud: CloudLike, objects: int) -> None:
         self._cloud = cloud
-        self.by_object = np.zeros(objects, np.int64)
+        self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: NDArray[np.float64] = np.asarray(cloud.bounds, dtype=np.float64)
         # A cell that a surface crosses has about the square of its side of that surface.
@@ -38,7 +39,11 @@ class CountedCloud:
     def chunks(self, points: int = CHUNK_POINTS, first: int = 0) -> Iterator[Cloud]:
         """Yield the points in order, and update the statistics."""
         for chunk in self._cloud.chunks(points, first):
-            self.by_object += np.bincount(chunk["object"], minlength=len(self.by_object))
+            owners = chunk["object"]
+            if owners.min(initial=0) < 0:
+                owners = owners[owners >= 0]
+                self.no_surface += len(chunk) - len(owners)
+            self.by_object += np.bincount(owners, minlength=len(self.by_object))
             for name, values in chunk.columns.items():
                 low, high = self.limits.get(name, (np.inf, -np.inf))
                 self.limits[name] = min(low, values.min().item()), max(high, values.max().item())

@@ -15,6 +15,7 @@ import numpy as np
 from .._version import __version__
 from ..base.declared import declared
 from ..base.storage import Storage
+from ..columns.table import NO_SURFACE
 from ..pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..pipeline.task_book import StageTotals, union
 from ..plan.planning import Search
@@ -74,7 +75,8 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
         "points": len(result.points),
         "points_by_object": {
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
-        },
+        }
+        | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
         "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
@@ -120,8 +122,8 @@ def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
         "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
-        "returns": asdict(survey.returns),
-        "noise": asdict(survey.noise),
+        "returns": asdict(survey.returns_each[0]),
+        "noise": asdict(survey.noise_each[0]),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),
     }

@@ -23,7 +23,7 @@ from ..base.fingerprint import fingerprint
 from ..base.words import counted
 from ..base.yamlfile import read_yaml
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Noise, Survey
 from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits, Value, file_of
 from .draws import Draw
 from .paths import FieldPath, find_field, held, opened, put
@@ -324,10 +324,7 @@ class _Made:
                 "the same names, with None where there is no value."
             )
         values = {name: _plain(number, name, value) for name, value in made.values.items()}
-        survey = made.survey
-        if (survey.noise.loses or survey.noise.displaces) and not survey.noise.seed:
-            noise = replace(survey.noise, seed=_noise_seed(self._seed, number))
-            made = replace(made, survey=replace(survey, noise=noise))
+        made = replace(made, survey=_seeded(made.survey, _noise_seed(self._seed, number)))
         return Described(number, "", _without_none(values), made=made)
 
     def _made(self, number: int) -> CampaignJob:
@@ -610,6 +607,19 @@ class _Base:
 
 def _noise_seed(seed: int, number: int) -> int:
     return Draw(seed, number, _NOISE).bits(63) or 1
+
+
+def _seeded(survey: Survey, seed: int) -> Survey:
+    """Give the noise of a survey a seed where it has none."""
+
+    def seeded(noise: Noise) -> Noise:
+        return noise if noise.seed else replace(noise, seed=seed)
+
+    sensors = [
+        replace(one, noise=None if one.noise is None else seeded(one.noise))
+        for one in survey.sensors
+    ]
+    return replace(survey, noise=seeded(survey.noise), sensors=sensors)
 
 
 def _without_none(values: Mapping[str, Value | None]) -> dict[str, Value]:

@@ -53,12 +53,16 @@ class Mounted:
         Its name, needed if there are several.
     steps
         Time steps from each station; by default those of the survey.
+    returns, noise
+        Its own; by default those of the survey.
     """
 
     sensor: Sensor
     mount: Pose = CENTRE
     name: str = ""
     steps: Steps | None = None
+    returns: Returns | None = None
+    noise: Noise | None = None
 
 
 @dataclass(frozen=True)
@@ -269,8 +273,8 @@ class Survey(CloudOptions, Weather):
                 f"start is {self.start}; it must be a time from 2017 on, with its time zone: "
                 "2026-11-21T10:00:00Z."
             )
-        for carried in self.carried:
-            self.returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
+        for carried, returns in zip(self.carried, self.returns_each, strict=True):
+            returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""
@@ -304,6 +308,16 @@ class Survey(CloudOptions, Weather):
     def carried(self) -> tuple[Mounted, ...]:
         """The sensors, also if there is only one."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
+
+    @cached_property
+    def returns_each(self) -> tuple[Returns, ...]:
+        """What each sensor reports of its pulses."""
+        return tuple(carried.returns or self.returns for carried in self.carried)
+
+    @cached_property
+    def noise_each(self) -> tuple[Noise, ...]:
+        """Noise of each sensor."""
+        return tuple(carried.noise or self.noise for carried in self.carried)
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:

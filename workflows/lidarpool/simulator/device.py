@@ -25,6 +25,7 @@ from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
 from .echoes import Echoes
+from .hits import SURFACE
 from .motion import Poses
 from .returns import BatchReturns
 from .surfaces import Surfaces
@@ -39,7 +40,7 @@ _MADE = (
     *AXES, CHANNEL, OBJECT,
     *(TABLE[name] for name in ("ray", "time", "range", *_ENERGIES, "class")), _TRIANGLE,
 )  # fmt: skip
-_EQUAL = "sensor", "return_number", "returns"  # the same for all points
+_EQUAL = "sensor", "return_number", "returns", "cause"  # the same for all points
 _HITS = np.uint32, np.float64, np.int32  # rays, distances and triangles of hits for NumPy
 _NO_HITS = (np.zeros(0, np.int64), *(np.zeros(0, kind) for kind in _HITS))
 
@@ -83,7 +84,7 @@ class DeviceReturns:
             return self.columns[column.name]
         if self.returns is not None:
             return column.make(self.returns)
-        value = self.specs[0].sensor if column.name == "sensor" else 1
+        value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
         return np.full(len(self), value, column.dtype)
 
     def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:

@@ -49,16 +49,21 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     passing = any(material.transparent != "none" for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)
     textured = any(material.reflectance == "texture" for material in survey.materials)
-    subrays, noise = survey.returns.subrays, survey.noise
-    echoes = subrays > 1 or noise.loses or passing or dark
-    several = survey.returns.mode in ("all", "dual") and (subrays > 1 or passing)
     bodies = bool(scene.actors or scene.instances)
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
-    made_there = on_device and not (echoes or noise.displaces)
+    plain = all(
+        returns.subrays == 1 and not (noise.loses or noise.displaces)
+        for returns, noise in zip(survey.returns_each, survey.noise_each, strict=True)
+    )
+    made_there = on_device and plain and not (passing or dark)
     by_numpy = not made_there or needs_hits(survey)
     most = 0.0
-    for carried, steps in zip(survey.carried, survey.steps_each, strict=True):
-        sensor = carried.sensor
+    for carried, steps, reported, noise in zip(
+        survey.carried, survey.steps_each, survey.returns_each, survey.noise_each, strict=True
+    ):
+        sensor, subrays = carried.sensor, reported.subrays
+        echoes = subrays > 1 or noise.loses or passing or dark
+        several = reported.mode in ("all", "dual") and (subrays > 1 or passing)
         first, stop = sensor.firings(0)
         firings = (stop - first) * scans
         rays = firings * sensor.channels

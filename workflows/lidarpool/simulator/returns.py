@@ -237,7 +237,10 @@ class BatchReturns:
 
     @cached_property
     def cosine(self) -> NDArray[np.float64]:
-        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1."""
+        """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
+
+        It means nothing where there is no surface.
+        """
         ways = self._poses.ways
         times = self.time if ways else np.zeros(len(self), np.int64)
         normals = self._surfaces.normals(self.found.triangle, times, ways)
@@ -298,6 +301,14 @@ class BatchReturns:
         return self.found.returns
 
     @property
+    def cause(self) -> NDArray[np.uint8]:
+        """Why the return is there, see `CAUSES` of the table of columns."""
+        if self.found.cause is None:
+            return np.zeros(len(self), np.uint8)
+        return self.found.cause
+
+    @property
     def semantic_class(self) -> NDArray[np.uint16]:
         """Class of the material."""
-        return self._surfaces.materials.semantic_class[self.object]
+        classes, owners = self._surfaces.materials.semantic_class[self.object], self.object
+        return classes if self.found.cause is None else np.where(owners < 0, 0, classes)

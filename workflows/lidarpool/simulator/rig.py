@@ -85,7 +85,7 @@ class Rig:
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
-                made = _Rays(pattern, self._echoes.divided(sensor, pattern), by_head=True)
+                made = _Rays(pattern, self._echoes[number].divided(pattern), by_head=True)
             elif repeats:
                 made = self._rays_of(number, 0, sensor.period or 0)
             self._made[number, moves] = made
@@ -124,10 +124,10 @@ class Rig:
     def _see(self) -> None:
         """Make what depends on where the surfaces are."""
         given = self._world, self.scene, self.survey, self._surfaces
-        self._echoes = EchoCaster(*given)
+        self._echoes = [EchoCaster(number, *given) for number in range(len(self.survey.carried))]
         if self._device is not None:
             self._device = self._device.moved(self.scene, self._surfaces)
-        elif self._echoes.plain and self._world.caster.on_device:
+        elif all(echoes.plain for echoes in self._echoes) and self._world.caster.on_device:
             self._device = DeviceColumns(*given)
 
     @property
@@ -170,7 +170,7 @@ class Rig:
         number, survey = specs[0].sensor, self.survey
         whole, subrays, by_head = self._repeated(number, path.moves)
         carried = survey.carried[number]
-        sensor, channels = carried.sensor, carried.sensor.channels
+        channels = carried.sensor.channels
         first, stop = specs[0].firings[0], specs[-1].firings[1]
         if path.moves or by_head:
             poses = poses_of_firings(carried, path, specs[0].station, first, stop, late_ns)
@@ -186,7 +186,8 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        found = self._echoes.scan(sensor, specs[0].scan, pattern, subrays, poses, window, groups)
+        echoes = self._echoes[number]
+        found = echoes.scan(specs[0].scan, pattern, subrays, poses, window, groups)
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
@@ -228,9 +229,8 @@ class Rig:
             poses = self._timed(poses, specs, count)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
             scan, window = specs[0].scan + begin * len(specs), (0, len(image))
-            found = self._echoes.scan(
-                sensor, scan, pattern, subrays, poses, window, groups, tally=False
-            )
+            echoes = self._echoes[number]
+            found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=False)
             nearest = found.number == 1
             image[found.ray[nearest]] = found.reported[nearest]
         return out.reshape(len(positions), -1, sensor.channels)
@@ -245,6 +245,6 @@ class Rig:
             pattern = self.pattern(number, first, stop)
             if len(self._firings) >= KEPT:
                 self._firings.clear()
-            rays = _Rays(pattern, self._echoes.divided(sensor, pattern))
+            rays = _Rays(pattern, self._echoes[number].divided(pattern))
             made = self._firings[number, first, stop] = rays
         return made

@@ -87,7 +87,7 @@ class Surfaces:
         self._parts_begin = int(firsts[-1])
         owners = np.arange(self._standing, self._standing + len(moving), dtype=np.int32)
         # Objects of the triangles of faces and of actors; the last is of no triangle.
-        owned = [scene.face_object, np.repeat(owners, moving), np.zeros(1, np.int32)]
+        owned = [scene.face_object, np.repeat(owners, moving), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(owned)
         if shared is not None:
             self._turns = _turns(shared.transforms)
@@ -232,7 +232,7 @@ class Surfaces:
         return np.concatenate(bodies).astype(np.int64), np.concatenate(turns)
 
     def objects(self, triangle: Triangles) -> NDArray[np.int32]:
-        """Objects of triangles (n,)."""
+        """Objects of triangles (n,); -1 of no surface."""
         shared = self._scene.instances
         if shared is None:
             return self.owners[triangle]

@@ -1,0 +1,1 @@
+"""Effects of lidars: the pictures of docs/effects.md, and what each effect costs."""

@@ -1,0 +1,84 @@
+"""Hits of sub-rays, and the keys of their random numbers."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..columns.table import CAUSES
+
+NO_SURFACE = -1  # triangle and object of what is no surface
+SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING = range(len(CAUSES))
+
+Whole = NDArray[np.int64]
+Rays = NDArray[np.integer[Any]]
+Real = NDArray[np.float64]
+
+
+class Hits(NamedTuple):
+    """Points that light returned from, in the order of rays: arrays (n,).
+
+    What is no surface has the triangle `NO_SURFACE`.
+    """
+
+    ray: Whole
+    distance: Real
+    triangle: NDArray[np.int32]
+    energy: Real
+    colour: NDArray[np.uint32] | None = None  # packed, see `Surfaces.colours`
+    cause: NDArray[np.uint8] | None = None  # None if all are surfaces
+
+    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
+        """Select some of them."""
+        colour = None if self.colour is None else self.colour[rows]
+        cause = None if self.cause is None else self.cause[rows]
+        own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
+        return Hits(*own, colour, cause)
+
+
+# Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
+# rays: (n, 3) each.
+Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
+
+
+def joined(parts: list[Hits]) -> Hits:
+    """Concatenate hits; all have colours, or none, and those without a cause are surfaces."""
+    *own, colours, causes = zip(*parts, strict=True)
+    colour = None if parts[0].colour is None else np.concatenate(colours)
+    cause = None
+    if any(one is not None for one in causes):
+        cause = np.concatenate(
+            [
+                np.zeros(len(part.ray), np.uint8) if part.cause is None else part.cause
+                for part in parts
+            ]
+        )
+    return Hits(*map(np.concatenate, own))._replace(colour=colour, cause=cause)
+
+
+@dataclass(frozen=True)
+class Keys:
+    """Keys of the random numbers of rays."""
+
+    scan: int  # number of the first scan
+    begins: Whole  # rays at which scans begin
+
+    def of(self, ray: Rays) -> tuple[Whole, Whole]:
+        """Return the scans of rays, and their numbers within them."""
+        number = np.searchsorted(self.begins, ray, side="right") - 1
+        return self.scan + number, ray - self.begins[number]
+
+
+def numbers(ray: Whole) -> Whole:
+    """Count the entries of each ray, which are consecutive, from 0: (n,)."""
+    return np.arange(len(ray)) - np.repeat(*runs(ray))
+
+
+def runs(ray: Whole) -> tuple[Whole, Whole]:
+    """Find starts and lengths of runs of equal numbers."""
+    begins = np.flatnonzero(np.diff(ray, prepend=-1))
+    return begins, np.diff(begins, append=len(ray))
