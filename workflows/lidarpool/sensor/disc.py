@@ -122,7 +122,8 @@ class Beam:
         sqrt(w0² + (θ R / 2)²), that of a Gaussian beam: the hyperbola is made of straight lines
         (Herloski, Marshall and Antos 1983).
         """
-        places = _places(count) if profile == "even" else _gaussian_places(count)
+        even = profile == "even" or count == 1
+        places = _places(count) if even else _gaussian_places(count)
         across, up = divergence
         starts = None
         if exit_m and count > 1:

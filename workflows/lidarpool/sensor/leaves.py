@@ -19,8 +19,8 @@ LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
 ]
 NAMES: tuple[str, ...] = LeafAngles.__args__  # type: ignore[attr-defined]
-_NODES = 1025  # cosines at which integrals are tabulated
-_ANGLES = 4000  # of leaves, in the integrals
+_NODES = 361  # angles of light for which integrals are tabulated, from 0 to 90 degrees
+_ANGLES = 500  # of leaves, in the integrals
 
 Real = NDArray[np.float64]
 
@@ -74,13 +74,13 @@ def density(leaf_angle: str | float, angle: Real) -> Real:
 @cache
 def _tables(leaf_angle: str | float) -> tuple[Real, Real, Real]:
     """Cosines of light from the vertical, and for them what `projection` and `brightness` are."""
-    cosine = np.linspace(0, 1, _NODES)[:, None]
+    cosine = np.sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES) + 0.5) * (np.pi / 2 / _ANGLES)
     share = density(leaf_angle, angle)
     share /= share.sum()
     # Cosine between light and a leaf's normal: `along + across * cos(azimuth)`.
     along = cosine * np.cos(angle)
-    across = np.sqrt(1 - cosine**2) * np.sin(angle)
+    across = np.sqrt(np.maximum(1 - cosine**2, 0)) * np.sin(angle)
     # Its mean size over all azimuths (Ross 1981): beyond `turn`, light meets the other side.
     turn = np.arccos(-np.minimum(along / np.maximum(across, 1e-300), 1))
     mean = (along * (2 * turn - np.pi) + 2 * across * np.sin(turn)) / np.pi

@@ -383,9 +383,13 @@ class MaterialTable:
     def goes_on(
         self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Share of the light that continues at glass or mirrors (n,)."""
-        through = np.where(self.passes[rows], 1 - fresnel(cosine), 1.0)
-        return np.asarray((1 - self.reflectance[rows]) * through)
+        """Share of the light that continues at glass or mirrors (n,).
+
+        Where it is refracted, what the surface reflects is not taken off.
+        """
+        glass = self.passes[rows] & ~self.refracts[rows]
+        through = np.where(glass, 1 - fresnel(cosine), 1.0)
+        return np.asarray(np.where(self.leafy[rows], 1, 1 - self.reflectance[rows]) * through)
 
 
 def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArray[np.float64]:

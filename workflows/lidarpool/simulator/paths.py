@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,22 +12,64 @@ from raybeam import Pattern
 from ..columns.table import COLOURS
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from .hits import Hits, Planes, Real, joined
+from ..sensor.noise import raw
+from .hits import Hits, Keys, Planes, Real, Whole, joined
+from .media import LEAF, Around, Bundle, Media, depths, refracted
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
 from .world import World
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
+LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
+
+
+@dataclass
+class _Light:
+    """The light of sub-rays on its way: arrays (n,), vectors (n, 3)."""
+
+    ray: Whole  # number of the sub-ray
+    times: Real
+    origins: Real
+    directions: Real
+    share: Real  # that comes back, but for what the last surface scatters
+    before: Real  # optical path up to the origin
+    # What mirrors did to the directions so far, (n, 3, 3), if there are any.
+    turns: Real | None = None
+    # If there are media: those around it, its bundle if they refract, and the optical depth that is
+    # left until a leaf if there are any.
+    around: Around | None = None
+    bundle: Bundle | None = None
+    left: Real | None = None
+
+    def on(self, rows: NDArray[np.intp]) -> _Light:
+        """Select that of some sub-rays."""
+        own = self.ray, self.times, self.origins, self.directions, self.share, self.before
+        return _Light(
+            *(values[rows] for values in own),
+            None if self.turns is None else self.turns[rows],
+            None if self.around is None else self.around.take(rows),
+            None if self.bundle is None else self.bundle.take(rows),
+            None if self.left is None else self.left[rows],
+        )
 
 
 class Paths:
     """Finds where the light of a sensor returns from."""
 
     def __init__(
-        self, world: World, scene: Scene, survey: Survey, sensor: Sensor, surfaces: Surfaces
+        self,
+        world: World,
+        scene: Scene,
+        survey: Survey,
+        sensor: Sensor,
+        surfaces: Surfaces,
+        seed: int = 0,
     ) -> None:
         self._world, self._sensor, self._surfaces = world, sensor, surfaces
-        self._light = light_of(survey, sensor)
+        self._light, self._seed = light_of(survey, sensor), seed
+        table = surfaces.at(sensor.optics.wavelength_nm)
+        filled = table.leafy.any() or table.refracts.any()
+        self._media = Media(scene, surfaces, table) if filled else None
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
@@ -42,58 +86,90 @@ class Paths:
         """Return the received energy of hits (n,), see `Surfaces.energy`."""
         return self._surfaces.energy(triangle, cosine, distance, self._light, colour)
 
-    def hits(self, beams: Pattern, poses: Poses, window: tuple[int, int]) -> tuple[Hits, Planes]:
-        """Cast the sub-rays of a window, and follow the light through glass and off mirrors."""
-        surfaces = self._surfaces
+    def hits(
+        self,
+        beams: Pattern,
+        poses: Poses,
+        window: tuple[int, int],
+        keys: Keys,
+        first: int = 0,
+        each: int = 1,
+    ) -> tuple[Hits, Planes]:
+        """Cast the sub-rays of a window, and follow the light through glass and off mirrors.
+
+        There are `each` of a beam, and the first beam has the number `first` for its keys.
+        """
+        surfaces, media = self._surfaces, self._media
         materials = surfaces.at(self._light.wavelength_nm)
         nearest, farthest = self._sensor.min_range_m, self._sensor.max_range_m
-        found = self._world.scan(beams, poses, window=window, t_min=nearest, t_max=farthest)
-        ray, step, triangle = found.ray.astype(np.int64), found.distance, found.triangle
-        origins, directions = poses.rays(beams, ray, window[0])
-        origins = np.broadcast_to(origins, directions.shape)
-        times = poses.times(ray)
-        share, before = np.ones(len(ray)), np.zeros(len(ray))
-        # What mirrors did to the directions so far: (n, 3, 3), if there are any.
-        turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3)) if materials.mirrors.any() else None
+        leafy = media is not None and media.leafy
+        # How far light goes in a crown depends on its other side, however far that is.
+        reach = np.inf if leafy else farthest
+        found = self._world.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
+        light = self._started(beams, poses, window, found.ray.astype(np.int64))
+        step, triangle = found.distance, found.triangle
+
+        def draw(purpose: int, ray: Whole) -> NDArray[np.uint64]:
+            scan, number = keys.of(first + ray // each)
+            return raw(self._seed, purpose, scan, number, ray % each)
+
+        if leafy:
+            light.left = depths(draw(LEAF, light.ray))
         parts: list[Hits] = []
         seen: list[Real] = []  # normals as the sensor sees them
-        for _ in range(PASSES_MOST):
-            normals = surfaces.normals(triangle, times, poses.ways)
-            along = products(normals.T, directions.T)
-            distance = before + step
+        clear: float | Real = nearest  # where light is first, from the origin
+        for _ in range(LEAFY_PASSES_MOST if leafy else PASSES_MOST):
+            normals = surfaces.normals(triangle, light.times, poses.ways)
+            along = products(normals.T, light.directions.T)
+            cosine = np.abs(along)
+            leaves = np.zeros(0, np.intp)
+            if media is not None and light.around is not None and light.left is not None:
+                leaves, metres, entered, cosines = media.meet(
+                    light.around, light.left, light.directions, step - clear, light.ray, draw
+                )
+                step, triangle = step.copy(), triangle.copy()
+                step[leaves] = np.broadcast_to(clear, step.shape)[leaves] + metres
+                triangle[leaves], cosine[leaves] = entered, cosines
+                normals[leaves] = light.directions[leaves]  # no leaf continues another
+            bundle = light.bundle
+            distance = light.before + (step if bundle is None else step * bundle.index)
             colour = None
             if self._coloured:
-                points = origins + step[:, None] * directions
-                colour = surfaces.colours(triangle, points, times, poses.ways)
-            energy = share * self.energy(triangle, np.abs(along), distance, colour)
-            parts.append(Hits(ray, distance, triangle, energy, colour))
-            seen.append(normals if turns is None else np.einsum("nji,nj->ni", turns, normals))
+                points = light.origins + step[:, None] * light.directions
+                colour = surfaces.colours(triangle, points, light.times, poses.ways)
+            energy = light.share * self.energy(triangle, cosine, distance, colour)
+            if bundle is not None and media is not None and light.around is not None:
+                bundle.go(step, media.attenuation(light.around, self._light.extinction))
+                energy *= bundle.factor(light.directions, distance, self._light.extinction)
+            hits = Hits(light.ray, distance, triangle, energy, colour)
+            turns = light.turns
+            looks = normals if turns is None else np.einsum("nji,nj->ni", turns, normals)
             rows = surfaces.objects(triangle)
-            on = np.flatnonzero(materials.passes[rows] | materials.mirrors[rows])
+            goes = materials.passes[rows] | materials.mirrors[rows]
+            if leafy:
+                crowns = materials.leafy[rows]  # whose surfaces send nothing back
+                crowns[leaves] = False
+                near = distance <= farthest
+                goes = (goes | crowns) & near
+                there = np.flatnonzero(near & ~crowns)
+                hits, looks = hits.take(there), looks[there]
+            parts.append(hits)
+            seen.append(looks)
+            on = np.flatnonzero(goes)
             if not len(on):
                 break
-            rows, along, distance, ahead = rows[on], along[on], distance[on], directions[on]
-            share = share[on] * materials.goes_on(rows, np.abs(along)) ** 2  # and back again
-            ends = origins[on] + step[on, None] * ahead
-            mirrored = 2 * materials.mirrors[rows, None] * normals[on]
-            ahead = ahead - along[:, None] * mirrored
-            if turns is not None:
-                turns = turns[on]
-                along_turns = np.einsum("ni,nij->nj", normals[on], turns)
-                turns = turns - mirrored[:, :, None] * along_turns[:, None]
-            away = self._clear_m / np.maximum(np.abs(along), 1e-3)
-            light = Pattern(ahead, ends + away[:, None] * ahead)
+            light, clear = self._behind(
+                light.on(on), step[on], distance[on], triangle[on], normals[on], along[on]
+            )
             # Light takes no time: it travels 300 m in a microsecond.
-            now = Poses(np.zeros(3), clock=Clock(times[on], np.zeros(1), poses.ways))
-            found = self._world.scan(light, now, t_max=farthest)
-            before = distance + away
-            near = before[found.ray] + found.distance <= farthest
-            which, step, triangle = found.ray[near], found.distance[near], found.triangle[near]
-            ray, share, before = ray[on][which], share[which], before[which]
-            times = times[on][which]
-            turns = None if turns is None else turns[which]
-            directions = light.directions[which]
-            origins = light.origins[which]  # type: ignore[index]  # it has some
+            now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
+            found = self._world.scan(Pattern(light.directions, light.origins), now, t_max=reach)
+            which, step, triangle = found.ray, found.distance, found.triangle
+            if not leafy:
+                index = 1.0 if light.bundle is None else light.bundle.index[which]
+                near = light.before[which] + step * index <= farthest
+                which, step, triangle = which[near], step[near], triangle[near]
+            light, clear = light.on(which), clear[which]
         hits, normals = joined(parts), seen[0]
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
@@ -103,3 +179,70 @@ class Paths:
             return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
 
         return hits, planes
+
+    def _started(
+        self, beams: Pattern, poses: Poses, window: tuple[int, int], ray: Whole
+    ) -> _Light:
+        """Light of sub-rays that hit something, where it leaves the sensor."""
+        media = self._media
+        origins, directions = poses.rays(beams, ray, window[0])
+        origins = np.broadcast_to(origins, directions.shape)
+        light = _Light(
+            ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
+        )
+        if self._surfaces.materials.mirrors.any() or (media is not None and media.bends):
+            light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
+        if media is not None:
+            light.around = media.around(self._world, origins, light.times, poses, self._clear_m)
+            if media.bends:
+                light.bundle = Bundle.of(directions, media.index(light.around))
+        return light
+
+    def _behind(
+        self,
+        light: _Light,
+        step: Real,
+        distance: Real,
+        triangle: NDArray[np.int32],
+        normals: Real,
+        along: Real,
+    ) -> tuple[_Light, Real]:
+        """Take light (n,) through the surfaces at its end, or off them.
+
+        Returns it behind them, and where the surfaces are from there, at or below 0.
+        """
+        materials = self._surfaces.at(self._light.wavelength_nm)
+        rows = self._surfaces.objects(triangle)
+        cosine = np.abs(along)
+        share = light.share * materials.goes_on(rows, cosine) ** 2  # and back again
+        ahead, mirrors = light.directions, materials.mirrors[rows]
+        around, bundle, index = light.around, light.bundle, 1.0
+        if self._media is not None and around is not None:
+            around = self._media.behind(around, rows, triangle, along)
+            if bundle is not None:
+                index = self._media.index(around)
+                ahead, passes, whole = refracted(ahead, normals, along, index / bundle.index)
+                share *= passes**2
+                mirrors = mirrors | whole
+                index = np.where(mirrors, bundle.index, index)
+                around.restore(np.flatnonzero(mirrors), light.around)
+        mirrored = 2 * mirrors[:, None] * normals
+        ahead = ahead - along[:, None] * mirrored
+        if bundle is not None:
+            bundle.turn(light.directions, ahead, normals, mirrors, index)
+            cosine = np.abs(products(normals.T, ahead.T))
+        turns = light.turns
+        if turns is not None:
+            along_turns = np.einsum("ni,nij->nj", normals, turns)
+            turns = turns - mirrored[:, :, None] * along_turns[:, None]
+        away = self._clear_m / np.maximum(cosine, 1e-3)
+        ends = light.origins + step[:, None] * light.directions
+        path = Pattern(ahead, ends + away[:, None] * ahead)
+        if bundle is not None and self._media is not None and around is not None:
+            bundle.go(away, self._media.attenuation(around, self._light.extinction))
+        assert path.origins is not None  # it was given some
+        behind = _Light(
+            light.ray, light.times, path.origins, path.directions, share, distance + away * index,
+            turns, around, bundle, light.left,
+        )  # fmt: skip
+        return behind, -away

@@ -271,6 +271,30 @@ class Surfaces:
         scattered = table.scattered(self.objects(triangle), cosine, bright)
         return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
+    @cached_property
+    def solids(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Whether the surfaces of objects that hold a medium are closed, and point inwards: (n,).
+
+        They point inwards if they are closed and have a negative volume.
+        """
+        table, scene = self.materials, self._scene
+        closed = np.ones(len(table.reflectance), np.bool_)
+        volume = np.zeros(len(closed))
+        for number in np.flatnonzero(table.leafy | table.refracts):
+            bodies: list[tuple[Real, Triangles]] = []
+            if number >= self._standing:
+                mesh = scene.actors[number - self._standing].mesh
+                bodies.append((mesh.vertices, mesh.faces))
+            elif (own := scene.face_object == number).any():
+                bodies.append((scene.vertices, scene.faces[own]))
+            if scene.instances is not None:
+                parts = np.unique(scene.instances.part[scene.instances.owner == number])
+                bodies += [scene.instances.parts[part][:2] for part in parts]
+            for vertices, faces in bodies:
+                closed[number] &= _closed(vertices, faces)
+                volume[number] += _volume(vertices, faces)
+        return closed, closed & (volume < 0)
+
     @property
     def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
         """Vertices, faces and colours of the triangles that are kept once.
@@ -315,3 +339,23 @@ class Surfaces:
 def _turns(transforms: Real) -> Real:
     """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
     return np.asarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)
+
+
+def _closed(vertices: Real, faces: Triangles) -> bool:
+    """Whether a surface has no gaps: each edge is one of two triangles that wind alike."""
+    used, corners = np.unique(faces, return_inverse=True)
+    # Vertices of flat shading are one for each triangle.
+    _, same = np.unique(vertices[used], axis=0, return_inverse=True)
+    corners = same.reshape(-1)[corners.reshape(-1)].reshape(-1, 3).astype(np.int64)
+    ahead, after = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
+    some = ahead != after
+    there, back = (
+        np.sort(one[some] * len(used) + other[some]) for one, other in ((ahead, after), (after, ahead))
+    )
+    return bool(np.array_equal(there, back))
+
+
+def _volume(vertices: Real, faces: Triangles) -> float:
+    """Volume within a closed surface, m³; negative if its triangles wind the other way."""
+    a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum() / 6)
