@@ -119,7 +119,7 @@ class Beam:
 
         Sub-rays of a beam that is wide at its start are skew lines. Off the axis, each starts at a
         right angle to where it goes, so that the beam's radius in the distance R is
-        sqrt(w0² + (θ R / 2)²), that of a Gaussian beam: the hyperbola is made of straight lines
+        sqrt(w0² + (θ R / 2)²), that of a Gaussian beam: the hyperboloid is made of straight lines
         (Herloski, Marshall and Antos 1983).
         """
         even = profile == "even" or count == 1
@@ -128,6 +128,9 @@ class Beam:
         starts = None
         if exit_m and count > 1:
             starts = exit_m / 2 * np.stack([places[:, 1], -places[:, 0]], axis=1)
+            if across != up:
+                # All to one side, sub-rays would turn the oval on its way.
+                starts[1:] *= np.repeat([1, -1] * 3, (count - 1) // 6)[:, None]
         return cls(np.array([across, up]) / 2 * places, starts, across != up and count > 1)
 
 

@@ -161,11 +161,15 @@ class Media:
                     f"materials: {scene.all_names[number]!r} has a leaf_area_density, but its "
                     "surface has gaps: give a closed one, such as a box or a sphere."
                 )
-        bounds = [scene.object_bounds[number] for number in np.flatnonzero(
-            self.filled[: len(scene.object_bounds)])]  # fmt: skip
-        if self.filled[len(scene.object_bounds) :].any():  # an actor, which may be anywhere
-            bounds.append(np.array([[-np.inf] * 3, [np.inf] * 3]))
-        self._bounds = np.array(bounds).reshape(-1, 2, 3)
+        # Where sensors may be within media: an actor may be anywhere, and below a sheet is water.
+        standing = np.flatnonzero(self.filled[: len(scene.object_bounds)])
+        bounds = scene.object_bounds[standing]
+        bounds[~closed[standing], 0, 2] = -np.inf
+        if self.filled[len(scene.object_bounds) :].any():
+            bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
+        self._bounds = bounds
+        for angle in table.leaf_angles if self.leafy else ():
+            projection(angle, np.ones(1))  # makes its table
 
     def sides(self, objects: Numbers, along: Real) -> Bools:
         """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
