@@ -70,7 +70,7 @@ def nearer(meshes, sensor=None, at=(0, 0, 0), **options):
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("count", SUBRAYS[1:])
 def test_beams_follow_the_hyperbola_of_a_gaussian_beam(profile, count):
-    """Second moments are those of w² = w0² + (θ R / 2)² everywhere, and the two axes independent."""
+    """Second moments are those of w² = w0² + (θ R / 2)² everywhere, and the axes independent."""
     beam = Beam.of(count, (3e-3, 1.5e-3), profile, 0.012)
     assert np.allclose(beam.angles[0], 0)
     assert np.allclose(beam.starts[0], 0)
@@ -182,7 +182,7 @@ def test_the_oval_turns_with_the_head_and_with_a_carrier_that_moves():
         angle = np.linspace(0, 2 * math.pi, 129)[:-1]
         ring = np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1)
         low_ring = np.column_stack([ring, np.full(128, low)])
-        points = np.concatenate([low_ring, low_ring + (0, 0, 40)])
+        points = np.concatenate([low_ring, np.add(low_ring, (0, 0, 40))])
         one, other = np.arange(128), np.roll(np.arange(128), -1)
         faces = [[one, other, other + 128], [one, other + 128, one + 128]]
         tubes.append(Mesh(name, points, np.concatenate([np.stack(f, axis=1) for f in faces])))
@@ -201,7 +201,9 @@ def test_the_oval_of_a_line_scanner_lies_across_its_line():
         low, high = np.full(2, -50.0), np.full(2, 50.0)
         high[axis] = 10 * width / 4
         corners = [[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]]]
-        step = Mesh("Near", np.column_stack([corners, np.full(4, -10.0)]), np.array([[0, 1, 2], [0, 2, 3]]))
+        step = Mesh(
+            "Near", np.column_stack([corners, np.full(4, -10.0)]), np.array([[0, 1, 2], [0, 2, 3]])
+        )
         ground = Mesh("Far", step.vertices * (10, 10, 2), step.faces)
         assert nearer([step, ground], sensor) == pytest.approx(normal_share(1), abs=0.03)
 

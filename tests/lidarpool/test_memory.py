@@ -57,6 +57,15 @@ SURVEYS = {
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
     "colours": Survey(MANY, **STILL, **PAINT),
     "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
+    "leaves": Survey(
+        MANY,
+        **STILL,
+        returns=Returns("all", 7, (3.0, 1.5), exit_diameter_m=0.01),
+        materials=[Material("*", 0.5, leaf_area_density=0.02)],
+    ),
+    "water": Survey(
+        MANY, **STILL, materials=[Material("*", 0.5, transparent="pass", refractive_index=1.33)]
+    ),
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
 }
 

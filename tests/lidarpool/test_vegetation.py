@@ -87,7 +87,9 @@ def test_projections_of_known_leaves():
         assert projection(name, np.ones(1))[0] == pytest.approx(value / math.pi, rel=1e-4)
     # Campbell's own approximation of his integral is right to 1 %.
     for x in (0.1, 0.5, 1.0, 2.0, 10.0):
-        approximate = np.sqrt((x * cosine) ** 2 + 1 - cosine**2) / (x + 1.774 * (x + 1.182) ** -0.733)
+        approximate = np.sqrt((x * cosine) ** 2 + 1 - cosine**2) / (
+            x + 1.774 * (x + 1.182) ** -0.733
+        )
         assert projection(x, cosine) == pytest.approx(approximate, rel=0.01)
     assert projection(20.0, cosine[1:]) == pytest.approx(cosine[1:], rel=0.15), "nearly flat"
 
@@ -107,7 +109,10 @@ def test_optical_depths_are_exponentially_distributed():
 @pytest.mark.parametrize("nadir_deg", [0.0, 50.0])
 def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg):
     """Within 1 %: a layer of 3 m with 0.6 m²/m³, a leaf area index of 1.8."""
-    canopy, floor = box("Leaves", (-90, -90, 0), (90, 90, 3)), box("F", (-99, -99, -2), (99, 99, -1))
+    canopy, floor = (
+        box("Leaves", (-90, -90, 0), (90, 90, 3)),
+        box("F", (-99, -99, -2), (99, 99, -1)),
+    )
     materials = [GROUND, Material("Leaves", leaf_area_density=0.6, leaf_angle=leaf_angle)]
     found = cast([canopy, floor], rays(nadir_deg=nadir_deg), (0, 0, 10), materials=materials)
     cosine = math.cos(math.radians(nadir_deg))
@@ -163,7 +168,8 @@ def test_crowns_that_overlap_and_the_trunk_in_them():
     oak, both, ivy = (np.array([0.1, 0.4, 0.3]) * [2, 2, 2]) * slant
     stops = [
         1 - math.exp(-oak) + math.exp(-oak) * 0.25 * (1 - math.exp(-both)),
-        math.exp(-oak) * 0.75 * (1 - math.exp(-both)) + math.exp(-oak - both) * (1 - math.exp(-ivy)),
+        math.exp(-oak) * 0.75 * (1 - math.exp(-both))
+        + math.exp(-oak - both) * (1 - math.exp(-ivy)),
     ]
     for number, stop in enumerate(stops):
         assert (found["object"] == number).mean() == pytest.approx(stop, rel=0.015)
@@ -184,7 +190,9 @@ def test_leaves_are_as_bright_as_they_face_the_light():
     assert found["intensity"][on] == pytest.approx(expected, rel=1e-5)
     # Of the whole cone, the mean over sub-rays is the gap's: each meets leaves by itself.
     beam = Returns("all", subrays=37, divergence_mrad=1)
-    cone = cast([canopy, floor], rays(4000, 0.0), (0, 0, 10), materials=[GROUND, leaves], returns=beam)
+    cone = cast(
+        [canopy, floor], rays(4000, 0.0), (0, 0, 10), materials=[GROUND, leaves], returns=beam
+    )
     tau = projection("planophile", np.ones(1))[0] * 3
     ground = cone["intensity"][cone["object"] == 1].sum() / 4000
     assert ground == pytest.approx(math.exp(-tau) * 0.3 * (10 / 11) ** 2, rel=0.02)
@@ -200,12 +208,16 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
     mirrored[0, 3] = 4
     for meshes in ([inwards, wall], [Instance(crown, mirrored), wall]):
         found = cast(meshes, rays(), materials=materials)
-        assert gap(found, leaves=found["object"].min() if len(meshes) < 2 else
-                   Scene.from_meshes(meshes).all_names.index("Crown")) == pytest.approx(
-            math.exp(-0.4 * 4), rel=0.015
-        )
+        assert gap(
+            found,
+            leaves=found["object"].min()
+            if len(meshes) < 2
+            else Scene.from_meshes(meshes).all_names.index("Crown"),
+        ) == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
     way = Track([0.0, 10.0], [(4, 0, 0), (4, 0, 0)])
-    scene = Scene.from_meshes([wall]).with_actors([Actor(Mesh("Crown", crown.vertices * 2, crown.faces), way)])
+    scene = Scene.from_meshes([wall]).with_actors(
+        [Actor(Mesh("Crown", crown.vertices * 2, crown.faces), way)]
+    )
     survey = Survey(rays(), poses=[(0, 0, 0)], steps=1, materials=materials)
     (batch,) = Rig(scene, survey, "embree").cast(0, 1)
     assert (batch.object == 0).mean() == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
@@ -257,7 +269,9 @@ ALL_ON = {
 }
 
 
-@pytest.mark.parametrize("path", [{"poses": [Pose((0, 0, 1), 10, 5, -3), (4, 0, 1)]}, {"trajectory": Cart()}])
+@pytest.mark.parametrize(
+    "path", [{"poses": [Pose((0, 0, 1), 10, 5, -3), (4, 0, 1)]}, {"trajectory": Cart()}]
+)
 def test_batches_chunks_and_backends_leave_no_trace(path, monkeypatch):
     sensor = Sensor(Beams(np.radians([-20, -5, 0, 12])), Spin(360, step_deg=30), 0.5, 20)
     survey = Survey(sensor, steps=12, keep_every=2, **ALL_ON, **path)

@@ -75,7 +75,7 @@ def density(leaf_angle: str | float, angle: Real) -> Real:
 def _tables(leaf_angle: str | float) -> tuple[Real, Real, Real]:
     """Cosines of light from the vertical, and for them what `projection` and `brightness` are."""
     cosine = np.sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
-    angle = (np.arange(_ANGLES) + 0.5) * (np.pi / 2 / _ANGLES)
+    angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
     share = density(leaf_angle, angle)
     share /= share.sum()
     # Cosine between light and a leaf's normal: `along + across * cos(azimuth)`.

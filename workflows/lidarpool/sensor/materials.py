@@ -180,7 +180,9 @@ class Material:
     def _check_within(self) -> None:
         """Refuse what contradicts the medium within a surface."""
         if self.refractive_index is not None and self.transparent != "pass":
-            raise LidarpoolError("refractive_index is for light that passes: add transparent: pass.")
+            raise LidarpoolError(
+                "refractive_index is for light that passes: add transparent: pass."
+            )
         if self.attenuation_per_m and self.refractive_index is None:
             raise LidarpoolError("attenuation_per_m needs a refractive_index, such as 1.33.")
         if self.leaf_area_density is None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from raybeam import Pattern
 
 from ..base.errors import LidarpoolError
 from ..scene.scene import Scene
+from ..sensor import Trajectory
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.optics import any_axes
@@ -37,6 +38,15 @@ Numbers = NDArray[np.int32]
 Draw = Callable[[int, Whole], NDArray[np.uint64]]
 
 
+class Rays(NamedTuple):
+    """Light of sub-rays that begins, and the trajectories of actors."""
+
+    origins: Real  # (n, 3)
+    directions: Real  # (n, 3)
+    times: Real  # (n,)
+    ways: tuple[Trajectory, ...]
+
+
 @dataclass
 class Around:
     """Media around the light of sub-rays, the innermost first: (n, DEPTH) each; -1 for none."""
@@ -49,7 +59,7 @@ class Around:
         """Make them for light in the air."""
         return cls(*(np.full((count, DEPTH), -1, np.int32) for _ in range(2)))
 
-    def take(self, rows: NDArray[np.intp]) -> Around:
+    def take(self, rows: NDArray[np.integer[Any]]) -> Around:
         """Select those of some sub-rays."""
         return Around(self.objects[rows], self.triangles[rows])
 
@@ -100,7 +110,7 @@ class Bundle:
         none = np.zeros(len(ways))
         return cls(index.copy(), index, none, np.zeros_like(ways), ways)
 
-    def take(self, rows: NDArray[np.intp]) -> Bundle:
+    def take(self, rows: NDArray[np.integer[Any]]) -> Bundle:
         """Select those of some sub-rays."""
         return Bundle(*(getattr(self, field.name)[rows] for field in fields(self)))
 
@@ -124,9 +134,7 @@ class Bundle:
         nearer = distance**2 / np.maximum(area, 1e-12)
         return np.asarray(nearer * np.exp(2 * (extinction * distance - self.lost)))
 
-    def turn(
-        self, before: Real, after: Real, normals: Real, mirrored: Bools, index: float | Real
-    ) -> None:
+    def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools, index: Real) -> None:
         """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""
         along, behind = (_aside(_dots(way, normals)) for way in (before, after))
         # Each ray of a bundle arrives where it meets the plane.
@@ -136,18 +144,20 @@ class Bundle:
         bend = np.where(mirrored, 2.0, ratio - ratio**2 * along / behind)
         slope = bend[:, None] * _dots(self.ways, normals[:, None])
         self.ways = ratio[:, None, None] * self.ways - slope[..., None] * normals[:, None]
-        self.index = np.array(index)
+        self.index = np.where(mirrored, self.index, index)
 
 
 class Media:
     """The media of a scene."""
 
-    def __init__(self, scene: Scene, surfaces: Surfaces, table: MaterialTable) -> None:
-        self._surfaces = surfaces
+    def __init__(
+        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air: float = 0.0
+    ) -> None:
+        self._surfaces, self.air = surfaces, air  # its extinction, 1/m
         self.filled = table.leafy | table.refracts  # whether objects hold a medium
         self.leafy = bool(table.leafy.any())
         self.bends = bool(table.refracts.any())
-        self._table = table
+        self._angles = table.leaf_angles
         # Of no object, which has the number -1, nothing.
         self._area, self._index, self._attenuation = (
             np.append(values, 0.0) for values in (table.leaf_area, table.refractive_index,
@@ -168,37 +178,38 @@ class Media:
         if self.filled[len(scene.object_bounds) :].any():
             bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
         self._bounds = bounds
-        for angle in table.leaf_angles if self.leafy else ():
+        for angle in self._angles if self.leafy else ():
             projection(angle, np.ones(1))  # makes its table
 
     def sides(self, objects: Numbers, along: Real) -> Bools:
         """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
         return np.asarray((along < 0) != self._inwards[objects])
 
-    def around(
-        self, world: World, origins: Real, times: Real, poses: Poses, clear_m: float
-    ) -> Around:
-        """Find the media around the origins (n, 3) of light, at the times (n,)."""
-        found = Around.none(len(origins))
-        within = np.zeros(len(origins), np.bool_)
+    def around(self, world: World, light: Rays, clear_m: float) -> Around:
+        """Find the media around the origins of light."""
+        found = Around.none(len(light.origins))
+        within = np.zeros(len(light.origins), np.bool_)
         for low, high in self._bounds:
-            within |= ((origins >= low) & (origins <= high)).all(axis=1)
+            within |= ((light.origins >= low) & (light.origins <= high)).all(axis=1)
         rows = np.flatnonzero(within)
         if not len(rows):
             return found
         # Most rays start where the one before did.
+        origins, times = light.origins[rows], light.times[rows]
         new = np.ones(len(rows), np.bool_)
-        new[1:] = (np.diff(origins[rows], axis=0) != 0).any(axis=1)
-        if poses.ways:
-            new[1:] |= np.diff(times[rows]) != 0
-        first = rows[new]
-        there = self._search(world, origins[first], times[first], poses, clear_m)
+        new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
+        there = self._search(world, origins[new], times[new], light.ways, clear_m)
         which = np.cumsum(new) - 1
         found.objects[rows], found.triangles[rows] = there.objects[which], there.triangles[which]
         return found
 
     def _search(
-        self, world: World, origins: Real, times: Real, poses: Poses, clear_m: float
+        self,
+        world: World,
+        origins: Real,
+        times: Real,
+        ways: tuple[Trajectory, ...],
+        clear_m: float,
     ) -> Around:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces
@@ -209,12 +220,12 @@ class Media:
             if not len(rows):
                 break
             light = Pattern(np.broadcast_to(up, origins.shape), origins)
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), poses.ways))
+            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
             hits = world.scan(light, now)
             rows, times = rows[hits.ray], times[hits.ray]
             origins = origins[hits.ray] + (hits.distance[:, None] + away) * up
             objects = surfaces.objects(hits.triangle)
-            normals = surfaces.normals(hits.triangle, times, poses.ways)
+            normals = surfaces.normals(hits.triangle, times, ways)
             media = self.filled[objects]
             comes = self.sides(objects, products(normals.T, up[:, None])) & media
             entered.enter(rows[comes], objects[comes], hits.triangle[comes])
@@ -224,20 +235,23 @@ class Media:
             around.surround(rows[goes], objects[goes], hits.triangle[goes])
         return around
 
-    # -- refraction --------------------------------------------------------------------------
+    def within(self, world: World, light: Rays, depths: Real | None, clear_m: float) -> Within:
+        """Return the state of light that begins; `depths` (n,) are those until a leaf."""
+        around = self.around(world, light, clear_m)
+        bundle = Bundle.of(light.directions, self.index(around)) if self.bends else None
+        return Within(self, around, bundle, depths)
 
     def index(self, around: Around) -> Real:
         """Refractive indices of the innermost media that have one: (n,)."""
         indices = self._index[around.objects]
         return _first(indices, indices > 0, 1.0)
 
-    def attenuation(self, around: Around, air: float) -> Real:
+    def attenuation(self, around: Around) -> Real:
         """Extinction there, 1/m: (n,); outside of what refracts that of the air."""
-        return _first(self._attenuation[around.objects], self._index[around.objects] > 0, air)
+        refracts = self._index[around.objects] > 0
+        return _first(self._attenuation[around.objects], refracts, self.air)
 
-    def behind(
-        self, around: Around, objects: Numbers, triangles: Numbers, along: Real
-    ) -> Around:
+    def behind(self, around: Around, objects: Numbers, triangles: Numbers, along: Real) -> Around:
         """Media behind surfaces (n,), which light meets at the cosines `along`."""
         behind = around.take(np.arange(len(objects)))
         enters, filled = self.sides(objects, along), self.filled[objects]
@@ -246,49 +260,105 @@ class Media:
         behind.leave(goes, objects[goes])
         return behind
 
-    # -- leaves ------------------------------------------------------------------------------
-
-    def density(self, around: Around, directions: Real) -> Real:
+    def density(self, around: Around, upright: Real) -> Real:
         """Optical depth of leaves for each metre, in each medium around light: (n, DEPTH)."""
         density = self._area[around.objects]
         if density.any():
-            upright = np.minimum(np.abs(directions[:, 2]), 1)
-            for number, angle in enumerate(self._table.leaf_angles):
+            for number, angle in enumerate(self._angles):
                 crossing = projection(angle, upright)[:, None]
                 density *= np.where(self._angle[around.objects] == number, crossing, 1)
         return density
 
-    def bright(self, objects: Numbers, directions: Real) -> Real:
+    def bright(self, objects: Numbers, upright: Real) -> Real:
         """Mean cosine between light and the leaves of objects (n,) that it meets: (n,)."""
-        upright, out = np.minimum(np.abs(directions[:, 2]), 1), np.ones(len(objects))
-        for number, angle in enumerate(self._table.leaf_angles):
+        out = np.ones(len(objects))
+        for number, angle in enumerate(self._angles):
             out = np.where(self._angle[objects] == number, brightness(angle, upright), out)
         return out
 
-    def meet(
-        self, around: Around, left: Real, directions: Real, length: Real, ray: Whole, draw: Draw
-    ) -> tuple[NDArray[np.intp], Real, Numbers, Real]:
-        """Find which light (n,) meets a leaf within its next metres (n,).
 
-        `left` (n,) are the optical depths that are left until a leaf; they become less.
+class Leaves(NamedTuple):
+    """Leaves that light meets: arrays (k,)."""
+
+    rows: NDArray[np.intp]  # of the light
+    metres: Real  # how far it gets
+    triangles: Numbers  # where it came into the crown
+    cosines: Real  # mean ones between light and leaves
+
+
+@dataclass
+class Within:
+    """Light on its way through media: those around it, and what they do to it."""
+
+    media: Media
+    around: Around
+    bundle: Bundle | None  # None if nothing refracts
+    left: Real | None  # (n,): optical depth until a leaf; None if there are none
+
+    def take(self, rows: NDArray[np.integer[Any]]) -> Within:
+        """Select that of some sub-rays."""
+        return Within(
+            self.media,
+            self.around.take(rows),
+            None if self.bundle is None else self.bundle.take(rows),
+            None if self.left is None else self.left[rows],
+        )
+
+    def optical(self, step: Real) -> Real:
+        """Optical paths of so many metres (n,)."""
+        return step if self.bundle is None else step * self.bundle.index
+
+    def meet(self, directions: Real, length: Real, ray: Whole, draw: Draw) -> Leaves:
+        """Find which light meets a leaf within its next metres (n,)."""
+        if self.left is None:
+            none = np.zeros(0, np.intp)
+            return Leaves(none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
+        upright = np.minimum(np.abs(directions[:, 2]), 1)
+        sums = np.cumsum(self.media.density(self.around, upright), axis=1)
+        total = sums[:, -1]
+        depth = total * length
+        rows = np.flatnonzero(depth > self.left)
+        metres = self.left[rows] / total[rows]
+        self.left = self.left - depth
+        # Where crowns overlap, a leaf is of one of them in proportion to its density.
+        share = (draw(WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
+        cosines = self.media.bright(self.around.objects[rows, place], upright[rows])
+        return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
+
+    def go(self, step: Real) -> None:
+        """Go straight on so many metres (n,)."""
+        if self.bundle is not None:
+            self.bundle.go(step, self.media.attenuation(self.around))
+
+    def factor(self, directions: Real, distance: Real) -> Real | float:
+        """Energy relative to that of light that went as far, straight through the air: (n,)."""
+        if self.bundle is None:
+            return 1.0
+        return self.bundle.factor(directions, distance, self.media.air)
+
+    def cross(
+        self, objects: Numbers, triangles: Numbers, directions: Real, normals: Real, along: Real
+    ) -> tuple[Real, Real | float, Bools]:
+        """Take light through surfaces (n,), which it meets at the cosines `along`.
 
         Returns
         -------
-        Rows of those (k,), how far they get (k,), triangles where they came in (k,), and mean
-        cosines of the leaves (k,).
+        Directions behind them (n, 3), shares of light that pass (n,), and whether all is reflected,
+        with directions and shares as if there were no surface.
         """
-        each = self.density(around, directions)
-        sums = np.cumsum(each, axis=1)
-        total = sums[:, -1]
-        depth = total * length
-        rows = np.flatnonzero(depth > left)
-        reached = left[rows] / total[rows]
-        left -= depth
-        # Where crowns overlap, a leaf is of one in proportion to its density.
-        share = (draw(WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
-        place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
-        objects = around.objects[rows, place]
-        return rows, reached, around.triangles[rows, place], self.bright(objects, directions[rows])
+        before, self.around = self.around, self.media.behind(self.around, objects, triangles, along)
+        if self.bundle is None:
+            return directions, 1.0, np.zeros(len(objects), np.bool_)
+        ratio = self.media.index(self.around) / self.bundle.index
+        ahead, passes, whole = refracted(directions, normals, along, ratio)
+        self.around.restore(np.flatnonzero(whole), before)
+        return ahead, passes, whole
+
+    def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools) -> None:
+        """Turn the bundles at flat surfaces, from directions (n, 3) to others."""
+        if self.bundle is not None:
+            self.bundle.turn(before, after, normals, mirrored, self.media.index(self.around))
 
 
 def refracted(

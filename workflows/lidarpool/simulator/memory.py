@@ -27,9 +27,11 @@ RAY_MADE, RAY_MADE_KEPT = 92, 32  # if it is not repeated: while it is made, and
 RAY_TURNED = 20  # by noise of angles, likewise
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
-SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+# Of those cast at a time; if light passes or is reflected; if it is refracted.
+SUBRAY, SUBRAY_PASSING, SUBRAY_REFRACTED = 200, 650, 1350
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
+RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns
@@ -46,7 +48,9 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     they needed as much as others. `on_device` says that a CUDA device casts the rays; its own
     memory, some 300 MB, does not count.
     """
-    passing = any(material.transparent != "none" for material in survey.materials)
+    leafy = any(material.leaf_area_density is not None for material in survey.materials)
+    passing = leafy or any(material.transparent != "none" for material in survey.materials)
+    refracted = any(material.refractive_index is not None for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)
     textured = any(material.reflectance == "texture" for material in survey.materials)
     bodies = bool(scene.actors or scene.instances)
@@ -67,7 +71,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         first, stop = sensor.firings(0)
         firings = (stop - first) * scans
         rays = firings * sensor.channels
-        returns = rays * (RETURNS if several else 1)
+        each = RETURNS_LEAFY if leafy and subrays > 1 and reported.mode == "all" else RETURNS
+        returns = rays * (each if several else 1)
         points = returns / survey.keep_every
         repeats, by_head = rays_repeat(sensor, survey.path.moves)
         poses = firings if survey.path.moves or by_head else 0
@@ -81,7 +86,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
-            found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            subray = SUBRAY_PASSING if passing else SUBRAY
+            found = (SUBRAY_REFRACTED if refracted else subray) * chunk + RETURN * returns
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
         if by_numpy:  # as if it made all columns, and once more those of the device
             point = POINT + POINT_BYTE * columns + columns * made_there

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.noise import raw
 from .hits import Hits, Keys, Planes, Real, Whole, joined
-from .media import LEAF, Around, Bundle, Media, depths, refracted
+from .media import LEAF, Media, Rays, Within, depths
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
 from .world import World
@@ -35,21 +36,19 @@ class _Light:
     before: Real  # optical path up to the origin
     # What mirrors did to the directions so far, (n, 3, 3), if there are any.
     turns: Real | None = None
-    # If there are media: those around it, its bundle if they refract, and the optical depth that is
-    # left until a leaf if there are any.
-    around: Around | None = None
-    bundle: Bundle | None = None
-    left: Real | None = None
+    within: Within | None = None  # if there are media
 
-    def on(self, rows: NDArray[np.intp]) -> _Light:
+    def on(self, rows: NDArray[np.integer[Any]]) -> _Light:
         """Select that of some sub-rays."""
-        own = self.ray, self.times, self.origins, self.directions, self.share, self.before
         return _Light(
-            *(values[rows] for values in own),
+            self.ray[rows],
+            self.times[rows],
+            self.origins[rows],
+            self.directions[rows],
+            self.share[rows],
+            self.before[rows],
             None if self.turns is None else self.turns[rows],
-            None if self.around is None else self.around.take(rows),
-            None if self.bundle is None else self.bundle.take(rows),
-            None if self.left is None else self.left[rows],
+            None if self.within is None else self.within.take(rows),
         )
 
 
@@ -69,7 +68,8 @@ class Paths:
         self._light, self._seed = light_of(survey, sensor), seed
         table = surfaces.at(sensor.optics.wavelength_nm)
         filled = table.leafy.any() or table.refracts.any()
-        self._media = Media(scene, surfaces, table) if filled else None
+        air = self._light.extinction
+        self._media = Media(scene, surfaces, table, air) if filled else None
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
         # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
@@ -106,41 +106,47 @@ class Paths:
         # How far light goes in a crown depends on its other side, however far that is.
         reach = np.inf if leafy else farthest
         found = self._world.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
-        light = self._started(beams, poses, window, found.ray.astype(np.int64))
-        step, triangle = found.distance, found.triangle
+        ray = found.ray.astype(np.int64)
+        origins, directions = poses.rays(beams, ray, window[0])
+        origins = np.broadcast_to(origins, directions.shape)
+        light = _Light(
+            ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
+        )
 
         def draw(purpose: int, ray: Whole) -> NDArray[np.uint64]:
             scan, number = keys.of(first + ray // each)
             return raw(self._seed, purpose, scan, number, ray % each)
 
-        if leafy:
-            light.left = depths(draw(LEAF, light.ray))
+        if materials.mirrors.any() or (media is not None and media.bends):
+            light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
+        if media is not None:
+            left = depths(draw(LEAF, ray)) if leafy else None
+            rays = Rays(origins, directions, light.times, poses.ways)
+            light.within = media.within(self._world, rays, left, self._clear_m)
+        step, triangle = found.distance, found.triangle
         parts: list[Hits] = []
         seen: list[Real] = []  # normals as the sensor sees them
-        clear: float | Real = nearest  # where light is first, from the origin
+        clear = np.full(len(ray), nearest)  # where light is first, metres from the origin
         for _ in range(LEAFY_PASSES_MOST if leafy else PASSES_MOST):
             normals = surfaces.normals(triangle, light.times, poses.ways)
             along = products(normals.T, light.directions.T)
             cosine = np.abs(along)
-            leaves = np.zeros(0, np.intp)
-            if media is not None and light.around is not None and light.left is not None:
-                leaves, metres, entered, cosines = media.meet(
-                    light.around, light.left, light.directions, step - clear, light.ray, draw
-                )
-                step, triangle = step.copy(), triangle.copy()
-                step[leaves] = np.broadcast_to(clear, step.shape)[leaves] + metres
-                triangle[leaves], cosine[leaves] = entered, cosines
+            within, leaves = light.within, np.zeros(0, np.intp)
+            if within is not None:
+                met = within.meet(light.directions, step - clear, light.ray, draw)
+                step, triangle, leaves = step.copy(), triangle.copy(), met.rows
+                step[leaves] = clear[leaves] + met.metres
+                triangle[leaves], cosine[leaves] = met.triangles, met.cosines
                 normals[leaves] = light.directions[leaves]  # no leaf continues another
-            bundle = light.bundle
-            distance = light.before + (step if bundle is None else step * bundle.index)
+            distance = light.before + (step if within is None else within.optical(step))
             colour = None
             if self._coloured:
                 points = light.origins + step[:, None] * light.directions
                 colour = surfaces.colours(triangle, points, light.times, poses.ways)
             energy = light.share * self.energy(triangle, cosine, distance, colour)
-            if bundle is not None and media is not None and light.around is not None:
-                bundle.go(step, media.attenuation(light.around, self._light.extinction))
-                energy *= bundle.factor(light.directions, distance, self._light.extinction)
+            if within is not None:
+                within.go(step)
+                energy *= within.factor(light.directions, distance)
             hits = Hits(light.ray, distance, triangle, energy, colour)
             turns = light.turns
             looks = normals if turns is None else np.einsum("nji,nj->ni", turns, normals)
@@ -165,11 +171,17 @@ class Paths:
             now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
             found = self._world.scan(Pattern(light.directions, light.origins), now, t_max=reach)
             which, step, triangle = found.ray, found.distance, found.triangle
-            if not leafy:
-                index = 1.0 if light.bundle is None else light.bundle.index[which]
-                near = light.before[which] + step * index <= farthest
-                which, step, triangle = which[near], step[near], triangle[near]
             light, clear = light.on(which), clear[which]
+            if not leafy:
+                within = light.within
+                end = light.before + (step if within is None else within.optical(step))
+                here = np.flatnonzero(end <= farthest)
+                light, clear, step, triangle = (
+                    light.on(near),
+                    clear[near],
+                    step[near],
+                    triangle[near],
+                )
         hits, normals = joined(parts), seen[0]
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
@@ -179,24 +191,6 @@ class Paths:
             return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
 
         return hits, planes
-
-    def _started(
-        self, beams: Pattern, poses: Poses, window: tuple[int, int], ray: Whole
-    ) -> _Light:
-        """Light of sub-rays that hit something, where it leaves the sensor."""
-        media = self._media
-        origins, directions = poses.rays(beams, ray, window[0])
-        origins = np.broadcast_to(origins, directions.shape)
-        light = _Light(
-            ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
-        )
-        if self._surfaces.materials.mirrors.any() or (media is not None and media.bends):
-            light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
-        if media is not None:
-            light.around = media.around(self._world, origins, light.times, poses, self._clear_m)
-            if media.bends:
-                light.bundle = Bundle.of(directions, media.index(light.around))
-        return light
 
     def _behind(
         self,
@@ -209,40 +203,34 @@ class Paths:
     ) -> tuple[_Light, Real]:
         """Take light (n,) through the surfaces at its end, or off them.
 
-        Returns it behind them, and where the surfaces are from there, at or below 0.
+        Returns it behind them, and where the surfaces are from there, metres, at or below 0.
         """
         materials = self._surfaces.at(self._light.wavelength_nm)
         rows = self._surfaces.objects(triangle)
-        cosine = np.abs(along)
+        cosine, within = np.abs(along), light.within
         share = light.share * materials.goes_on(rows, cosine) ** 2  # and back again
         ahead, mirrors = light.directions, materials.mirrors[rows]
-        around, bundle, index = light.around, light.bundle, 1.0
-        if self._media is not None and around is not None:
-            around = self._media.behind(around, rows, triangle, along)
-            if bundle is not None:
-                index = self._media.index(around)
-                ahead, passes, whole = refracted(ahead, normals, along, index / bundle.index)
-                share *= passes**2
-                mirrors = mirrors | whole
-                index = np.where(mirrors, bundle.index, index)
-                around.restore(np.flatnonzero(mirrors), light.around)
+        if within is not None:
+            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along)
+            share *= passes**2
+            mirrors = mirrors | whole
         mirrored = 2 * mirrors[:, None] * normals
         ahead = ahead - along[:, None] * mirrored
-        if bundle is not None:
-            bundle.turn(light.directions, ahead, normals, mirrors, index)
-            cosine = np.abs(products(normals.T, ahead.T))
         turns = light.turns
         if turns is not None:
             along_turns = np.einsum("ni,nij->nj", normals, turns)
             turns = turns - mirrored[:, :, None] * along_turns[:, None]
+        if within is not None:
+            within.turn(light.directions, ahead, normals, mirrors)
+            cosine = np.abs(products(normals.T, ahead.T))
         away = self._clear_m / np.maximum(cosine, 1e-3)
         ends = light.origins + step[:, None] * light.directions
         path = Pattern(ahead, ends + away[:, None] * ahead)
-        if bundle is not None and self._media is not None and around is not None:
-            bundle.go(away, self._media.attenuation(around, self._light.extinction))
         assert path.origins is not None  # it was given some
+        before = distance + (away if within is None else within.optical(away))
+        if within is not None:
+            within.go(away)
         behind = _Light(
-            light.ray, light.times, path.origins, path.directions, share, distance + away * index,
-            turns, around, bundle, light.left,
-        )  # fmt: skip
+            light.ray, light.times, path.origins, path.directions, share, before, turns, within
+        )
         return behind, -away

@@ -350,7 +350,8 @@ def _closed(vertices: Real, faces: Triangles) -> bool:
     ahead, after = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
     some = ahead != after
     there, back = (
-        np.sort(one[some] * len(used) + other[some]) for one, other in ((ahead, after), (after, ahead))
+        np.sort(one[some] * len(used) + other[some])
+        for one, other in ((ahead, after), (after, ahead))
     )
     return bool(np.array_equal(there, back))
 
