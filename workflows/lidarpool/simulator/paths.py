@@ -176,12 +176,8 @@ class Paths:
                 within = light.within
                 end = light.before + (step if within is None else within.optical(step))
                 here = np.flatnonzero(end <= farthest)
-                light, clear, step, triangle = (
-                    light.on(near),
-                    clear[near],
-                    step[near],
-                    triangle[near],
-                )
+                light, clear = light.on(here), clear[here]
+                step, triangle = step[here], triangle[here]
         hits, normals = joined(parts), seen[0]
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
