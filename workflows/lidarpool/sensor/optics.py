@@ -49,16 +49,16 @@ class Optics:
         Divergence | None,
         Field(description="full angle of the beam, or two, across and up; None if unknown"),
     ] = None
+    pulse_ns: Annotated[Pulse, Field(description="length of a pulse")] = 5.0
+    resolution_m: Annotated[
+        Precision, Field(description="of reported ranges: default step for rounding positions")
+    ] = 0.01
     beam_profile: Annotated[
         Profile, Field(description="how light is spread over the beam, where it has sub-rays")
     ] = "even"
     exit_diameter_m: Annotated[
         Diameter, Field(description="width of the beam where it leaves the sensor")
     ] = 0.0
-    pulse_ns: Annotated[Pulse, Field(description="length of a pulse")] = 5.0
-    resolution_m: Annotated[
-        Precision, Field(description="of reported ranges: default step for rounding positions")
-    ] = 0.01
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, Sequence):
@@ -92,6 +92,14 @@ class Returns:
             examples=[3.0],
         ),
     ] = None
+    pulse_ns: Annotated[
+        Pulse | None,
+        Field(
+            description="length of the pulse: surfaces less than half of it apart are "
+            "one return; by default the sensor's, or 5",
+            examples=[5.0],
+        ),
+    ] = None
     beam_profile: Annotated[
         Profile | None,
         Field(
@@ -105,14 +113,6 @@ class Returns:
             description="width of the beam where it leaves the sensor; by default the sensor's, "
             "or 0",
             examples=[0.01],
-        ),
-    ] = None
-    pulse_ns: Annotated[
-        Pulse | None,
-        Field(
-            description="length of the pulse: surfaces less than half of it apart are "
-            "one return; by default the sensor's, or 5",
-            examples=[5.0],
         ),
     ] = None
 
