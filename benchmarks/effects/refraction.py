@@ -41,7 +41,8 @@ def box(name: str, low: tuple[float, float, float], high: tuple[float, float, fl
 def pool() -> list[Mesh]:
     """Make a pool with a step, in the ground."""
     return [
-        box("Water", (-5.3, -9, -DEPTH - 0.5), (5.3, 9, 0)),  # reaches into its basin
+        # Into the walls, which light that goes straight on would miss otherwise.
+        box("Water", (-5.3, -9, -DEPTH - 0.5), (5.3, 9, 0)),
         box("Floor", (-9, -9, -DEPTH - 1), (9, 9, -DEPTH)),
         box("Step", (2, -9, -DEPTH - 0.2), (9, 9, -1.2)),
         box("Left", (-9, -9, -DEPTH - 0.2), (-5, 9, 0.1)),

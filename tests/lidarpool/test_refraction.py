@@ -78,17 +78,17 @@ def test_the_floor_of_a_pool(nadir_deg, surface, backend):
     )  # fmt: skip
     angle, air, below, water = pool(nadir_deg)
     assert found["object"].tolist() == [1]
-    assert found["range"] == pytest.approx([air + INDEX * water], rel=1e-6)
+    assert found["range"] == pytest.approx([air + INDEX * water], abs=4e-4)
     ahead = found["batch"].directions[0]
     assert found["batch"].positions[0] == pytest.approx(
-        (0, 0, HEIGHT) + (air + INDEX * water) * ahead, abs=1e-5
+        (0, 0, HEIGHT) + (air + INDEX * water) * ahead, abs=2e-4
     ), "straight ahead, below the true floor"
     passes = 1 - fresnel(np.array([math.cos(angle)]), INDEX)[0]
     lost = math.exp(-2 * (LOSS * water + extinction(0.5, 905) * air))
     tilt = math.cos(angle) / math.cos(below)
     area = (water + INDEX * air) * (tilt * water + INDEX * air / tilt)
     expected = 0.4 * math.cos(below) * passes**2 * lost * 100 / area
-    assert found["intensity"] == pytest.approx([expected], rel=1e-5)
+    assert found["intensity"] == pytest.approx([expected], rel=1e-4)
     if not nadir_deg:
         assert area == pytest.approx((INDEX * HEIGHT + DEPTH) ** 2)
 
@@ -131,20 +131,20 @@ def test_a_sensor_under_water(surface):
     )
     materials = [Material("*", 0.5), Material("Water", **WATER)]
     found = cast([surface, floor], ray(0), (0, 0, -1), materials=materials)
-    assert found["range"] == pytest.approx([1.33 * 3])
-    assert found["intensity"] == pytest.approx([0.5 * 100 / 9], rel=1e-5), "as 3 m in the air"
+    assert found["range"] == pytest.approx([1.33 * 3], abs=4e-4)
+    assert found["intensity"] == pytest.approx([0.5 * 100 / 9], rel=1e-4), "as 3 m in the air"
     steep = cast([surface, floor, wall], ray(180 - 60), (0, 0, -1), materials=materials)
     path = (1 + 4) / math.cos(math.radians(60))
     assert steep["object"].tolist() == [1]
-    assert steep["range"] == pytest.approx([1.33 * path])
-    assert steep["intensity"] == pytest.approx([0.5 * 0.5 * 100 / path**2], rel=1e-5), (
+    assert steep["range"] == pytest.approx([1.33 * path], abs=4e-4)
+    assert steep["intensity"] == pytest.approx([0.5 * 0.5 * 100 / path**2], rel=1e-4), (
         "nothing lost"
     )
     out = cast([surface, floor, wall], ray(180 - 45), (0, 0, -1), materials=materials)
     above = math.asin(1.33 * math.sin(math.radians(45)))
     air = (30 - 1) / math.sin(above)
     assert out["object"].tolist() == [2]
-    assert out["range"] == pytest.approx([1.33 * math.sqrt(2) + air], rel=1e-6)
+    assert out["range"] == pytest.approx([1.33 * math.sqrt(2) + air], abs=4e-4)
 
 
 # -- glass ---------------------------------------------------------------------------------------
@@ -171,11 +171,11 @@ def test_a_thick_pane_shifts_light_and_makes_the_way_longer(turn_deg, backend):
     wall = Scene.from_meshes([pane, *side]).all_names.index("Wall")
     expected = air + 1.5 * path - bool(shift)
     assert (found["object"][0] == wall) == (not shift)
-    assert found["range"] == pytest.approx([expected], abs=1e-5)
+    assert found["range"] == pytest.approx([expected], abs=4e-4)
     if not turn_deg:
         passes = (1 - fresnel(np.ones(1), 1.5)[0]) ** 4
         reduced = 60 - thick + thick / 1.5
-        assert found["intensity"] == pytest.approx([0.5 * passes * 100 / reduced**2], rel=1e-5)
+        assert found["intensity"] == pytest.approx([0.5 * passes * 100 / reduced**2], rel=1e-4)
 
 
 def test_water_in_a_tank_of_glass():
@@ -188,11 +188,11 @@ def test_water_in_a_tank_of_glass():
     glass = Material("Tank", transparent="pass", refractive_index=1.5)
     materials = [Material("*", 0.5), glass, Material("Filling", **WATER)]
     found = cast([tank, water, wall], ray(), materials=materials)
-    assert found["range"] == pytest.approx([16 + 1.5 * 0.2 + 1.33 * 3.8], abs=1e-5)
+    assert found["range"] == pytest.approx([16 + 1.5 * 0.2 + 1.33 * 3.8], abs=4e-4)
     one = np.ones(1)
     passes = ((1 - fresnel(one, 1.5)) * (1 - fresnel(one, 1.33 / 1.5)))[0] ** 4
     reduced = 16 + 0.2 / 1.5 + 3.8 / 1.33
-    assert found["intensity"] == pytest.approx([0.5 * passes * 100 / reduced**2], rel=1e-5)
+    assert found["intensity"] == pytest.approx([0.5 * passes * 100 / reduced**2], rel=1e-4)
 
 
 def test_a_prism_bends_light_by_its_least_deviation():
@@ -209,7 +209,7 @@ def test_a_prism_bends_light_by_its_least_deviation():
     sensor = Pose((*(-5 * ahead), 0), math.degrees(half))
     found = cast([prism, floor], ray(), sensor, materials=materials)
     expected = 5 + x / ahead[0] + 1.5 * 2 * -x + (y + 50) / ahead[1]
-    assert found["range"] == pytest.approx([expected], rel=1e-6)
+    assert found["range"] == pytest.approx([expected], abs=1e-3)
 
 
 def test_what_is_refused():
@@ -219,3 +219,22 @@ def test_what_is_refused():
         Material("*", transparent="pass", attenuation_per_m=0.1)
     with pytest.raises(LidarpoolError, match=r"refractive_index is 0\.9; it must be 1 to 4"):
         Material("*", transparent="pass", refractive_index=0.9)
+
+
+@pytest.mark.parametrize("backend", CPU)
+@pytest.mark.parametrize("nadir_deg", [0.0, 20.0, 35.0, 42.0])
+def test_water_may_touch_its_basin(nadir_deg, backend):
+    """Floor and walls are where the water ends, and none of them is missed."""
+    meshes = [
+        box("Water", (-3, -3, -2), (3, 3, 0)),
+        box("Floor", (-9, -9, -4), (9, 9, -2)),
+        box("Left", (-9, -9, -2), (-3, 9, 0.1)),
+        box("Right", (3, -9, -2), (9, 9, 0.1)),
+    ]
+    materials = [Material("*"), Material("Water", **WATER)]
+    found = cast(meshes, ray(nadir_deg), (0, 0, 3), backend, materials=materials)
+    angle = math.radians(abs(nadir_deg))
+    below = math.asin(math.sin(angle) / 1.33)
+    side = 3 - 3 * math.tan(angle)
+    path = min(2 / math.cos(below), side / max(math.sin(below), 1e-9))
+    assert found["range"] == pytest.approx([3 / math.cos(angle) + 1.33 * path], abs=4e-4)

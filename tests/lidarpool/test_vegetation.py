@@ -302,3 +302,22 @@ def test_optics_are_told_apart():
     optics = Optics(divergence_mrad=(3.0, 1.5), beam_profile="gaussian", exit_diameter_m=0.01)
     assert Returns(subrays=7).beam(optics).oval
     assert not Returns(subrays=7, divergence_mrad=2.0).beam(optics).oval
+
+
+@pytest.mark.parametrize("backend", CPU)
+@pytest.mark.parametrize("order", [1, -1])
+def test_layers_that_touch_each_other(backend, order):
+    """As voxels do: six of them side by side are one of six metres."""
+    layers = [box(f"Voxel{x}", (x, -9, -9), (x + 1, 9, 9)) for x in range(2, 8)][::order]
+    wall = box("Wall", (8, -9, -9), (10, 9, 9))
+    materials = [GROUND, Material("Voxel*", leaf_area_density=0.4)]
+    found = cast(
+        [*layers, wall],
+        rays((backend == "embree" and MANY) or 10_000, 91.0),
+        backend=backend,
+        materials=materials,
+    )
+    tau = 0.2 * 6 / math.cos(math.radians(1))
+    assert (found["object"] == 6).mean() == pytest.approx(math.exp(-tau), rel=0.02)
+    counts = np.bincount(found["object"], minlength=7)[:6][::order] / len(found["object"])
+    assert counts == pytest.approx(np.exp(-0.2 * np.arange(6)) * (1 - math.exp(-0.2)), rel=0.1)

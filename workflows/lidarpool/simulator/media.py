@@ -185,11 +185,15 @@ class Media:
         """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
         return np.asarray((along < 0) != self._inwards[objects])
 
-    def around(self, world: World, light: Rays, clear_m: float) -> Around:
+    def around(self, world: World, light: Rays) -> Around:
         """Find the media around the origins of light."""
         found = Around.none(len(light.origins))
         within = np.zeros(len(light.origins), np.bool_)
-        for low, high in self._bounds:
+        if not len(within):
+            return found
+        least, most = light.origins.min(axis=0), light.origins.max(axis=0)
+        near = ((self._bounds[:, 0] <= most) & (self._bounds[:, 1] >= least)).all(axis=1)
+        for low, high in self._bounds[near]:
             within |= ((light.origins >= low) & (light.origins <= high)).all(axis=1)
         rows = np.flatnonzero(within)
         if not len(rows):
@@ -198,7 +202,7 @@ class Media:
         origins, times = light.origins[rows], light.times[rows]
         new = np.ones(len(rows), np.bool_)
         new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
-        there = self._search(world, origins[new], times[new], light.ways, clear_m)
+        there = self._search(world, origins[new], times[new], light.ways)
         which = np.cumsum(new) - 1
         found.objects[rows], found.triangles[rows] = there.objects[which], there.triangles[which]
         return found
@@ -209,13 +213,12 @@ class Media:
         origins: Real,
         times: Real,
         ways: tuple[Trajectory, ...],
-        clear_m: float,
     ) -> Around:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces
         around, entered = Around.none(len(origins)), Around.none(len(origins))
         up = UPWARDS / np.sqrt((UPWARDS**2).sum())
-        rows, away = np.arange(len(origins)), clear_m / up[2]
+        rows, away = np.arange(len(origins)), world.clear_m / up[2]
         for _ in range(PROBES_MOST):
             if not len(rows):
                 break
@@ -235,9 +238,9 @@ class Media:
             around.surround(rows[goes], objects[goes], hits.triangle[goes])
         return around
 
-    def within(self, world: World, light: Rays, depths: Real | None, clear_m: float) -> Within:
+    def within(self, world: World, light: Rays, depths: Real | None) -> Within:
         """Return the state of light that begins; `depths` (n,) are those until a leaf."""
-        around = self.around(world, light, clear_m)
+        around = self.around(world, light)
         bundle = Bundle.of(light.directions, self.index(around)) if self.bends else None
         return Within(self, around, bundle, depths)
 

@@ -72,9 +72,7 @@ class Paths:
         self._media = Media(scene, surfaces, table, air) if filled else None
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
-        # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
-        reach = np.float32(np.abs(scene.bounds).max())
-        self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+        self._clear_m = world.clear_m
 
     def energy(
         self,
@@ -122,7 +120,7 @@ class Paths:
         if media is not None:
             left = depths(draw(LEAF, ray)) if leafy else None
             rays = Rays(origins, directions, light.times, poses.ways)
-            light.within = media.within(self._world, rays, left, self._clear_m)
+            light.within = media.within(self._world, rays, left)
         step, triangle = found.distance, found.triangle
         parts: list[Hits] = []
         seen: list[Real] = []  # normals as the sensor sees them

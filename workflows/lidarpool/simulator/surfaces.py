@@ -280,13 +280,13 @@ class Surfaces:
         table, scene = self.materials, self._scene
         closed = np.ones(len(table.reflectance), np.bool_)
         volume = np.zeros(len(closed))
-        for number in np.flatnonzero(table.leafy | table.refracts):
+        for number in np.flatnonzero(table.leafy | table.refracts).tolist():
             bodies: list[tuple[Real, Triangles]] = []
             if number >= self._standing:
                 mesh = scene.actors[number - self._standing].mesh
                 bodies.append((mesh.vertices, mesh.faces))
-            elif (own := scene.face_object == number).any():
-                bodies.append((scene.vertices, scene.faces[own]))
+            elif len(own := self._faces_of(number)):
+                bodies.append((scene.vertices, own))
             if scene.instances is not None:
                 parts = np.unique(scene.instances.part[scene.instances.owner == number])
                 bodies += [scene.instances.parts[part][:2] for part in parts]
@@ -294,6 +294,54 @@ class Surfaces:
                 closed[number] &= _closed(vertices, faces)
                 volume[number] += _volume(vertices, faces)
         return closed, closed & (volume < 0)
+
+    @cached_property
+    def _by_object(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of the scene's faces in the order of objects, and where those of each begin."""
+        owners = self._scene.face_object
+        order = np.argsort(owners, kind="stable")
+        return order, np.searchsorted(owners[order], np.arange(self._standing + 1))
+
+    def _faces_of(self, number: int) -> Triangles:
+        order, begins = self._by_object
+        return self._scene.faces[order[begins[number] : begins[number + 1]]]
+
+    @cached_property
+    def media(self) -> tuple[int, ...]:
+        """Objects of the scene's faces that hold a medium within a closed surface."""
+        table, (closed, _) = self.materials, self.solids
+        held = (table.leafy | table.refracts) & closed
+        return tuple(np.flatnonzero(held[: self._standing]).tolist())
+
+    def spread_out(self, by_m: float) -> Real:
+        """Vertices of the scene's faces, where surfaces of media are so many metres further out.
+
+        Water that touches its basin, or leaves that touch others, would share a surface with them,
+        and light that meets one of two would miss the other.
+        """
+        if not self.media:
+            return self._scene.vertices
+        vertices, inwards = self._scene.vertices.copy(), self.solids[1]
+        for number in self.media:
+            faces = self._faces_of(number)
+            if not len(faces):
+                continue
+            used, corners = np.unique(faces, return_inverse=True)
+            places, same = np.unique(vertices[used], axis=0, return_inverse=True)
+            same = same.reshape(-1)
+            corners = same[corners.reshape(-1)].reshape(-1, 3)
+            a, b, c = places[corners].transpose(1, 0, 2)
+            normals = np.cross(b - a, c - a) * (-1 if inwards[number] else 1)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+            # Each vertex goes where all of its triangles are so much further out, or nearly.
+            squares, sums = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
+            np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
+            np.add.at(sums, corners, normals[:, None])
+            squares += 1e-3 * np.eye(3)
+            step = by_m * np.linalg.solve(squares, sums[..., None])[..., 0]
+            places += np.clip(step, -4 * by_m, 4 * by_m)
+            vertices[used] = places[same]
+        return vertices
 
     @property
     def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
