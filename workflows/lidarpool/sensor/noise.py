@@ -70,6 +70,15 @@ class Noise:
         ),
     ] = None
     seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
+    overlap_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1000,
+            description="from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "and dust do not return more",
+        ),
+    ] = 10.0
 
     @property
     def loses(self) -> bool:
@@ -80,6 +89,13 @@ class Noise:
     def displaces(self) -> bool:
         """Whether directions or ranges deviate."""
         return self.angle_deg > 0 or self.range_m > 0 or self.range_per_m > 0
+
+    @property
+    def threshold(self) -> float:
+        """Energy of which half of the returns are detected; 0 if all are."""
+        if self.detection_range_m is None:
+            return 0.0
+        return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     def ranges(self, distance: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
         """Return the reported ranges of returns (n,), metres, at least 0."""
@@ -103,8 +119,7 @@ class Noise:
         """
         seen = uniform(self.seed, _LOSS, scan, ray, number) >= self.dropout
         if self.detection_range_m is not None:
-            threshold = TARGET_REFLECTANCE * at_right_angles(self.detection_range_m)
-            above = THRESHOLD_SIGMAS * (energy / threshold - 1)
+            above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
             seen &= above + normal(self.seed, _DETECTION, scan, ray, number) > 0
         return seen
 

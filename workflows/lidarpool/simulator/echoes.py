@@ -16,6 +16,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.disc import Beam
 from ..sensor.optics import Mode, any_axes, axes_about, spread
+from .air import AirCaster
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products, turned
 from .paths import Paths
@@ -53,6 +54,7 @@ class EchoCaster:
         self._returns, self._noise = survey.returns_each[number], survey.noise_each[number]
         seed = self._noise.seed
         self._paths = Paths(caster, scene, survey, self._sensor, surfaces, seed)
+        self._air = AirCaster(number, survey, surfaces) if survey.returns_light else None
         # Whether each ray that hits something has one return.
         several = self._returns.subrays > 1 or self._noise.loses
         self._one_each = surfaces.materials.plain and not several
@@ -119,6 +121,8 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window, keys, start, len(beam))
+                if self._air is not None:
+                    hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
                 returns = separated(hits, self._gap_m, len(beam), planes)
                 returns = returns._replace(ray=start + returns.ray)
                 chunks.append(self._reported(returns, keys))

@@ -32,6 +32,7 @@ SUBRAY, SUBRAY_PASSING, SUBRAY_REFRACTED = 200, 650, 1350
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
+AIR, AIR_HIT = 110, 200  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns
@@ -62,9 +63,10 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     made_there = on_device and plain and not (passing or dark)
     by_numpy = not made_there or needs_hits(survey)
     most = 0.0
-    for carried, steps, reported, noise in zip(
+    each = zip(
         survey.carried, survey.steps_each, survey.returns_each, survey.noise_each, strict=True
-    ):
+    )
+    for number, (carried, steps, reported, noise) in enumerate(each):
         sensor, subrays = carried.sensor, reported.subrays
         echoes = subrays > 1 or noise.loses or passing or dark
         several = reported.mode in ("all", "dual") and (subrays > 1 or passing)
@@ -72,7 +74,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         firings = (stop - first) * scans
         rays = firings * sensor.channels
         each = RETURNS_LEAFY if leafy and subrays > 1 and reported.mode == "all" else RETURNS
-        returns = rays * (each if several else 1)
+        in_air = 0.0  # hits of a pulse
+        if survey.returns_light:
+            in_air = survey.met(number) + bool(survey.scatters(sensor.optics.wavelength_nm))
+        more = {"all": in_air, "dual": min(in_air, 1.0)}.get(reported.mode, 0.0)
+        returns = rays * max(each if several else 1, 1 + more)
         points = returns / survey.keep_every
         repeats, by_head = rays_repeat(sensor, survey.path.moves)
         poses = firings if survey.path.moves or by_head else 0
@@ -88,6 +94,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
             chunk = min(rays * subrays, CHUNK_RAYS)
             subray = SUBRAY_PASSING if passing else SUBRAY
             found = (SUBRAY_REFRACTED if refracted else subray) * chunk + RETURN * returns
+            if survey.returns_light:
+                found += AIR * chunk + AIR_HIT * in_air * chunk / subrays
             casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
         if by_numpy:  # as if it made all columns, and once more those of the device
             point = POINT + POINT_BYTE * columns + columns * made_there
