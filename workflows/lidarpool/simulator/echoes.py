@@ -20,6 +20,7 @@ from .air import AirCaster
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products, turned
 from .paths import Paths
+from .receiver import Receiver
 from .separation import separated
 from .surfaces import Surfaces
 from .world import World
@@ -66,6 +67,7 @@ class EchoCaster:
         # across it and towards it.
         axis = turned(np.array([[0.0, 0, 1]]), self._sensor.axes)
         self._axis = turned(axis, survey.carried[number].mount.rotation)[0]
+        self._receiver = Receiver(number, survey, caster, scene, surfaces, self._paths)
 
     def divided(self, pattern: Pattern, *, by_head: bool = False) -> Pattern | None:
         """Make the sub-rays of a repeated pattern, if they are few and always the same.
@@ -124,11 +126,15 @@ class EchoCaster:
                 if self._air is not None:
                     hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
                 returns = separated(hits, self._gap_m, len(beam), planes)
-                returns = returns._replace(ray=start + returns.ray)
-                chunks.append(self._reported(returns, keys))
+                returns = self._detected(returns._replace(ray=start + returns.ray), keys)
+                if self._receiver.adds:
+                    every = np.arange(start, stop)
+                    middles = (every - start) * len(beam)
+                    returns = self._receiver.added(returns, keys, every, beams, here, middles, row)
+                chunks.append(returns.take(chosen(returns, self._returns.mode)))
             found = self._kept(joined(chunks), groups, tally)
-        if noise.range_m or noise.range_per_m:
-            reported = noise.ranges(found.distance, *keys.of(found.ray), found.number)
+        if noise.moves_ranges:
+            reported = noise.ranges(found.distance, found.energy, *keys.of(found.ray), found.number)
             found = replace(found, reported=reported)
         return found
 
@@ -213,12 +219,12 @@ class EchoCaster:
         some = triangle[triangle != NO_SURFACE]
         return np.bincount(surfaces.counter(some), minlength=surfaces.counters)
 
-    def _reported(self, returns: Hits, keys: Keys) -> Hits:
-        """Select detected returns, and among them those that the mode reports."""
-        if self._noise.loses:
-            seen = self._noise.detected(returns.energy, *keys.of(returns.ray), numbers(returns.ray))
-            returns = returns.take(seen)
-        return returns.take(chosen(returns, self._returns.mode))
+    def _detected(self, returns: Hits, keys: Keys) -> Hits:
+        """Select the returns that are detected."""
+        if not self._noise.loses:
+            return returns
+        seen = self._noise.detected(returns.energy, *keys.of(returns.ray), numbers(returns.ray))
+        return returns.take(seen)
 
     def _kept(self, returns: Hits, groups: Whole, tally: bool) -> Echoes:
         """Count the returns of each scan and thin them out."""
