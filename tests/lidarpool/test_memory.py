@@ -70,10 +70,12 @@ SURVEYS = {
         MANY,
         **STILL,
         returns=Returns("all", 7, (3.0, 1.5), exit_diameter_m=0.01),
-        materials=[Material("*", 0.5, leaf_area_density=0.02)],
+        materials=[*HALF, Material("Ball", 0.5, leaf_area_density=0.02)],
     ),
     "water": Survey(
-        MANY, **STILL, materials=[Material("*", 0.5, transparent="pass", refractive_index=1.33)]
+        MANY,
+        **STILL,
+        materials=[*HALF, Material("Ball", 0.5, transparent="pass", refractive_index=1.33)],
     ),
     "false alarms": Survey(ALERT, **STILL, noise=Noise(**FAINT, false_alarm_hz=1e6), **EVERY),
     "stray light": Survey(ALERT, **WAY, noise=Noise(**FAINT, stray_light=1e-5), **SIGN),
