@@ -112,7 +112,7 @@ WRONG = {
     Noise: [("0.1", "range_m is '0.1'"), ([1], "a number"), (0, 0, 0, 0, None, 1.5, "seed is 1.5")],
     Optics: [
         ("red", "wavelength_nm"),
-        (905.0, "x", "number or None"),
+        (905.0, "x", "a list of numbers or None"),
         (905, None, None, "pulse_ns"),
     ],
     Planning: [

@@ -70,6 +70,17 @@ SURVEYS = {
     "velocities of sub-rays": Survey(
         MANY, **WAY, columns=["radial_velocity"], returns=Returns("strongest", 7, 3.0)
     ),
+    "leaves": Survey(
+        MANY,
+        **STILL,
+        returns=Returns("all", 7, (3.0, 1.5), exit_diameter_m=0.01),
+        materials=[*HALF, Material("Ball", 0.5, leaf_area_density=0.02)],
+    ),
+    "water": Survey(
+        MANY,
+        **STILL,
+        materials=[*HALF, Material("Ball", 0.5, transparent="pass", refractive_index=1.33)],
+    ),
     "false alarms": Survey(ALERT, **STILL, noise=Noise(**FAINT, false_alarm_hz=1e6), **EVERY),
     "stray light": Survey(ALERT, **WAY, noise=Noise(**FAINT, stray_light=1e-5), **SIGN),
     "crosstalk": Survey(sensors=BOTH, **STILL, noise=Noise(**FAINT, crosstalk=True)),

@@ -159,7 +159,8 @@ def _check(name: str, value: object, kind: Kind, limits: dict[str, Any]) -> None
     for limit in limits if value is not None else ():
         if isinstance(value, str) and limit != "min_length":
             continue  # of the numbers that are also allowed
-        if not _LIMITS[limit][0](value, limits[limit]):  # nor NaN
+        each = value if isinstance(value, (list, tuple)) and limit != "min_length" else [value]
+        if not all(_LIMITS[limit][0](one, limits[limit]) for one in each):  # nor NaN
             raise LidarpoolError(f"{name} is {shown(value)}; it must be {_range(limits)}.")
 
 

@@ -270,15 +270,16 @@ def _look_at_folder(out: Path | Storage) -> list[str]:
 
 def _worker_bytes(job: Job) -> int:
     """Memory of a GPU worker, without what it casts."""
-    each = zip(job.survey.carried, job.survey.returns_each, strict=True)
-    rays = sum(
-        min((carried.sensor.period or 0) * carried.sensor.channels * returns.subrays, PATTERN_RAYS)
-        for carried, returns in each
-    )
+    patterns = 0
+    for carried, returns in zip(job.survey.carried, job.survey.returns_each, strict=True):
+        sensor = carried.sensor
+        rays = min((sensor.period or 0) * sensor.channels * returns.subrays, PATTERN_RAYS)
+        own_starts = returns.beam(sensor.optics).starts is not None
+        patterns += RAY_BYTES * rays * (1 + own_starts)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
     images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
     coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())
-    return PROCESS_BYTES + triangles + coloured + _copies_bytes(job) + RAY_BYTES * rays
+    return PROCESS_BYTES + triangles + coloured + _copies_bytes(job) + patterns
 
 
 def _copies_bytes(job: Job) -> int:

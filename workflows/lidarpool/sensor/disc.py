@@ -1,8 +1,10 @@
-"""Places of sub-rays in the round cross-section of a beam."""
+"""Sub-rays of a beam: places in its cross-section, directions and starts."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import cache
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -49,6 +51,7 @@ _SIXTH = {
 }
 
 SUBRAYS = (1, *_SIXTH)
+Profile = Literal["even", "gaussian"]
 
 
 @cache
@@ -65,13 +68,70 @@ def _places(count: int) -> NDArray[np.float64]:
     return np.concatenate([np.zeros((1, 2)), points.reshape(-1, 2)])
 
 
-def disc(count: int, divergence: float) -> NDArray[np.float64]:
-    """Places of sub-rays in an evenly bright cone, each with the same share of the light.
+@cache
+def _gaussian_places(count: int) -> NDArray[np.float64]:
+    """Places with equal shares of a Gaussian beam's light, in units of its radius at 1/e².
 
-    `divergence` is the full angle of the cone, radians. Returns float64 (count, 2): angles off the
-    axis, radians, the middle first; the count is one of `SUBRAYS`.
+    Those of the disc, moved outwards: where the disc within a place has a share q of the area, the
+    beam within it has the share q of the light, 1 - exp(-2 r²). Their second moment is the beam's.
+    On a straight edge they are wrong by at most 0.212 of the beam with 7, 0.107 with 19, 0.072,
+    0.053, 0.043, 0.039, 0.037, and 0.023 with 217. Weights on evenly spread places, out to the best
+    radius, are wrong by 0.280, 0.143, 0.103, …, and 0.034 with 217.
     """
-    return divergence / 2 * _places(count)
+    places = _places(count)
+    share = (places**2).sum(axis=1)
+    outwards = np.sqrt(-np.log1p(-share[1:]) / 2 / share[1:])
+    places = np.concatenate([places[:1], places[1:] * outwards[:, None]])
+    return np.asarray(places * np.sqrt(count / 2 / (places**2).sum()))
+
+
+@dataclass(frozen=True, eq=False)
+class Beam:
+    """Sub-rays of a beam, each with the same share of its light, the middle first.
+
+    Attributes
+    ----------
+    angles
+        float64 (k, 2): angles off the axis, across and up, radians.
+    starts
+        float64 (k, 2): where they leave the sensor, across and up, metres off the axis; None if all
+        start on it.
+    oval
+        Whether the two directions differ, so that across and up have to be those of the sensor.
+    """
+
+    angles: NDArray[np.float64]
+    starts: NDArray[np.float64] | None = None
+    oval: bool = False
+
+    def __len__(self) -> int:
+        return len(self.angles)
+
+    @classmethod
+    def of(
+        cls,
+        count: int,
+        divergence: tuple[float, float],
+        profile: Profile = "even",
+        exit_m: float = 0.0,
+    ) -> Beam:
+        """Make one: the number of sub-rays, of `SUBRAYS`, and full angles across and up, radians.
+
+        Sub-rays of a beam that is wide at its start are skew lines. Off the axis, each starts at a
+        right angle to where it goes, so that the beam's radius in the distance R is
+        sqrt(w0² + (θ R / 2)²), that of a Gaussian beam: the hyperboloid is made of straight lines
+        (Herloski, Marshall and Antos 1983).
+        """
+        even = profile == "even" or count == 1
+        places = _places(count) if even else _gaussian_places(count)
+        across, up = divergence
+        starts = None
+        if exit_m and count > 1:
+            starts = exit_m / 2 * np.stack([places[:, 1], -places[:, 0]], axis=1)
+            if across != up:
+                # All to one side, sub-rays would turn the oval on its way.
+                starts[1:] *= np.repeat([1, -1] * 3, (count - 1) // 6)[:, None]
+        return cls(np.array([across, up]) / 2 * places, starts, across != up and count > 1)
 
 
 @cache

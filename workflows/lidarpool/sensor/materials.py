@@ -20,6 +20,7 @@ from ..base.arguments import checked_fields, shown
 from ..base.declared import Share, TextOrTexts, written_as
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
+from .leaves import LeafAngle
 
 REFERENCE_M = 10.0  # energy is 1 for a white surface hit at right angles from here
 REFLECTANCE = 0.5  # default reflectance: between asphalt (0.1 to 0.2) and white paint (0.8)
@@ -118,6 +119,37 @@ class Material:
     metalness: Annotated[
         Share, Field(description="with roughness: 1 for metals, which scatter by their gloss alone")
     ] = 0.0
+    refractive_index: Annotated[
+        float | None,
+        Field(
+            ge=1,
+            le=4,
+            description="with transparent: pass, light is refracted and slower within the closed "
+            "surface, as 1.33 for water; by default it goes straight on",
+            examples=[1.33],
+        ),
+    ] = None
+    attenuation_per_m: Annotated[
+        float,
+        Field(ge=0, le=1e6, description="with refractive_index, extinction within the surface"),
+    ] = 0.0
+    leaf_area_density: Annotated[
+        float | None,
+        Field(
+            gt=0,
+            le=1e4,
+            description="the closed surface is full of leaves: their one-sided area, m²/m³; "
+            "reflectance is theirs",
+            examples=[0.8],
+        ),
+    ] = None
+    leaf_angle: Annotated[
+        LeafAngle,
+        Field(
+            description="with leaf_area_density, how leaves are inclined: spherical, planophile, "
+            "erectophile, plagiophile, extremophile, uniform, or Campbell's ratio of axes"
+        ),
+    ] = "spherical"
 
     def __post_init__(self) -> None:
         names = (self.objects,) if isinstance(self.objects, str) else tuple(self.objects)
@@ -143,6 +175,26 @@ class Material:
             raise LidarpoolError("metalness needs a roughness: give 0.1 (polished) to 1 (matt).")
         if self.roughness is not None and (self.retro or self.transparent != "none"):
             raise LidarpoolError("roughness is for opaque surfaces that are not retro-reflective.")
+        self._check_within()
+
+    def _check_within(self) -> None:
+        """Refuse what contradicts the medium within a surface."""
+        if self.refractive_index is not None and self.transparent != "pass":
+            raise LidarpoolError(
+                "refractive_index is for light that passes: add transparent: pass."
+            )
+        if self.attenuation_per_m and self.refractive_index is None:
+            raise LidarpoolError("attenuation_per_m needs a refractive_index, such as 1.33.")
+        if self.leaf_area_density is None:
+            if self.leaf_angle != "spherical":
+                raise LidarpoolError("leaf_angle needs a leaf_area_density, m²/m³, such as 0.8.")
+            return
+        other = self.transparent != "none" or self.retro or self.roughness is not None
+        if other or self.reflectance == "texture":
+            raise LidarpoolError(
+                "leaf_area_density is for leaves that scatter light: leave out transparent, retro "
+                "and roughness, and give reflectance as a number, or a material."
+            )
 
     def share(self, wavelength_nm: float) -> float:
         """Share of light that is scattered; of textures, that of what has no colour."""
@@ -241,6 +293,11 @@ class MaterialTable:
     passes: NDArray[np.bool_]
     mirrors: NDArray[np.bool_]
     semantic_class: NDArray[np.uint16]
+    refractive_index: NDArray[np.float64]  # within; 0 where light goes straight on
+    attenuation: NDArray[np.float64]  # within, 1/m
+    leaf_area: NDArray[np.float64]  # density within, m²/m³; 0 for no leaves
+    leaf_angle: NDArray[np.intp]  # rows of `leaf_angles`
+    leaf_angles: tuple[str | float, ...]
 
     @classmethod
     def of(
@@ -263,6 +320,7 @@ class MaterialTable:
             )
         found = [*materials, Material("*")]  # the last is of all, if there are no materials
         textured = [m.scale * (m.reflectance == "texture") for m in found]
+        angles = tuple(dict.fromkeys(m.leaf_angle for m in found))
         return cls(
             np.array([m.share(wavelength_nm) for m in found], np.float64)[last],
             np.array(textured, np.float64)[last],
@@ -272,12 +330,28 @@ class MaterialTable:
             np.array([m.transparent == "pass" for m in found], np.bool_)[last],
             np.array([m.transparent == "mirror" for m in found], np.bool_)[last],
             np.array([m.semantic_class for m in found], np.uint16)[last],
+            np.array([m.refractive_index or 0.0 for m in found])[last],
+            np.array([m.attenuation_per_m for m in found], np.float64)[last],
+            np.array([m.leaf_area_density or 0.0 for m in found])[last],
+            np.array([angles.index(m.leaf_angle) for m in found], np.intp)[last],
+            angles,
         )
 
     @property
     def plain(self) -> bool:
         """Whether each ray ends at its first hit, with a return."""
-        return bool((self.reflectance > 0).all() and not (self.passes | self.mirrors).any())
+        through = self.passes | self.mirrors | self.leafy
+        return bool((self.reflectance > 0).all() and not through.any())
+
+    @property
+    def leafy(self) -> NDArray[np.bool_]:
+        """Whether objects are full of leaves."""
+        return self.leaf_area > 0
+
+    @property
+    def refracts(self) -> NDArray[np.bool_]:
+        """Whether light is refracted at the surfaces of objects."""
+        return self.refractive_index > 0
 
     @property
     def textured(self) -> bool:
@@ -311,9 +385,13 @@ class MaterialTable:
     def goes_on(
         self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Share of the light that continues at glass or mirrors (n,)."""
-        through = np.where(self.passes[rows], 1 - fresnel(cosine), 1.0)
-        return np.asarray((1 - self.reflectance[rows]) * through)
+        """Share of the light that continues at glass or mirrors (n,).
+
+        Where it is refracted, what the surface reflects is not taken off.
+        """
+        glass = self.passes[rows] & ~self.refracts[rows]
+        through = np.where(glass, 1 - fresnel(cosine), 1.0)
+        return np.asarray(np.where(self.leafy[rows], 1, 1 - self.reflectance[rows]) * through)
 
 
 def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -328,11 +406,17 @@ def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArra
     return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 
 
-def fresnel(cosine: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Share of unpolarised light that a surface of glass reflects (Fresnel's equations)."""
-    inside = np.sqrt(1 - (1 - cosine**2) / GLASS_INDEX**2)
-    across = (cosine - GLASS_INDEX * inside) / (cosine + GLASS_INDEX * inside)
-    along = (inside - GLASS_INDEX * cosine) / (inside + GLASS_INDEX * cosine)
+def fresnel(
+    cosine: NDArray[np.float64], index: float | NDArray[np.float64] = GLASS_INDEX
+) -> NDArray[np.float64]:
+    """Share of unpolarised light that a surface reflects (Fresnel's equations).
+
+    `index` is the refractive index behind the surface over that before it; all light is reflected
+    where it is below 1 and the cosine is small.
+    """
+    inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / index**2, 0.0))
+    across = (cosine - index * inside) / (cosine + index * inside)
+    along = (inside - index * cosine) / (inside + index * cosine)
     return np.asarray((across**2 + along**2) / 2)
 
 

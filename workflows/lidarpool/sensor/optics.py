@@ -2,22 +2,37 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import BeforeValidator, Field
 
-from ..base.arguments import checked_fields
+from ..base.arguments import checked_fields, shown
 from ..base.errors import LidarpoolError
-from .disc import SUBRAYS
+from .disc import SUBRAYS, Beam, Profile
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
 
 Mode = Literal["strongest", "first", "last", "dual", "all"]
-# Full angle of a beam's cone, at 1/e² of its maximum.
-Divergence = Annotated[float, Field(ge=0, le=1000)]
+
+
+def _one_or_two(value: Any) -> Any:
+    """Refuse what is neither, in one line instead of pydantic's for each."""
+    angles = list(value) if isinstance(value, (list, tuple)) else [value]
+    fits = all(type(angle) in (int, float) and 0 <= angle <= 1000 for angle in angles)
+    if value is None or (fits and len(angles) == (2 if isinstance(value, (list, tuple)) else 1)):
+        return tuple(value) if isinstance(value, list) else value
+    raise ValueError(f"given is {shown(value)}; it must be 0 to 1000, or two such: [across, up].")
+
+
+# Full angle of a beam's cone, at 1/e² of its maximum; or two, across and up.
+Divergence = Annotated[
+    Annotated[float, Field(ge=0, le=1000)] | Sequence[float], BeforeValidator(_one_or_two)
+]
+Diameter = Annotated[float, Field(ge=0, le=10)]
 Pulse = Annotated[float, Field(ge=0, le=1e6)]
 Precision = Annotated[float, Field(ge=1e-6, le=1000)]
 
@@ -31,12 +46,23 @@ class Optics:
         float, Field(ge=200, le=20_000, description="of the laser; 905 if no source states it")
     ] = 905.0
     divergence_mrad: Annotated[
-        Divergence | None, Field(description="full angle of the beam; None if unknown")
+        Divergence | None,
+        Field(description="full angle of the beam, or two, across and up; None if unknown"),
     ] = None
     pulse_ns: Annotated[Pulse, Field(description="length of a pulse")] = 5.0
     resolution_m: Annotated[
         Precision, Field(description="of reported ranges: default step for rounding positions")
     ] = 0.01
+    beam_profile: Annotated[
+        Profile, Field(description="how light is spread over the beam, where it has sub-rays")
+    ] = "even"
+    exit_diameter_m: Annotated[
+        Diameter, Field(description="width of the beam where it leaves the sensor")
+    ] = 0.0
+
+    def __post_init__(self) -> None:
+        if isinstance(self.divergence_mrad, Sequence):
+            object.__setattr__(self, "divergence_mrad", _pair(self.divergence_mrad))
 
 
 @dataclass(frozen=True)
@@ -68,7 +94,10 @@ class Returns:
     ] = 1
     divergence_mrad: Annotated[
         Divergence | None,
-        Field(description="full angle of the beam; by default the sensor's", examples=[3.0]),
+        Field(
+            description="full angle of the beam, or two, across and up; by default the sensor's",
+            examples=[3.0],
+        ),
     ] = None
     pulse_ns: Annotated[
         Pulse | None,
@@ -78,38 +107,79 @@ class Returns:
             examples=[5.0],
         ),
     ] = None
+    beam_profile: Annotated[
+        Profile | None,
+        Field(
+            description="how light is spread over the beam; by default the sensor's, or even",
+            examples=["gaussian"],
+        ),
+    ] = None
+    exit_diameter_m: Annotated[
+        Diameter | None,
+        Field(
+            description="width of the beam where it leaves the sensor; by default the sensor's, "
+            "or 0",
+            examples=[0.01],
+        ),
+    ] = None
+
+    def __post_init__(self) -> None:
+        if isinstance(self.divergence_mrad, Sequence):
+            object.__setattr__(self, "divergence_mrad", _pair(self.divergence_mrad))
 
     def of(self, optics: Optics) -> tuple[float, float]:
         """Divergence, radians, and least distance of two returns, metres.
+
+        The divergence of an oval beam is that of a round one of the same area.
 
         Raises
         ------
         LidarpoolError
             If there are sub-rays, and the divergence is unknown.
         """
+        across, up = self._divergence(optics)
+        pulse_ns = optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
+        wide = across if across == up else float(np.sqrt(across * up))
+        return wide, LIGHT_M_NS * pulse_ns / 2
+
+    def beam(self, optics: Optics) -> Beam:
+        """Sub-rays of a sensor's beam; raises as `of`."""
+        profile = optics.beam_profile if self.beam_profile is None else self.beam_profile
+        wide_m = optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
+        return Beam.of(self.subrays, self._divergence(optics), profile, wide_m)
+
+    def _divergence(self, optics: Optics) -> tuple[float, float]:
+        """Across and up, radians."""
         wide = optics.divergence_mrad if self.divergence_mrad is None else self.divergence_mrad
         if wide is None and self.subrays > 1:
             raise LidarpoolError(
                 f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
-        pulse_ns = optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
-        return (wide or 0.0) / 1000, LIGHT_M_NS * pulse_ns / 2
+        across, up = _pair(wide) if isinstance(wide, Sequence) else (wide or 0.0, wide or 0.0)
+        return across / 1000, up / 1000
+
+
+def _pair(divergence: Sequence[float]) -> tuple[float, float]:
+    """Divergences across and up; LidarpoolError if there are not two."""
+    if len(divergence) != 2:
+        raise LidarpoolError(
+            f"divergence_mrad is {shown(divergence)}; it must be one angle, or two: [across, up]."
+        )
+    return divergence[0], divergence[1]
 
 
 def spread(
-    directions: NDArray[np.float64], across: NDArray[np.float64], up: NDArray[np.float64]
+    directions: NDArray[np.float64],
+    across: NDArray[np.float64],
+    up: NDArray[np.float64],
+    axes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
 ) -> NDArray[np.float64]:
     """Turn unit directions (n, 3) by small angles (n, k) or (1, k), radians: (n, k, 3), unit.
 
-    The two axes across a ray are those of Duff et al. 2017, which exist for every direction.
+    By default, the two axes across a ray are those of `any_axes`.
     """
-    x, y, z = directions.T
-    sign = np.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    one = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    other = np.stack([b, sign + y * y * a, -y], axis=1)
+    one, other = any_axes(directions) if axes is None else axes
     straight = 1 / np.sqrt(1 + across**2 + up**2)
     across, up = across * straight, up * straight
     out = np.empty((3, len(directions), across.shape[1]))
@@ -117,3 +187,40 @@ def spread(
         ahead, first, second = (v[:, axis, None] for v in (directions, one, other))
         out[axis] = (straight * ahead + across * first) + up * second
     return out.transpose(1, 2, 0)
+
+
+def any_axes(directions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Two axes across unit directions (n, 3): those of Duff et al. 2017, which always exist."""
+    x, y, z = directions.T
+    sign = np.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    one = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    other = np.stack([b, sign + y * y * a, -y], axis=1)
+    return one, other
+
+
+def axes_about(
+    directions: NDArray[np.float64], axis: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Axes across unit directions (n, 3): counter-clockwise about an axis (3,), and towards it.
+
+    Straight along the axis, they are those of `any_axes`.
+    """
+    x, y, z = directions.T
+    a, b, c = axis
+    across = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
+    length = np.sqrt((across[0] ** 2 + across[1] ** 2) + across[2] ** 2)
+    one = (across / np.maximum(length, 1e-300)).T
+    other = np.stack(
+        [
+            y * one[:, 2] - z * one[:, 1],
+            z * one[:, 0] - x * one[:, 2],
+            x * one[:, 1] - y * one[:, 0],
+        ],
+        axis=1,
+    )
+    along = length < 1e-6
+    if along.any():
+        one[along], other[along] = any_axes(directions[along])
+    return one, other

@@ -14,12 +14,12 @@ from raybeam import Pattern, ScanReturns
 
 from ..scene.scene import Scene
 from ..sensor import Survey
-from ..sensor.disc import disc
-from ..sensor.optics import Mode, spread
+from ..sensor.disc import Beam
+from ..sensor.optics import Mode, any_axes, axes_about, spread
 from .air import AirCaster
 from .doppler import radial_velocities
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
-from .motion import Poses, products
+from .motion import Poses, products, turned
 from .paths import Paths
 from .receiver import Receiver
 from .separation import separated
@@ -56,26 +56,34 @@ class EchoCaster:
         self._caster, self._survey, self._surfaces = caster, survey, surfaces
         self._sensor = survey.carried[number].sensor
         self._returns, self._noise = survey.returns_each[number], survey.noise_each[number]
-        self._paths = Paths(caster, scene, survey, self._sensor, surfaces)
+        seed = self._noise.seed
+        self._paths = Paths(caster, scene, survey, self._sensor, surfaces, seed)
         self._air = AirCaster(number, survey, surfaces) if survey.returns_light else None
         # Whether each ray that hits something has one return.
         several = self._returns.subrays > 1 or self._noise.loses
         self._one_each = surfaces.materials.plain and not several
         # Whether its returns are the caster's hits.
         self.plain = self._one_each and not self._noise.displaces
-        divergence, self._gap_m = self._returns.of(self._sensor.optics)
+        _, self._gap_m = self._returns.of(self._sensor.optics)
+        self._beam = self._returns.beam(self._sensor.optics)
+        # The axis that the head turns about, in the carrier's axes: of an oval beam, sub-rays lie
+        # across it and towards it.
+        axis = turned(np.array([[0.0, 0, 1]]), self._sensor.axes)
+        self._axis = turned(axis, survey.carried[number].mount.rotation)[0]
         self._receiver = Receiver(number, survey, caster, scene, surfaces, self._paths)
-        self._beam = disc(self._returns.subrays, divergence)
 
-    def divided(self, pattern: Pattern) -> Pattern | None:
-        """Make the sub-rays of a repeated pattern, if they are few and always the same."""
+    def divided(self, pattern: Pattern, *, by_head: bool = False) -> Pattern | None:
+        """Make the sub-rays of a repeated pattern, if they are few and always the same.
+
+        `by_head` says that it is in the axes of the head.
+        """
         subrays = len(self._beam)
         if len(pattern) * subrays > PATTERN_RAYS or self._noise.angle_deg:
             return None
         if subrays == 1:
             return pattern
         keys = Keys(0, np.zeros(1, int))
-        return self._beams(self._beam, pattern, 0, keys, 0, len(pattern))
+        return self._beams(self._beam, pattern, 0, keys, (0, len(pattern)), by_head)
 
     def scan(
         self,
@@ -97,7 +105,7 @@ class EchoCaster:
         keys = Keys(scan, groups)
         if self._one_each:
             if noise.angle_deg:
-                beams = self._beams(np.zeros((1, 2)), pattern, first, keys, 0, rays)
+                beams = self._beams(self._beam, pattern, first, keys, (0, rays))
                 pattern, first = beams, 0
             found = self._once(pattern, poses, (first, first + rays), groups, tally)
         else:
@@ -111,12 +119,13 @@ class EchoCaster:
                 stop = min(start + size, rays)
                 row = (first + start) * len(beam)
                 if divided is None:
-                    beams, row = self._beams(beam, pattern, first, keys, start, stop), 0
+                    some = start, stop
+                    beams, row = self._beams(beam, pattern, first, keys, some, poses.by_head), 0
                 else:
                     beams = divided
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
-                hits, planes = self._paths.hits(beams, here, window)
+                hits, planes = self._paths.hits(beams, here, window, keys, start, len(beam))
                 if self._air is not None:
                     hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
                 hits = self._paths.with_velocities(hits, beams, here, window)
@@ -134,22 +143,38 @@ class EchoCaster:
         return found
 
     def _beams(
-        self, beam: Real, pattern: Pattern, first: int, keys: Keys, start: int, stop: int
+        self,
+        beam: Beam,
+        pattern: Pattern,
+        first: int,
+        keys: Keys,
+        which: tuple[int, int],
+        by_head: bool = False,
     ) -> Pattern:
-        """Make the sub-rays of rays `start` to `stop`, with noise of angles, ray by ray."""
-        rays = np.arange(start, stop)
+        """Make the sub-rays of some rays, from one to another, with noise of angles, ray by ray."""
+        rays = np.arange(*which)
         rows = (first + rays) % len(pattern)
         directions = np.empty((len(rays), len(beam), 3))
-        for begin in range(0, len(rays), BLOCK_RAYS):
-            block = slice(begin, begin + BLOCK_RAYS)
-            across, up = beam.T[:, None]
-            if self._noise.angle_deg:
-                off_across, off_up = self._noise.angles(*keys.of(rays[block]))
-                across, up = across + off_across[:, None], up + off_up[:, None]
-            directions[block] = spread(pattern.directions[rows[block]], across, up)
         origins = pattern.origins
         if origins is not None:
             origins = np.repeat(origins[rows], len(beam), axis=0)
+        elif beam.starts is not None:
+            origins = np.zeros((len(rays) * len(beam), 3))
+        axis = np.array([0.0, 0, 1]) if by_head else self._axis
+        for begin in range(0, len(rays), BLOCK_RAYS):
+            block = slice(begin, begin + BLOCK_RAYS)
+            across, up = beam.angles.T[:, None]
+            if self._noise.angle_deg:
+                off_across, off_up = self._noise.angles(*keys.of(rays[block]))
+                across, up = across + off_across[:, None], up + off_up[:, None]
+            ahead, axes = pattern.directions[rows[block]], None
+            if beam.oval or beam.starts is not None:
+                axes = axes_about(ahead, axis) if beam.oval else any_axes(ahead)
+            directions[block] = spread(ahead, across, up, axes)
+            if beam.starts is not None and axes is not None and origins is not None:
+                one, other = axes
+                here = origins.reshape(directions.shape)[block]  # a view
+                here += beam.starts[:, :1] * one[:, None] + beam.starts[:, 1:] * other[:, None]
         return Pattern(directions.reshape(-1, 3), origins)
 
     def _once(

@@ -28,13 +28,15 @@ RAY_MADE, RAY_MADE_KEPT = 92, 32  # if it is not repeated: while it is made, and
 RAY_TURNED = 20  # by noise of angles, likewise
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
-SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+# Of those cast at a time; if light passes or is reflected; if it is refracted.
+SUBRAY, SUBRAY_PASSING, SUBRAY_REFRACTED = 200, 650, 1350
 SUBRAY_MOVING = 110  # more of each, with radial velocities
 # Of a ray that is cast at a time: false alarms and stray light, and each pulse of another sensor.
 # Each return has a cause then.
 RECEIVED, CROSSED, RETURN_CAUSED = 120, 370, 10
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
+RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
 AIR, AIR_HIT = 110, 200  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
@@ -52,7 +54,9 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     they needed as much as others. `on_device` says that a CUDA device casts the rays; its own
     memory, some 300 MB, does not count.
     """
-    passing = any(material.transparent != "none" for material in survey.materials)
+    leafy = any(material.leaf_area_density is not None for material in survey.materials)
+    passing = leafy or any(material.transparent != "none" for material in survey.materials)
+    refracted = any(material.refractive_index is not None for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)
     textured = any(material.reflectance == "texture" for material in survey.materials)
     moving = any(column.name == VELOCITY for column in survey.stored_columns)
@@ -75,6 +79,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         first, stop = sensor.firings(0)
         firings = (stop - first) * scans
         rays = firings * sensor.channels
+        in_leaves = leafy and subrays > 1 and reported.mode == "all"
+        of_pulse = (RETURNS_LEAFY if in_leaves else RETURNS) if several else 1
         in_air = 0.0  # hits of a pulse
         if survey.returns_light:
             in_air = survey.met(number) + bool(survey.scatters(sensor.optics.wavelength_nm))
@@ -82,7 +88,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         if noise.false_alarm_hz:
             alarms = noise.false_alarm_hz * sensor.gate_s
             more += {"all": alarms, "dual": min(alarms, 1.0)}.get(reported.mode, 0.0)
-        returns = rays * max(RETURNS if several else 1, 1 + more)
+        returns = rays * max(of_pulse, 1 + more)
         points = returns / survey.keep_every
         repeats, by_head = rays_repeat(sensor, survey.path.moves)
         poses = firings if survey.path.moves or by_head else 0
@@ -96,7 +102,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         casting += RAY_AMONG_BODIES * (rays if scene.actors else here) * bodies
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
-            subray = (SUBRAY_PASSING if passing else SUBRAY) + SUBRAY_MOVING * moving
+            subray = SUBRAY_PASSING if passing else SUBRAY
+            subray = (SUBRAY_REFRACTED if refracted else subray) + SUBRAY_MOVING * moving
             found = subray * chunk + RETURN * returns
             if noise.false_alarm_hz or noise.stray_light or noise.crosstalk:
                 found += RECEIVED * chunk / subrays

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,30 +13,72 @@ from raybeam import Pattern
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
+from ..sensor.noise import raw
 from .doppler import BLOCK_HITS, approach
-from .hits import AIR, Hits, Planes, Real, joined
+from .hits import AIR, Hits, Keys, Planes, Real, Whole, joined
+from .media import LEAF, Media, Rays, Within, depths
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
 from .world import World
 
 PASSES_MOST = 16  # surfaces that light passes before it is dropped
+LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
+
+
+@dataclass
+class _Light:
+    """The light of sub-rays on its way: arrays (n,), vectors (n, 3)."""
+
+    ray: Whole  # number of the sub-ray
+    times: Real
+    origins: Real
+    directions: Real
+    share: Real  # that comes back, but for what the last surface scatters
+    before: Real  # optical path up to the origin
+    # What mirrors did to the directions so far, (n, 3, 3), if there are any.
+    turns: Real | None = None
+    within: Within | None = None  # if there are media
+    # How fast its optical path grows, m/s, but for the motion of its end, if that is asked for.
+    growth: Real | None = None
+
+    def on(self, rows: NDArray[np.integer[Any]]) -> _Light:
+        """Select that of some sub-rays."""
+        return _Light(
+            self.ray[rows],
+            self.times[rows],
+            self.origins[rows],
+            self.directions[rows],
+            self.share[rows],
+            self.before[rows],
+            None if self.turns is None else self.turns[rows],
+            None if self.within is None else self.within.take(rows),
+            None if self.growth is None else self.growth[rows],
+        )
 
 
 class Paths:
     """Finds where the light of a sensor returns from."""
 
     def __init__(
-        self, world: World, scene: Scene, survey: Survey, sensor: Sensor, surfaces: Surfaces
+        self,
+        world: World,
+        scene: Scene,
+        survey: Survey,
+        sensor: Sensor,
+        surfaces: Surfaces,
+        seed: int = 0,
     ) -> None:
         self._world, self._sensor, self._surfaces = world, sensor, surfaces
-        self._light = light_of(survey, sensor)
+        self._light, self._seed = light_of(survey, sensor), seed
+        table = surfaces.at(sensor.optics.wavelength_nm)
+        filled = table.leafy.any() or table.refracts.any()
+        air = self._light.extinction
+        self._media = Media(scene, surfaces, table, air) if filled else None
         shown = any(column.name in COLOURS for column in survey.stored_columns)
         self._coloured = shown or surfaces.materials.textured
         # Whether hits have radial velocities.
         self.moving = any(column.name == VELOCITY for column in survey.stored_columns)
-        # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
-        reach = np.float32(np.abs(scene.bounds).max())
-        self._clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+        self._clear_m = world.clear_m
 
     def energy(
         self,
@@ -45,68 +90,106 @@ class Paths:
         """Return the received energy of hits (n,), see `Surfaces.energy`."""
         return self._surfaces.energy(triangle, cosine, distance, self._light, colour)
 
-    def hits(self, beams: Pattern, poses: Poses, window: tuple[int, int]) -> tuple[Hits, Planes]:
-        """Cast the sub-rays of a window, and follow the light through glass and off mirrors."""
-        surfaces = self._surfaces
+    def hits(
+        self,
+        beams: Pattern,
+        poses: Poses,
+        window: tuple[int, int],
+        keys: Keys,
+        first: int = 0,
+        each: int = 1,
+    ) -> tuple[Hits, Planes]:
+        """Cast the sub-rays of a window, and follow the light through glass and off mirrors.
+
+        There are `each` of a beam, and the first beam has the number `first` for its keys.
+        """
+        surfaces, media = self._surfaces, self._media
         materials = surfaces.at(self._light.wavelength_nm)
         nearest, farthest = self._sensor.min_range_m, self._sensor.max_range_m
-        found = self._world.scan(beams, poses, window=window, t_min=nearest, t_max=farthest)
-        ray, step, triangle = found.ray.astype(np.int64), found.distance, found.triangle
+        leafy = media is not None and media.leafy
+        # How far light goes in a crown depends on its other side, however far that is.
+        reach = np.inf if leafy else farthest
+        found = self._world.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
+        ray = found.ray.astype(np.int64)
         origins, directions = poses.rays(beams, ray, window[0])
         origins = np.broadcast_to(origins, directions.shape)
-        times = poses.times(ray)
-        share, before = np.ones(len(ray)), np.zeros(len(ray))
-        # How fast the path to where the light is grows, but for the motion of its end.
-        growth = approach(poses, ray, origins, directions) if self.moving else None
-        # What mirrors did to the directions so far: (n, 3, 3), if there are any.
-        turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3)) if materials.mirrors.any() else None
+        light = _Light(
+            ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
+        )
+
+        def draw(purpose: int, ray: Whole) -> NDArray[np.uint64]:
+            scan, number = keys.of(first + ray // each)
+            return raw(self._seed, purpose, scan, number, ray % each)
+
+        if self.moving:
+            light.growth = approach(poses, ray, origins, directions)
+        if materials.mirrors.any() or (media is not None and media.bends):
+            light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
+        if media is not None:
+            left = depths(draw(LEAF, ray)) if leafy else None
+            rays = Rays(origins, directions, light.times, poses.ways)
+            light.within = media.within(self._world, rays, left)
+        step, triangle = found.distance, found.triangle
         parts: list[Hits] = []
         seen: list[Real] = []  # normals as the sensor sees them
-        for _ in range(PASSES_MOST):
-            normals = surfaces.normals(triangle, times, poses.ways)
-            along = products(normals.T, directions.T)
-            distance = before + step
+        clear = np.full(len(ray), nearest)  # where light is first, metres from the origin
+        for _ in range(LEAFY_PASSES_MOST if leafy else PASSES_MOST):
+            normals = surfaces.normals(triangle, light.times, poses.ways)
+            along = products(normals.T, light.directions.T)
+            cosine = np.abs(along)
+            within, leaves = light.within, np.zeros(0, np.intp)
+            if within is not None:
+                met = within.meet(light.directions, step - clear, light.ray, draw)
+                step, triangle, leaves = step.copy(), triangle.copy(), met.rows
+                step[leaves] = clear[leaves] + met.metres
+                triangle[leaves], cosine[leaves] = met.triangles, met.cosines
+                normals[leaves] = light.directions[leaves]  # no leaf continues another
+            distance = light.before + (step if within is None else within.optical(step))
             colour = None
             if self._coloured:
-                points = origins + step[:, None] * directions
-                colour = surfaces.colours(triangle, points, times, poses.ways)
-            energy = share * self.energy(triangle, np.abs(along), distance, colour)
-            velocity = None
-            if growth is not None:
-                moved = self._velocities(triangle, origins, step, directions, times, poses)
-                velocity = growth + products(moved.T, directions.T)
-            parts.append(Hits(ray, distance, triangle, energy, colour, velocity=velocity))
-            seen.append(normals if turns is None else np.einsum("nji,nj->ni", turns, normals))
+                points = light.origins + step[:, None] * light.directions
+                colour = surfaces.colours(triangle, points, light.times, poses.ways)
+            energy = light.share * self.energy(triangle, cosine, distance, colour)
+            if within is not None:
+                within.go(step)
+                energy *= within.factor(light.directions, distance)
+            velocity, moved = None, np.zeros((0, 3))
+            if light.growth is not None:
+                moved = self._velocities(light, step, triangle, poses)
+                index = 1.0 if within is None else within.index
+                velocity = light.growth + index * products(moved.T, light.directions.T)
+            hits = Hits(light.ray, distance, triangle, energy, colour, velocity=velocity)
+            turns = light.turns
+            looks = normals if turns is None else np.einsum("nji,nj->ni", turns, normals)
             rows = surfaces.objects(triangle)
-            on = np.flatnonzero(materials.passes[rows] | materials.mirrors[rows])
+            goes = materials.passes[rows] | materials.mirrors[rows]
+            if leafy:
+                crowns = materials.leafy[rows]  # whose surfaces send nothing back
+                crowns[leaves] = False
+                near = distance <= farthest
+                goes = (goes | crowns) & near
+                there = np.flatnonzero(near & ~crowns)
+                hits, looks = hits.take(there), looks[there]
+            parts.append(hits)
+            seen.append(looks)
+            on = np.flatnonzero(goes)
             if not len(on):
                 break
-            rows, along, distance, ahead = rows[on], along[on], distance[on], directions[on]
-            share = share[on] * materials.goes_on(rows, np.abs(along)) ** 2  # and back again
-            ends = origins[on] + step[on, None] * ahead
-            mirrored = 2 * materials.mirrors[rows, None] * normals[on]
-            ahead = ahead - along[:, None] * mirrored
-            if turns is not None:
-                turns = turns[on]
-                along_turns = np.einsum("ni,nij->nj", normals[on], turns)
-                turns = turns - mirrored[:, :, None] * along_turns[:, None]
-            if growth is not None:  # a mirror that moves makes the path longer, too
-                bent = (directions[on] - ahead).T
-                growth = growth[on] + products(moved[on].T, bent)
-            away = self._clear_m / np.maximum(np.abs(along), 1e-3)
-            light = Pattern(ahead, ends + away[:, None] * ahead)
+            ends = step[on], distance[on], triangle[on], normals[on], along[on]
+            light, clear = self._behind(
+                light.on(on), *ends, None if light.growth is None else moved[on]
+            )
             # Light takes no time: it travels 300 m in a microsecond.
-            now = Poses(np.zeros(3), clock=Clock(times[on], np.zeros(1), poses.ways))
-            found = self._world.scan(light, now, t_max=farthest)
-            before = distance + away
-            near = before[found.ray] + found.distance <= farthest
-            which, step, triangle = found.ray[near], found.distance[near], found.triangle[near]
-            ray, share, before = ray[on][which], share[which], before[which]
-            times = times[on][which]
-            turns = None if turns is None else turns[which]
-            growth = None if growth is None else growth[which]
-            directions = light.directions[which]
-            origins = light.origins[which]  # type: ignore[index]  # it has some
+            now = Poses(np.zeros(3), clock=Clock(light.times, np.zeros(1), poses.ways))
+            found = self._world.scan(Pattern(light.directions, light.origins), now, t_max=reach)
+            which, step, triangle = found.ray, found.distance, found.triangle
+            light, clear = light.on(which), clear[which]
+            if not leafy:
+                within = light.within
+                end = light.before + (step if within is None else within.optical(step))
+                here = np.flatnonzero(end <= farthest)
+                light, clear = light.on(here), clear[here]
+                step, triangle = step[here], triangle[here]
         hits, normals = joined(parts), seen[0]
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
@@ -116,6 +199,54 @@ class Paths:
             return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
 
         return hits, planes
+
+    def _behind(
+        self,
+        light: _Light,
+        step: Real,
+        distance: Real,
+        triangle: NDArray[np.int32],
+        normals: Real,
+        along: Real,
+        moved: Real | None,
+    ) -> tuple[_Light, Real]:
+        """Take light (n,) through the surfaces at its end, or off them.
+
+        Returns it behind them, and where the surfaces are from there, metres, at or below 0.
+        `moved` (n, 3) are the velocities of the surfaces: where one bends light, its path grows.
+        """
+        materials = self._surfaces.at(self._light.wavelength_nm)
+        rows = self._surfaces.objects(triangle)
+        cosine, within = np.abs(along), light.within
+        share = light.share * materials.goes_on(rows, cosine) ** 2  # and back again
+        ahead, mirrors = light.directions, materials.mirrors[rows]
+        index = 1.0 if within is None else within.index
+        if within is not None:
+            ahead, passes, whole = within.cross(rows, triangle, ahead, normals, along)
+            share *= passes**2
+            mirrors = mirrors | whole
+        mirrored = 2 * mirrors[:, None] * normals
+        ahead = ahead - along[:, None] * mirrored
+        turns = light.turns
+        if turns is not None:
+            along_turns = np.einsum("ni,nij->nj", normals, turns)
+            turns = turns - mirrored[:, :, None] * along_turns[:, None]
+        if within is not None:
+            within.turn(light.directions, ahead, normals, mirrors)
+            cosine = np.abs(products(normals.T, ahead.T))
+        away = self._clear_m / np.maximum(cosine, 1e-3)
+        ends = light.origins + step[:, None] * light.directions
+        path = Pattern(ahead, ends + away[:, None] * ahead)
+        assert path.origins is not None  # it was given some
+        before = distance + (away if within is None else within.optical(away))
+        if within is not None:
+            within.go(away)
+        growth = light.growth
+        if growth is not None and moved is not None:  # a mirror that moves makes it longer, too
+            there, back = products(moved.T, light.directions.T), products(moved.T, ahead.T)
+            growth = growth + index * there - (1.0 if within is None else within.index) * back
+        own = light.ray, light.times, path.origins, path.directions, share, before
+        return _Light(*own, turns, within, growth), -away
 
     def with_velocities(
         self, hits: Hits, beams: Pattern, poses: Poses, window: tuple[int, int]
@@ -130,20 +261,14 @@ class Paths:
         return hits._replace(velocity=velocity)
 
     def _velocities(
-        self,
-        triangle: NDArray[np.int32],
-        origins: Real,
-        step: Real,
-        directions: Real,
-        times: Real,
-        poses: Poses,
+        self, light: _Light, step: Real, triangle: NDArray[np.int32], poses: Poses
     ) -> Real:
-        """Velocities of where light ends, m/s: (n, 3)."""
-        out = np.empty_like(directions)
+        """Velocities of where light ends after so many metres, m/s: (n, 3)."""
+        out = np.empty_like(light.directions)
         for begin in range(0, len(triangle), BLOCK_HITS):
             block = slice(begin, begin + BLOCK_HITS)
-            points = origins[block] + step[block, None] * directions[block]
+            points = light.origins[block] + step[block, None] * light.directions[block]
             out[block] = self._surfaces.velocities(
-                triangle[block], points, times[block], poses.ways
+                triangle[block], points, light.times[block], poses.ways
             )
         return out

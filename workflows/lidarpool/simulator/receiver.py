@@ -15,7 +15,7 @@ from raybeam import Pattern
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
 from ..sensor import Survey
-from ..sensor.optics import LIGHT_M_NS
+from ..sensor.optics import LIGHT_M_NS, any_axes
 from .crosstalk import Crosstalk
 from .hits import (
     BLOOMING,
@@ -208,7 +208,7 @@ class Receiver:
 
         The light comes from the point of the triangles that is nearest to the ray by angle.
         """
-        across, up = _axes_across(ahead)
+        across, up = any_axes(ahead)
         best, ends = np.zeros(len(starts)), np.zeros((len(starts), 3))
         nearest = _first_few(retro, starts, ahead)
         for which in nearest.T:
@@ -333,16 +333,6 @@ def _first_few(retro: _Retro, starts: Real, ahead: Real) -> NDArray[np.intp]:
     towards = towards.transpose(2, 0, 1)
     cosine = products(towards, ahead.T[:, None]) / np.sqrt(products(towards, towards))
     return np.argsort(-cosine, axis=0, kind="stable")[:TRIANGLES_NEAR].T
-
-
-def _axes_across(ahead: Real) -> tuple[Real, Real]:
-    """Two unit vectors across each direction (n, 3), see `spread`."""
-    x, y, z = ahead.T
-    sign = np.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    across = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    return across, np.stack([b, sign + y * y * a, -y], axis=1)
 
 
 def _nearest(x: Real, y: Real, corners: Real, depth: Real) -> tuple[Real, Real]:

@@ -85,7 +85,8 @@ class Rig:
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
-                made = _Rays(pattern, self._echoes[number].divided(pattern), by_head=True)
+                subrays = self._echoes[number].divided(pattern, by_head=True)
+                made = _Rays(pattern, subrays, by_head=True)
             elif repeats:
                 made = self._rays_of(number, 0, sensor.period or 0)
             self._made[number, moves] = made

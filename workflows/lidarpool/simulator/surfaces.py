@@ -290,6 +290,78 @@ class Surfaces:
         scattered = table.scattered(self.objects(triangle), cosine, bright)
         return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
+    @cached_property
+    def solids(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Whether the surfaces of objects that hold a medium are closed, and point inwards: (n,).
+
+        They point inwards if they are closed and have a negative volume.
+        """
+        table, scene = self.materials, self._scene
+        closed = np.ones(len(table.reflectance), np.bool_)
+        volume = np.zeros(len(closed))
+        for number in np.flatnonzero(table.leafy | table.refracts).tolist():
+            bodies: list[tuple[Real, Triangles]] = []
+            if number >= self._standing:
+                mesh = scene.actors[number - self._standing].mesh
+                bodies.append((mesh.vertices, mesh.faces))
+            elif len(own := self._faces_of(number)):
+                bodies.append((scene.vertices, own))
+            if scene.instances is not None:
+                parts = np.unique(scene.instances.part[scene.instances.owner == number])
+                bodies += [scene.instances.parts[part][:2] for part in parts]
+            for vertices, faces in bodies:
+                closed[number] &= _closed(vertices, faces)
+                volume[number] += _volume(vertices, faces)
+        return closed, closed & (volume < 0)
+
+    @cached_property
+    def _by_object(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Rows of the scene's faces in the order of objects, and where those of each begin."""
+        owners = self._scene.face_object
+        order = np.argsort(owners, kind="stable")
+        return order, np.searchsorted(owners[order], np.arange(self._standing + 1))
+
+    def _faces_of(self, number: int) -> Triangles:
+        order, begins = self._by_object
+        return self._scene.faces[order[begins[number] : begins[number + 1]]]
+
+    @cached_property
+    def media(self) -> tuple[int, ...]:
+        """Objects of the scene's faces that hold a medium within a closed surface."""
+        table, (closed, _) = self.materials, self.solids
+        held = (table.leafy | table.refracts) & closed
+        return tuple(np.flatnonzero(held[: self._standing]).tolist())
+
+    def spread_out(self, by_m: float) -> Real:
+        """Vertices of the scene's faces, where surfaces of media are so many metres further out.
+
+        Water that touches its basin, or leaves that touch others, would share a surface with them,
+        and light that meets one of two would miss the other.
+        """
+        if not self.media:
+            return self._scene.vertices
+        vertices, inwards = self._scene.vertices.copy(), self.solids[1]
+        for number in self.media:
+            faces = self._faces_of(number)
+            if not len(faces):
+                continue
+            used, corners = np.unique(faces, return_inverse=True)
+            places, same = np.unique(vertices[used], axis=0, return_inverse=True)
+            same = same.reshape(-1)
+            corners = same[corners.reshape(-1)].reshape(-1, 3)
+            a, b, c = places[corners].transpose(1, 0, 2)
+            normals = np.cross(b - a, c - a) * (-1 if inwards[number] else 1)
+            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+            # Each vertex goes where all of its triangles are so much further out, or nearly.
+            squares, sums = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
+            np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
+            np.add.at(sums, corners, normals[:, None])
+            squares += 1e-3 * np.eye(3)
+            step = by_m * np.linalg.solve(squares, sums[..., None])[..., 0]
+            places += np.clip(step, -4 * by_m, 4 * by_m)
+            vertices[used] = places[same]
+        return vertices
+
     @property
     def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
         """Vertices, faces and colours of the triangles that are kept once.
@@ -334,3 +406,24 @@ class Surfaces:
 def _turns(transforms: Real) -> Real:
     """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
     return np.asarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)
+
+
+def _closed(vertices: Real, faces: Triangles) -> bool:
+    """Whether a surface has no gaps: each edge is one of two triangles that wind alike."""
+    used, corners = np.unique(faces, return_inverse=True)
+    # Vertices of flat shading are one for each triangle.
+    _, same = np.unique(vertices[used], axis=0, return_inverse=True)
+    corners = same.reshape(-1)[corners.reshape(-1)].reshape(-1, 3).astype(np.int64)
+    ahead, after = corners.reshape(-1), np.roll(corners, -1, axis=1).reshape(-1)
+    some = ahead != after
+    there, back = (
+        np.sort(one[some] * len(used) + other[some])
+        for one, other in ((ahead, after), (after, ahead))
+    )
+    return bool(np.array_equal(there, back))
+
+
+def _volume(vertices: Real, faces: Triangles) -> float:
+    """Volume within a closed surface, m³; negative if its triangles wind the other way."""
+    a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
+    return float((np.cross(a, b) * c).sum() / 6)

@@ -79,7 +79,15 @@ class World:
             begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
             self._begins = np.append([0] * bool(faces), begins).astype(np.int32)
             faces += self._shared.triangles
-        self.caster: RayCaster = _caster_of(scene, options) if like is None else like.caster
+        # Light continues so far behind a surface, not to hit it again: Embree rounds to a quarter.
+        reach = np.float32(np.abs(scene.bounds).max())
+        self.clear_m = max(1e-5, 4 * float(np.spacing(reach)))
+        self._media = surfaces.media
+        if like is None or like._media != self._media:
+            vertices = surfaces.spread_out(1.5 * self.clear_m)
+            self.caster: RayCaster = _caster_of(scene, vertices, options)
+        else:
+            self.caster = like.caster
         moving, self._shape_of = shapes_of(scene.actors)
         self._shapes = [_Shape(mesh, options) for mesh in moving]
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
@@ -228,11 +236,11 @@ class World:
             yield ray[on], distance / lengths, triangle + self._firsts[numbers[on]]
 
 
-def _caster_of(scene: Scene, options: dict[str, Any]) -> RayCaster:
-    """Build the trees of all that stands still."""
+def _caster_of(scene: Scene, vertices: Float, options: dict[str, Any]) -> RayCaster:
+    """Build the trees of all that stands still, with vertices of the scene's faces."""
     if scene.instances is None:
-        return RayCaster(scene.vertices, scene.faces, **options)
-    own = [Instance(Mesh(scene.vertices, scene.faces))] if len(scene.faces) else []
+        return RayCaster(vertices, scene.faces, **options)
+    own = [Instance(Mesh(vertices, scene.faces))] if len(scene.faces) else []
     meshes = [_mesh_of(part) for part in scene.instances.parts]
     placed = zip(scene.instances.part, scene.instances.transforms, strict=True)
     return RayCaster.of(

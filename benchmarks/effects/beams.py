@@ -1,0 +1,132 @@
+"""Gaussian and oval beams: footprints, light on an edge, and width against range."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from pathlib import Path
+from statistics import NormalDist
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from numpy.typing import NDArray
+
+from lidarpool import Beams, Mesh, Returns, Scene, Sensor, Spin, Survey
+from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
+from lidarpool.sensor.disc import Beam
+from lidarpool.simulator.rig import Rig
+
+DRAWS = "effect-beams.png"
+OVAL = (3.0, 1.5)  # mrad, as Velodyne's manual of the VLP-16 has it
+EXIT_M = 0.0125
+SENSOR = Sensor(Beams(np.zeros(1)), Spin(1, 360))
+EVEN, ROUND, WIDE = OBJECT_COLOURS[:3]
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with 19 sub-rays in a Gaussian, oval beam that is wide at its start."""
+    beam = Returns(
+        subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
+    )
+    return replace(survey, returns=beam)
+
+
+def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> Mesh:
+    """Make a rectangle across the x axis."""
+    corners = [[x, y[0], -50], [x, y[1], -50], [x, y[1], 50], [x, y[0], 50.0]]
+    return Mesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
+    """Where the sub-rays of a beam hit a wall: (k, 2), metres across and up."""
+    scene = Scene.from_meshes([wall("Wall", distance)])
+    rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
+    beams = rig._echoes[0].divided(rig.pattern(0, 0, 1))
+    assert beams is not None
+    starts = np.zeros((len(beams), 3)) if beams.origins is None else beams.origins
+    hits = rig._world.caster.cast(starts, beams.directions)
+    ends = starts + hits.distance[:, None] * beams.directions
+    return np.asarray(ends[:, 1:])
+
+
+def share(returns: Returns, edge_m: float) -> float:
+    """Share of a pulse's light on a wall at 50 m that ends at an edge, in front of another."""
+    meshes = [wall("Near", 50, (-50, edge_m)), wall("Far", 60)]
+    survey = Survey(
+        SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns, columns=["reflectivity", "range"]
+    )
+    (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
+    assert not hasattr(batch, "columns")
+    bright: Any = batch.reflectivity  # type: ignore[union-attr]
+    return float(bright[batch.object == 0].sum() / bright.sum())  # type: ignore[union-attr]
+
+
+def picture(path: Path) -> None:
+    """Draw it."""
+    figure = Figure((13.5, 4.5), dpi=100, layout="constrained")
+    prints, edges, widths = figure.subplots(1, 3, width_ratios=[0.8, 1, 1])
+    kinds = (
+        ("even, 3.0 mrad", EVEN, Returns(subrays=217, divergence_mrad=3.0)),
+        ("Gaussian, 3.0 mrad", ROUND,
+         Returns(subrays=217, divergence_mrad=3.0, beam_profile="gaussian")),
+        ("Gaussian, 3.0 × 1.5 mrad", WIDE,
+         Returns(subrays=217, divergence_mrad=OVAL, beam_profile="gaussian")),
+    )  # fmt: skip
+    for number, (label, colour, returns) in enumerate(kinds):
+        places = 100 * footprint(returns, 50.0)
+        middle = 22.0 * (1 - number)
+        prints.plot(places[:, 0], middle + places[:, 1], ".", ms=3.5, mew=0, color=colour)
+        tall = 7.5 if returns.divergence_mrad == OVAL else 15.0
+        prints.add_patch(Ellipse((0, middle), 15.0, tall, fill=False, ec=INK, lw=0.8))
+        prints.text(12, middle, label, va="center", fontsize=8, color=colour)
+    prints.plot([-7.5, 7.5], [-32, -32], color=INK, lw=1)
+    prints.text(0, -33, "15 cm", ha="center", va="top", fontsize=8, color=INK)
+    prints.set(xlim=(-12, 34), ylim=(-36, 33), aspect="equal", xticks=[], yticks=[])
+    prints.set_title("217 sub-rays at 50 m; lines: 1/e²", fontsize=11, color=INK)
+
+    offsets = np.linspace(-1.5, 1.5, 61)
+    gaussian = [NormalDist().cdf(2 * x) for x in offsets]
+    inside = np.clip(offsets, -1, 1)
+    even = 0.5 + (inside * np.sqrt(1 - inside**2) + np.arcsin(inside)) / math.pi
+    for colour, exact, name in ((EVEN, even, "even"), (ROUND, gaussian, "gaussian")):
+        edges.plot(offsets, exact, color=colour, lw=1.2, label=f"{name}: closed form")
+        for count, mark in ((19, "x"), (217, "o")):
+            beam = Returns(
+                "all", count, 3.0, beam_profile="even" if name == "even" else "gaussian",
+                pulse_ns=1,
+            )  # fmt: skip
+            some = offsets[::4]
+            found = [share(beam, 0.075 * x) for x in some]
+            edges.plot(some, found, mark, ms=4, mfc="none", color=colour, label=f"{count} sub-rays")
+    edges.set(xlabel="edge, in radii of the beam at 1/e²", ylabel="share of the light on the wall")
+    edges.set_title("A beam on an edge", fontsize=11, color=INK)
+    edges.legend(fontsize=7.5, frameon=False, loc="upper left")
+
+    ranges = np.geomspace(0.5, 100, 60)
+    beam = Returns(
+        subrays=19, divergence_mrad=OVAL, beam_profile="gaussian", exit_diameter_m=EXIT_M
+    )
+    made = Beam.of(19, (OVAL[0] / 1000, OVAL[1] / 1000), "gaussian", EXIT_M)
+    assert made.starts is not None
+    for axis, (label, colour) in enumerate((("across", ROUND), ("up", WIDE))):
+        waist, half = EXIT_M / 2, OVAL[axis] / 2000
+        widths.loglog(
+            ranges, 2e3 * np.hypot(waist, half * ranges), color=colour, lw=1.2,
+            label=f"{label}: 2 √(w0² + (θR/2)²)",
+        )  # fmt: skip
+        some = ranges[::6]
+        found = [4e3 * footprint(beam, distance)[:, axis].std() for distance in some]
+        widths.loglog(some, found, "o", ms=4, mfc="none", color=colour, label="simulated")
+        widths.loglog(ranges, 2e3 * half * ranges, color=colour, lw=0.8, ls=":")
+    widths.set(xlabel="range (m)", ylabel="width at 1/e² (mm)", ylim=(5, 400))
+    widths.set_title("3.0 × 1.5 mrad, 12.5 mm at its start", fontsize=11, color=INK)
+    widths.legend(fontsize=7.5, frameon=False, loc="upper left")
+    for scale in (widths.xaxis, widths.yaxis):
+        scale.set_major_formatter(lambda value, _: f"{value:g}")
+    prints.spines[:].set_visible(False)
+    for axes in (prints, edges, widths):
+        axes.tick_params(labelsize=8, colors=MUTED)
+        axes.spines[:].set_color(LINE)
+    figure.savefig(path)

@@ -1,0 +1,126 @@
+"""Light that is refracted: a pool, where it seems to be, and what comes back of its floor."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+
+from lidarpool import Beams, Material, Mesh, Scene, Sensor, Spin, Survey
+from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
+from lidarpool.render.theme import SENSOR as RED
+from lidarpool.sensor.materials import fresnel
+from lidarpool.simulator.rig import Rig
+
+DRAWS = "effect-refraction.png"
+HEIGHT, DEPTH, INDEX, LOSS = 3.0, 2.0, 1.33, 0.15
+FLOOR, WALL, BLUE = 0.4, 0.5, OBJECT_COLOURS[4]
+NADIRS = np.radians(np.linspace(-72, 72, 289))
+SCANNER = Sensor(Beams(np.abs(NADIRS) - np.pi / 2, np.where(NADIRS < 0, np.pi, 0.0)), Spin(1, 360))
+
+Real = NDArray[np.float64]
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with cars of glass."""
+    glass = Material("car-*", transparent="pass", refractive_index=1.5)
+    return replace(survey, materials=[Material("*"), glass])
+
+
+def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
+    """Make a box whose triangles face outwards."""
+    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
+    squares = ([0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3])
+    faces = [[a, b, c] for a, b, c, _ in squares] + [[a, c, d] for a, _, c, d in squares]
+    return Mesh(name, np.array(low) + corners * np.subtract(high, low), np.array(faces))
+
+
+def pool() -> list[Mesh]:
+    """Make a pool with a step, in the ground."""
+    return [
+        # Into the walls, which light that goes straight on would miss otherwise.
+        box("Water", (-5.3, -9, -DEPTH - 0.5), (5.3, 9, 0)),
+        box("Floor", (-9, -9, -DEPTH - 1), (9, 9, -DEPTH)),
+        box("Step", (2, -9, -DEPTH - 0.2), (9, 9, -1.2)),
+        box("Left", (-9, -9, -DEPTH - 0.2), (-5, 9, 0.1)),
+        box("Right", (5, -9, -DEPTH - 0.2), (9, 9, 0.1)),
+    ]
+
+
+def cast(meshes: list[Mesh], water: Material) -> tuple[Real, Real, Real, Real]:
+    """Places x and z of points, their beams' angles and energies."""
+    survey = Survey(
+        SCANNER, poses=[(0, 0, HEIGHT)], steps=1, columns=["intensity", "ray"],
+        materials=[Material("*", FLOOR), water],
+    )  # fmt: skip
+    (batch,) = Rig(Scene.from_meshes(meshes), survey, "numpy").cast(0, 1)
+    found = batch  # a survey with water is cast by the host
+    ray = found.found.ray  # type: ignore[union-attr]
+    places = found.positions  # type: ignore[union-attr]
+    return places[:, 0], places[:, 2], NADIRS[ray], found.intensity  # type: ignore[union-attr]
+
+
+def picture(path: Path) -> None:
+    """Draw it."""
+    straight = Material("Water", transparent="pass")
+    wet = Material("Water", transparent="pass", refractive_index=INDEX, attenuation_per_m=LOSS)
+    figure = Figure((13.5, 4.7), dpi=100, layout="constrained")
+    section, energies = figure.subplots(1, 2, width_ratios=[1.9, 1])
+    section.axhspan(-9, 0, color=BLUE, alpha=0.12, lw=0)
+    ground = [(-9, -9), (-9, 0.1), (-5, 0.1), (-5, -DEPTH), (2, -DEPTH), (2, -1.2), (5, -1.2),
+              (5, 0.1), (9, 0.1), (9, -9)]  # fmt: skip
+    section.fill(*zip(*ground, strict=True), color="#d9dde2", lw=0, zorder=2)
+    x, z, _, _ = cast(pool(), straight)
+    section.plot(x, z, ".", ms=5, mew=0, color=MUTED, zorder=4, label="without refraction")
+    x, z, _, _ = cast(pool(), wet)
+    section.plot(x, z, ".", ms=5, mew=0, color=RED, zorder=5, label="with refraction")
+    angles = np.linspace(0, np.radians(58), 60)
+    within = np.arcsin(np.sin(angles) / INDEX)
+    air, water = HEIGHT / np.cos(angles), DEPTH / np.cos(within)
+    seen = air + INDEX * water
+    for side in (-1, 1):
+        some = np.abs(HEIGHT * np.tan(angles) + DEPTH * np.tan(within)) < (5 if side < 0 else 2)
+        section.plot(
+            side * (seen * np.sin(angles))[some], (HEIGHT - seen * np.cos(angles))[some],
+            color=INK, lw=1, zorder=6, label="floor by Snell's law" if side > 0 else None,
+        )  # fmt: skip
+    for nadir in np.radians([-20, -40]):
+        down = np.arcsin(np.sin(nadir) / INDEX)
+        top, foot = HEIGHT * np.tan(nadir), HEIGHT * np.tan(nadir) + DEPTH * np.tan(down)
+        section.plot([0, top, foot], [HEIGHT, 0, -DEPTH], color=OBJECT_COLOURS[1], lw=1, zorder=3)
+        far = HEIGHT / np.cos(nadir) + INDEX * DEPTH / np.cos(down)
+        ends = [top, far * np.sin(nadir)], [0, HEIGHT - far * np.cos(nadir)]
+        section.plot(*ends, color=OBJECT_COLOURS[1], lw=1, ls=":", zorder=6)
+    section.plot(0, HEIGHT, "^", color=INK, ms=8, zorder=7)
+    section.text(0.25, HEIGHT, "sensor", va="center", fontsize=8, color=INK)
+    section.set(xlim=(-7.5, 7.5), ylim=(-3.4, 3.4), xlabel="x (m)", ylabel="z (m)", aspect="equal")
+    section.set_title("A pool of 2 m, seen from 3 m above", fontsize=11, color=INK)
+    section.legend(fontsize=8, frameon=False, loc="upper right")
+
+    floor = box("Floor", (-90, -90, -DEPTH - 1), (90, 90, -DEPTH))
+    plain = [box("Water", (-80, -80, -DEPTH - 0.5), (80, 80, 0)), floor]
+    angles = np.radians(np.linspace(0, 72, 100))
+    within = np.arcsin(np.sin(angles) / INDEX)
+    air, water = HEIGHT / np.cos(angles), DEPTH / np.cos(within)
+    tilt = np.cos(angles) / np.cos(within)
+    area = (water + INDEX * air) * (tilt * water + INDEX * air / tilt)
+    passes = 1 - fresnel(np.cos(angles), INDEX)
+    exact = FLOOR * np.cos(within) * passes**2 * np.exp(-2 * LOSS * water) * 100 / area
+    for material, colour, name in ((straight, MUTED, "without"), (wet, RED, "with")):
+        _, _, nadir, energy = cast(plain, material)
+        some = (nadir >= 0) & (np.arange(len(nadir)) % 6 == 0)
+        energies.plot(
+            np.degrees(nadir[some]), energy[some], "o", ms=4, mfc="none", color=colour,
+            label=f"simulated, {name} refraction",
+        )  # fmt: skip
+    energies.plot(np.degrees(angles), exact, color=INK, lw=1, label="Snell, Fresnel, Beer–Lambert")
+    energies.set(xlabel="angle from nadir (°)", ylabel="energy of the floor", ylim=(0, None))
+    energies.set_title("n = 1.33, attenuation 0.15 / m", fontsize=11, color=INK)
+    energies.legend(fontsize=8, frameon=False)
+    for axes in (section, energies):
+        axes.tick_params(labelsize=8, colors=MUTED)
+        axes.spines[:].set_color(LINE)
+    figure.savefig(path)

@@ -1,0 +1,424 @@
+"""Media within closed surfaces: refraction and attenuation, and leaves that light meets by chance.
+
+Directions follow Snell's law, energies Fresnel's equations, Beer and Lambert's law, and the beam's
+widening: ray differentials (Igehy 1999) say how large an area a cone of light is at its end. Leaves
+are met after an exponentially distributed optical depth (Ross 1981).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern
+
+from ..base.errors import LidarpoolError
+from ..scene.scene import Scene
+from ..sensor import Trajectory
+from ..sensor.leaves import brightness, projection
+from ..sensor.materials import MaterialTable, fresnel
+from ..sensor.optics import any_axes
+from .hits import Real, Whole
+from .motion import Clock, Poses, products
+from .surfaces import Surfaces
+from .world import World
+
+DEPTH = 8  # media around a place that are known at most
+PROBES_MOST = 256  # surfaces that a search for media around a place passes
+LEAF, WHICH = 30, 31  # purposes of random numbers: see `Leaves`
+UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of that search; along no edge of what people model
+
+Bools = NDArray[np.bool_]
+Numbers = NDArray[np.int32]
+# Random bits of rays for a purpose: (n,).
+Draw = Callable[[int, Whole], NDArray[np.uint64]]
+
+
+class Rays(NamedTuple):
+    """Light of sub-rays that begins, and the trajectories of actors."""
+
+    origins: Real  # (n, 3)
+    directions: Real  # (n, 3)
+    times: Real  # (n,)
+    ways: tuple[Trajectory, ...]
+
+
+@dataclass
+class Around:
+    """Media around the light of sub-rays, the innermost first: (n, DEPTH) each; -1 for none."""
+
+    objects: Numbers
+    triangles: Numbers  # where light came in
+
+    @classmethod
+    def none(cls, count: int) -> Around:
+        """Make them for light in the air."""
+        return cls(*(np.full((count, DEPTH), -1, np.int32) for _ in range(2)))
+
+    def take(self, rows: NDArray[np.integer[Any]]) -> Around:
+        """Select those of some sub-rays."""
+        return Around(self.objects[rows], self.triangles[rows])
+
+    def restore(self, rows: NDArray[np.intp], before: Around) -> None:
+        """Undo what happened to some."""
+        self.objects[rows], self.triangles[rows] = before.objects[rows], before.triangles[rows]
+
+    def enter(self, rows: NDArray[np.intp], objects: Numbers, triangles: Numbers) -> None:
+        """Enter a medium each."""
+        for table, new in ((self.objects, objects), (self.triangles, triangles)):
+            table[rows, 1:] = table[rows, :-1]
+            table[rows, 0] = new
+
+    def surround(self, rows: NDArray[np.intp], objects: Numbers, triangles: Numbers) -> None:
+        """Add a medium each around those that are known; nothing where there are too many."""
+        place = (self.objects[rows] >= 0).sum(axis=1)
+        free = place < DEPTH
+        self.objects[rows[free], place[free]] = objects[free]
+        self.triangles[rows[free], place[free]] = triangles[free]
+
+    def leave(self, rows: NDArray[np.intp], objects: Numbers) -> Bools:
+        """Leave a medium each; returns which were known."""
+        same = self.objects[rows] == objects[:, None]
+        known = same.any(axis=1)
+        rows, place = rows[known], same[known].argmax(axis=1)
+        column = np.arange(DEPTH)
+        column = column + (column >= place[:, None])
+        for table in (self.objects, self.triangles):
+            ended = np.pad(table[rows], ((0, 0), (0, 1)), constant_values=-1)
+            table[rows] = np.take_along_axis(ended, column, axis=1)
+        return known
+
+
+@dataclass
+class Bundle:
+    """How the light of sub-rays has been bent and weakened: arrays (n, …)."""
+
+    index: Real  # (n,): refractive index where it is
+    first: Real  # (n,): and where it began
+    lost: Real  # (n,): optical depth by attenuation, one way
+    places: Real  # (n, 2, 3): derivatives of where it is, by its first direction
+    ways: Real  # (n, 2, 3): and of where it goes
+
+    @classmethod
+    def of(cls, directions: Real, index: Real) -> Bundle:
+        """Make those of light that begins."""
+        ways = np.stack(any_axes(directions), axis=1)
+        none = np.zeros(len(ways))
+        return cls(index.copy(), index, none, np.zeros_like(ways), ways)
+
+    def take(self, rows: NDArray[np.integer[Any]]) -> Bundle:
+        """Select those of some sub-rays."""
+        return Bundle(*(getattr(self, field.name)[rows] for field in fields(self)))
+
+    def go(self, step: Real, attenuation: Real) -> None:
+        """Go straight on so many metres (n,), where so much is lost, 1/m (n,)."""
+        self.places = self.places + step[:, None, None] * self.ways
+        self.lost = self.lost + attenuation * step
+
+    def factor(self, directions: Real, distance: Real, extinction: float) -> Real:
+        """Energy relative to that of light that went as far, straight through the air: (n,).
+
+        Of light that is scattered at the end of a path, the receiver gets the share that its area
+        has of the cone's area there. By reciprocity, that area is that of the cone of the outgoing
+        light, times the square of the refractive index.
+        """
+        one, other = self.places.transpose(1, 2, 0)
+        a, b, c = directions.T
+        (x, y, z), (u, v, w) = one, other
+        area = np.abs((y * w - z * v) * a + (z * u - x * w) * b + (x * v - y * u) * c)
+        area *= (self.index / self.first) ** 2
+        nearer = distance**2 / np.maximum(area, 1e-12)
+        return np.asarray(nearer * np.exp(2 * (extinction * distance - self.lost)))
+
+    def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools, index: Real) -> None:
+        """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""
+        along, behind = (_aside(_dots(way, normals)) for way in (before, after))
+        # Each ray of a bundle arrives where it meets the plane.
+        shift = _dots(self.places, normals[:, None]) / along[:, None]
+        self.places = self.places - shift[..., None] * before[:, None]
+        ratio = np.where(mirrored, 1.0, self.index / index)
+        bend = np.where(mirrored, 2.0, ratio - ratio**2 * along / behind)
+        slope = bend[:, None] * _dots(self.ways, normals[:, None])
+        self.ways = ratio[:, None, None] * self.ways - slope[..., None] * normals[:, None]
+        self.index = np.where(mirrored, self.index, index)
+
+
+class Media:
+    """The media of a scene."""
+
+    def __init__(
+        self, scene: Scene, surfaces: Surfaces, table: MaterialTable, air: float = 0.0
+    ) -> None:
+        self._surfaces, self.air = surfaces, air  # its extinction, 1/m
+        self.filled = table.leafy | table.refracts  # whether objects hold a medium
+        self.leafy = bool(table.leafy.any())
+        self.bends = bool(table.refracts.any())
+        self._angles = table.leaf_angles
+        # Of no object, which has the number -1, nothing.
+        self._area, self._index, self._attenuation = (
+            np.append(values, 0.0) for values in (table.leaf_area, table.refractive_index,
+                                                  table.attenuation)
+        )  # fmt: skip
+        self._angle = np.append(table.leaf_angle, 0)
+        closed, self._inwards = surfaces.solids
+        for number in np.flatnonzero(table.leafy):
+            if not closed[number]:
+                raise LidarpoolError(
+                    f"materials: {scene.all_names[number]!r} has a leaf_area_density, but its "
+                    "surface has gaps: give a closed one, such as a box or a sphere."
+                )
+        # Where sensors may be within media: an actor may be anywhere, and below a sheet is water.
+        standing = np.flatnonzero(self.filled[: len(scene.object_bounds)])
+        bounds = scene.object_bounds[standing]
+        bounds[~closed[standing], 0, 2] = -np.inf
+        if self.filled[len(scene.object_bounds) :].any():
+            bounds = np.append(bounds, [[[-np.inf] * 3, [np.inf] * 3]], axis=0)
+        self._bounds = bounds
+        for angle in self._angles if self.leafy else ():
+            projection(angle, np.ones(1))  # makes its table
+
+    def sides(self, objects: Numbers, along: Real) -> Bools:
+        """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
+        return np.asarray((along < 0) != self._inwards[objects])
+
+    def around(self, world: World, light: Rays) -> Around:
+        """Find the media around the origins of light."""
+        found = Around.none(len(light.origins))
+        within = np.zeros(len(light.origins), np.bool_)
+        if not len(within):
+            return found
+        least, most = light.origins.min(axis=0), light.origins.max(axis=0)
+        near = ((self._bounds[:, 0] <= most) & (self._bounds[:, 1] >= least)).all(axis=1)
+        for low, high in self._bounds[near]:
+            within |= ((light.origins >= low) & (light.origins <= high)).all(axis=1)
+        rows = np.flatnonzero(within)
+        if not len(rows):
+            return found
+        # Most rays start where the one before did.
+        origins, times = light.origins[rows], light.times[rows]
+        new = np.ones(len(rows), np.bool_)
+        new[1:] = (np.diff(origins, axis=0) != 0).any(axis=1) | (np.diff(times) != 0)
+        there = self._search(world, origins[new], times[new], light.ways)
+        which = np.cumsum(new) - 1
+        found.objects[rows], found.triangles[rows] = there.objects[which], there.triangles[which]
+        return found
+
+    def _search(
+        self,
+        world: World,
+        origins: Real,
+        times: Real,
+        ways: tuple[Trajectory, ...],
+    ) -> Around:
+        """Look upwards: a medium that light leaves without having entered it is around it."""
+        surfaces = self._surfaces
+        around, entered = Around.none(len(origins)), Around.none(len(origins))
+        up = UPWARDS / np.sqrt((UPWARDS**2).sum())
+        rows, away = np.arange(len(origins)), world.clear_m / up[2]
+        for _ in range(PROBES_MOST):
+            if not len(rows):
+                break
+            light = Pattern(np.broadcast_to(up, origins.shape), origins)
+            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
+            hits = world.scan(light, now)
+            rows, times = rows[hits.ray], times[hits.ray]
+            origins = origins[hits.ray] + (hits.distance[:, None] + away) * up
+            objects = surfaces.objects(hits.triangle)
+            normals = surfaces.normals(hits.triangle, times, ways)
+            media = self.filled[objects]
+            comes = self.sides(objects, products(normals.T, up[:, None])) & media
+            entered.enter(rows[comes], objects[comes], hits.triangle[comes])
+            goes = np.flatnonzero(media & ~comes)
+            known = entered.leave(rows[goes], objects[goes])
+            goes = goes[~known]
+            around.surround(rows[goes], objects[goes], hits.triangle[goes])
+        return around
+
+    def within(self, world: World, light: Rays, depths: Real | None) -> Within:
+        """Return the state of light that begins; `depths` (n,) are those until a leaf."""
+        around = self.around(world, light)
+        bundle = Bundle.of(light.directions, self.index(around)) if self.bends else None
+        return Within(self, around, bundle, depths)
+
+    def index(self, around: Around) -> Real:
+        """Refractive indices of the innermost media that have one: (n,)."""
+        indices = self._index[around.objects]
+        return _first(indices, indices > 0, 1.0)
+
+    def attenuation(self, around: Around) -> Real:
+        """Extinction there, 1/m: (n,); outside of what refracts that of the air."""
+        refracts = self._index[around.objects] > 0
+        return _first(self._attenuation[around.objects], refracts, self.air)
+
+    def behind(self, around: Around, objects: Numbers, triangles: Numbers, along: Real) -> Around:
+        """Media behind surfaces (n,), which light meets at the cosines `along`."""
+        behind = around.take(np.arange(len(objects)))
+        enters, filled = self.sides(objects, along), self.filled[objects]
+        comes, goes = np.flatnonzero(filled & enters), np.flatnonzero(filled & ~enters)
+        behind.enter(comes, objects[comes], triangles[comes])
+        behind.leave(goes, objects[goes])
+        return behind
+
+    def density(self, around: Around, upright: Real) -> Real:
+        """Optical depth of leaves for each metre, in each medium around light: (n, DEPTH)."""
+        density = self._area[around.objects]
+        if density.any():
+            for number, angle in enumerate(self._angles):
+                crossing = projection(angle, upright)[:, None]
+                density *= np.where(self._angle[around.objects] == number, crossing, 1)
+        return density
+
+    def bright(self, objects: Numbers, upright: Real) -> Real:
+        """Mean cosine between light and the leaves of objects (n,) that it meets: (n,)."""
+        out = np.ones(len(objects))
+        for number, angle in enumerate(self._angles):
+            out = np.where(self._angle[objects] == number, brightness(angle, upright), out)
+        return out
+
+
+class Leaves(NamedTuple):
+    """Leaves that light meets: arrays (k,)."""
+
+    rows: NDArray[np.intp]  # of the light
+    metres: Real  # how far it gets
+    triangles: Numbers  # where it came into the crown
+    cosines: Real  # mean ones between light and leaves
+
+
+@dataclass
+class Within:
+    """Light on its way through media: those around it, and what they do to it."""
+
+    media: Media
+    around: Around
+    bundle: Bundle | None  # None if nothing refracts
+    left: Real | None  # (n,): optical depth until a leaf; None if there are none
+
+    def take(self, rows: NDArray[np.integer[Any]]) -> Within:
+        """Select that of some sub-rays."""
+        return Within(
+            self.media,
+            self.around.take(rows),
+            None if self.bundle is None else self.bundle.take(rows),
+            None if self.left is None else self.left[rows],
+        )
+
+    @property
+    def index(self) -> Real | float:
+        """Refractive index where it is."""
+        return 1.0 if self.bundle is None else self.bundle.index
+
+    def optical(self, step: Real) -> Real:
+        """Optical paths of so many metres (n,)."""
+        return step if self.bundle is None else step * self.bundle.index
+
+    def meet(self, directions: Real, length: Real, ray: Whole, draw: Draw) -> Leaves:
+        """Find which light meets a leaf within its next metres (n,)."""
+        if self.left is None:
+            none = np.zeros(0, np.intp)
+            return Leaves(none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
+        upright = np.minimum(np.abs(directions[:, 2]), 1)
+        sums = np.cumsum(self.media.density(self.around, upright), axis=1)
+        total = sums[:, -1]
+        depth = total * length
+        rows = np.flatnonzero(depth > self.left)
+        metres = self.left[rows] / total[rows]
+        self.left = self.left - depth
+        # Where crowns overlap, a leaf is of one of them in proportion to its density.
+        share = (draw(WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
+        cosines = self.media.bright(self.around.objects[rows, place], upright[rows])
+        return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
+
+    def go(self, step: Real) -> None:
+        """Go straight on so many metres (n,)."""
+        if self.bundle is not None:
+            self.bundle.go(step, self.media.attenuation(self.around))
+
+    def factor(self, directions: Real, distance: Real) -> Real | float:
+        """Energy relative to that of light that went as far, straight through the air: (n,)."""
+        if self.bundle is None:
+            return 1.0
+        return self.bundle.factor(directions, distance, self.media.air)
+
+    def cross(
+        self, objects: Numbers, triangles: Numbers, directions: Real, normals: Real, along: Real
+    ) -> tuple[Real, Real | float, Bools]:
+        """Take light through surfaces (n,), which it meets at the cosines `along`.
+
+        Returns
+        -------
+        Directions behind them (n, 3), shares of light that pass (n,), and whether all is reflected,
+        with directions and shares as if there were no surface.
+        """
+        before, self.around = self.around, self.media.behind(self.around, objects, triangles, along)
+        if self.bundle is None:
+            return directions, 1.0, np.zeros(len(objects), np.bool_)
+        ratio = self.media.index(self.around) / self.bundle.index
+        ahead, passes, whole = refracted(directions, normals, along, ratio)
+        self.around.restore(np.flatnonzero(whole), before)
+        return ahead, passes, whole
+
+    def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools) -> None:
+        """Turn the bundles at flat surfaces, from directions (n, 3) to others."""
+        if self.bundle is not None:
+            self.bundle.turn(before, after, normals, mirrored, self.media.index(self.around))
+
+
+def refracted(
+    directions: Real, normals: Real, along: Real, ratio: Real
+) -> tuple[Real, Real, Bools]:
+    """Take light through surfaces by Snell's law; `ratio` (n,) is the index behind over before.
+
+    Returns
+    -------
+    Directions behind them (n, 3), shares of light that pass (n,), and whether all is reflected,
+    with directions and shares as if there were no surface.
+    """
+    steep = np.maximum(np.abs(along), 1e-9)
+    inside = 1 - (1 - steep**2) / ratio**2
+    bends = ratio != 1
+    whole = bends & (inside <= 0)
+    bends &= ~whole
+    against = np.where(along < 0, 1.0, -1.0)[:, None] * normals
+    root = np.sqrt(np.maximum(inside, 0))
+    bent = directions / ratio[:, None] + (steep / ratio - root)[:, None] * against
+    passes = np.where(bends, 1 - fresnel(steep, ratio), 1.0)
+    return np.where(bends[:, None], bent, directions), passes, whole
+
+
+def depths(bits: NDArray[np.uint64]) -> Real:
+    """Exponentially distributed numbers of mean 1, from random bits: (n,).
+
+    The number of halvings and a table of 32,768 logarithms give the same on every machine.
+    """
+    share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
+    part, halvings = np.frexp(share)
+    row = ((part - 0.5) * (2 * len(_LOGS))).astype(np.intp)
+    return np.asarray(_LOGS[row] - halvings * float(np.float32(np.log(2))))
+
+
+_LOGS = -np.log((np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5).astype(np.float32).astype(np.float64)
+
+
+def _dots(one: Real, other: Real) -> Real:
+    """Scalar products along the last axis, in one order of rounding."""
+    return np.asarray(
+        (one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]) + one[..., 2] * other[..., 2]
+    )
+
+
+def _aside(cosine: Real) -> Real:
+    """Keep cosines away from 0."""
+    return np.where(np.abs(cosine) > 1e-9, cosine, 1e-9)
+
+
+def _first(values: Real, wanted: NDArray[Any], default: float) -> Real:
+    """Return the first wanted value of each row, or a default: (n,)."""
+    place = wanted.argmax(axis=1)
+    rows = np.arange(len(values))
+    return np.where(wanted[rows, place], values[rows, place], default)
