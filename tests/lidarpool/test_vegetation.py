@@ -16,7 +16,6 @@ from lidarpool import (
     LidarpoolError,
     Material,
     Noise,
-    Optics,
     Pose,
     Returns,
     Scene,
@@ -208,12 +207,8 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
     mirrored[0, 3] = 4
     for meshes in ([inwards, wall], [Instance(crown, mirrored), wall]):
         found = cast(meshes, rays(), materials=materials)
-        assert gap(
-            found,
-            leaves=found["object"].min()
-            if len(meshes) < 2
-            else Scene.from_meshes(meshes).all_names.index("Crown"),
-        ) == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
+        number = Scene.from_meshes(meshes).all_names.index("Crown")
+        assert gap(found, leaves=number) == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
     way = Track([0.0, 10.0], [(4, 0, 0), (4, 0, 0)])
     scene = Scene.from_meshes([wall]).with_actors(
         [Actor(Mesh("Crown", crown.vertices * 2, crown.faces), way)]
@@ -297,13 +292,6 @@ def test_another_seed_is_another_tree():
     assert not np.array_equal(one[:100], other[:100])
 
 
-def test_optics_are_told_apart():
-    """A sensor's own beam counts where the survey's returns state none."""
-    optics = Optics(divergence_mrad=(3.0, 1.5), beam_profile="gaussian", exit_diameter_m=0.01)
-    assert Returns(subrays=7).beam(optics).oval
-    assert not Returns(subrays=7, divergence_mrad=2.0).beam(optics).oval
-
-
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("order", [1, -1])
 def test_layers_that_touch_each_other(backend, order):
@@ -321,3 +309,38 @@ def test_layers_that_touch_each_other(backend, order):
     assert (found["object"] == 6).mean() == pytest.approx(math.exp(-tau), rel=0.02)
     counts = np.bincount(found["object"], minlength=7)[:6][::order] / len(found["object"])
     assert counts == pytest.approx(np.exp(-0.2 * np.arange(6)) * (1 - math.exp(-0.2)), rel=0.1)
+
+
+def test_a_wood_of_crowns_that_overlap_anyhow():
+    """From within and outside, gaps are those of the chords of all ellipsoids, added up."""
+    rng = np.random.default_rng(3)
+    unit = trimesh.creation.icosphere(4, 1.0007)  # of the volume of the sphere
+    kinds, meshes, materials, crowns = ("spherical", "planophile", 0.5), [], [Material("*")], []
+    for number in range(24):
+        centre, radii = rng.uniform(-5, 5, 3), rng.uniform(0.8, 3, 3)
+        inwards = np.array(unit.faces)[:, :: -1 if number % 4 == 0 else 1]
+        meshes.append(Mesh(f"C{number}", np.array(unit.vertices) * radii + centre, inwards))
+        thick, kind = float(rng.uniform(0.05, 0.4)), kinds[number % 3]
+        materials.append(Material(f"C{number}", leaf_area_density=thick, leaf_angle=kind))
+        crowns.append((centre, radii, thick, kind))
+    meshes.append(ball("Sky", 60.0, fineness=2))
+    sensor = Sensor(Beams(np.radians(np.linspace(-75, 75, 30))), Spin(100, 360))
+    places = rng.uniform(-6, 6, (8, 3))
+    survey = Survey(sensor, poses=places.tolist(), steps=1, materials=materials)
+    rig = Rig(Scene.from_meshes(meshes), survey, CPU[-1])
+    ahead = sensor.directions(np.arange(100)).reshape(-1, 3)
+    off, variance = 0.0, 0.0
+    for place, batch in zip(places, rig.cast(0, 8), strict=True):
+        tau = np.zeros(len(ahead))
+        for centre, radii, thick, kind in crowns:
+            start, way = (place - centre) / radii, ahead / radii
+            a, b, c = (way**2).sum(axis=1), way @ start, start @ start - 1
+            root = np.sqrt(np.maximum(b * b - a * c, 0))
+            chord = np.maximum((root - b) / a, 0) - np.maximum((-root - b) / a, 0)
+            tau += projection(kind, np.abs(ahead[:, 2])) * thick * chord
+        gaps = np.exp(-tau)
+        assert len(batch.object) == len(ahead)
+        off += (batch.object == 24).sum() - gaps.sum()
+        variance += (gaps * (1 - gaps)).sum()
+    assert abs(off) < 3 * math.sqrt(variance)
+    assert any((((place - c) / r) ** 2).sum() < 1 for place in places for c, r, *_ in crowns)
