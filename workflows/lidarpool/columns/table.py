@@ -152,6 +152,20 @@ OPTIONAL = (
         "reflectivity",
     ),
     Column(
+        "amplitude",
+        "float32",
+        "",
+        "height of the echo in the waveform; of one as narrow as the pulse its intensity",
+        "amplitude",
+    ),
+    Column(
+        "pulse_width",
+        "float32",
+        "ns",
+        "full width at half maximum of the echo in the waveform",
+        "pulse_width",
+    ),
+    Column(
         "return_number",
         "uint8",
         "",
@@ -185,6 +199,7 @@ OPTIONAL = (
     Column("blue", "uint8", "", "blue of the surface, sRGB", "blue"),
 )
 COLOURS = ("red", "green", "blue")
+OF_WAVEFORMS = ("amplitude", "pulse_width")
 
 TABLE = {column.name: column for column in (SCAN, *ALWAYS, *OPTIONAL)}  # {name: column}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import log, pi, sqrt
 from typing import Annotated, Literal
 
 import numpy as np
@@ -14,7 +15,11 @@ from ..base.errors import LidarpoolError
 from .disc import SUBRAYS
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
+FWHM = sqrt(8 * log(2))  # full width at half maximum of a Gaussian, in standard deviations
+# Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
+_RESPONSE = sqrt(log(2)) / (2 * pi)
 
+Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "all"]
 # Full angle of a beam's cone, at 1/e² of its maximum.
 Divergence = Annotated[float, Field(ge=0, le=1000)]
@@ -67,8 +72,27 @@ class Returns:
         Pulse | None,
         Field(
             description="length of the pulse: surfaces less than half of it apart are "
-            "one return; by default the sensor's, or 5",
+            "one return; by default the sensor's, or 5. Of waveforms the full width at half maximum",
             examples=[5.0],
+        ),
+    ] = None
+    waveform: Annotated[
+        Processing,
+        Field(
+            description="how returns are found in the waveform: peaks, or gaussian decomposition; "
+            "none: hits within half of the pulse are one return"
+        ),
+    ] = "none"
+    sample_ns: Annotated[
+        float, Field(ge=0.001, le=1000, description="time between two samples of the waveform")
+    ] = 1.0
+    bandwidth_mhz: Annotated[
+        float | None,
+        Field(
+            ge=0.1,
+            le=1e6,
+            description="of the receiver of waveforms, at -3 dB; by default without limit",
+            examples=[300.0],
         ),
     ] = None
 
@@ -86,8 +110,30 @@ class Returns:
                 f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
-        pulse_ns = optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
-        return (wide or 0.0) / 1000, LIGHT_M_NS * pulse_ns / 2
+        return (wide or 0.0) / 1000, LIGHT_M_NS * self._pulse_ns(optics) / 2
+
+    def _pulse_ns(self, optics: Optics) -> float:
+        return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
+
+    def system_ns(self, optics: Optics) -> float:
+        """Standard deviation of the system waveform, the pulse as the receiver sees it, ns.
+
+        It is Gaussian: that of the pulse, convolved with the response of the receiver.
+
+        Raises
+        ------
+        LidarpoolError
+            If the samples are too far apart for it.
+        """
+        response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
+        sigma = sqrt((self._pulse_ns(optics) / FWHM) ** 2 + response**2)
+        if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
+            raise LidarpoolError(
+                f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "
+                f"wide in the waveform: sample it twice at least, every {FWHM * sigma / 2:.3g} ns, "
+                "or give a longer pulse_ns."
+            )
+        return sigma
 
 
 def spread(

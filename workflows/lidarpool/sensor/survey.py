@@ -16,7 +16,7 @@ from pydantic import AwareDatetime, Field, Strict
 from ..base.arguments import checked_fields, shown
 from ..base.declared import FILLED_IN, written_as
 from ..base.errors import LidarpoolError
-from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored
+from ..columns.table import COORDINATES, OF_WAVEFORMS, OPTIONAL, Column, chosen, stored
 from .materials import Material, extinction
 from .noise import Noise
 from .optics import Precision, Returns
@@ -275,6 +275,15 @@ class Survey(CloudOptions, Weather):
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
             returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
+            if returns.waveform != "none":
+                returns.system_ns(carried.sensor.optics)
+                continue
+            for column in self.columns:
+                if column.name in OF_WAVEFORMS:
+                    raise LidarpoolError(
+                        f"The column {column.name} is of echoes in waveforms: give "
+                        "returns.waveform, peaks or gaussian."
+                    )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from raybeam import Pattern, ScanReturns
 
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Returns, Sensor, Survey
 from ..sensor.disc import disc
 from ..sensor.optics import Mode, spread
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
@@ -21,6 +21,7 @@ from .motion import Poses, products
 from .paths import Paths
 from .separation import separated
 from .surfaces import Surfaces
+from .waveform import Receiver, returns_in
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
@@ -40,6 +41,9 @@ class Echoes(ScanReturns):
     # (k,): packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
     colour: NDArray[np.uint32] | None = None
     cause: NDArray[np.uint8] | None = None  # (k,): why they are there; None if all are surfaces
+    # (k,): full width at half maximum in the waveform, ns, and height; None without waveforms.
+    width: Real | None = None
+    amplitude: Real | None = None
 
 
 class EchoCaster:
@@ -53,7 +57,8 @@ class EchoCaster:
         self._returns, self._noise = survey.returns_each[number], survey.noise_each[number]
         self._paths = Paths(caster, scene, survey, self._sensor, surfaces)
         # Whether each ray that hits something has one return.
-        several = self._returns.subrays > 1 or self._noise.loses
+        self._receiver = receiver_of(self._returns, self._sensor)
+        several = self._returns.subrays > 1 or self._noise.loses or self._receiver is not None
         self._one_each = surfaces.materials.plain and not several
         # Whether its returns are the caster's hits.
         self.plain = self._one_each and not self._noise.displaces
@@ -110,7 +115,10 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window)
-                returns = separated(hits, self._gap_m, len(beam), planes)
+                if self._receiver is None:
+                    returns = separated(hits, self._gap_m, len(beam), planes)
+                else:
+                    returns = returns_in(hits, self._receiver, len(beam), planes)
                 returns = returns._replace(ray=start + returns.ray)
                 chunks.append(self._reported(returns, keys))
             found = self._kept(joined(chunks), groups, tally)
@@ -187,9 +195,16 @@ class EchoCaster:
     def _reported(self, returns: Hits, keys: Keys) -> Hits:
         """Select detected returns, and among them those that the mode reports."""
         if self._noise.loses:
-            seen = self._noise.detected(returns.energy, *keys.of(returns.ray), numbers(returns.ray))
+            height = self._heights(returns).energy
+            seen = self._noise.detected(height, *keys.of(returns.ray), numbers(returns.ray))
             returns = returns.take(seen)
-        return returns.take(chosen(returns, self._returns.mode))
+        return returns.take(chosen(self._heights(returns), self._returns.mode))
+
+    def _heights(self, returns: Hits) -> Hits:
+        """Return returns with the heights of their echoes in place of energies."""
+        if self._receiver is None or returns.width is None:
+            return returns
+        return returns._replace(energy=self._receiver.amplitude(returns.energy, returns.width))
 
     def _kept(self, returns: Hits, groups: Whole, tally: bool) -> Echoes:
         """Count the returns of each scan and thin them out."""
@@ -200,6 +215,7 @@ class EchoCaster:
         place = np.arange(len(ray)) - np.repeat(cuts[:-1], np.diff(cuts))
         kept = place % self._survey.keep_every == 0
         thinned = returns.take(kept)
+        amplitude = None if thinned.width is None else self._heights(thinned).energy
         return Echoes(
             ray=thinned.ray.astype(np.uint32),
             distance=thinned.distance,
@@ -213,7 +229,17 @@ class EchoCaster:
             reported=thinned.distance,
             colour=thinned.colour,
             cause=thinned.cause,
+            width=thinned.width,
+            amplitude=amplitude,
         )
+
+
+def receiver_of(returns: Returns, sensor: Sensor) -> Receiver | None:
+    """Return the receiver of a sensor's waveforms; None if its returns are made without them."""
+    if returns.waveform == "none":
+        return None
+    system_ns = returns.system_ns(sensor.optics)
+    return Receiver(system_ns, returns.sample_ns, returns.waveform == "gaussian")
 
 
 def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:

@@ -31,13 +31,16 @@ class Hits(NamedTuple):
     energy: Real
     colour: NDArray[np.uint32] | None = None  # packed, see `Surfaces.colours`
     cause: NDArray[np.uint8] | None = None  # None if all are surfaces
+    # Full width at half maximum in the waveform, ns; None if returns are made without.
+    width: Real | None = None
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
         colour = None if self.colour is None else self.colour[rows]
         cause = None if self.cause is None else self.cause[rows]
+        width = None if self.width is None else self.width[rows]
         own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
-        return Hits(*own, colour, cause)
+        return Hits(*own, colour, cause, width)
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
@@ -46,8 +49,8 @@ Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
 
 
 def joined(parts: list[Hits]) -> Hits:
-    """Concatenate hits; all have colours, or none, and those without a cause are surfaces."""
-    *own, colours, causes = zip(*parts, strict=True)
+    """Concatenate hits; all have colours and widths, or none; those without a cause are surfaces."""
+    *own, colours, causes, widths = zip(*parts, strict=True)
     colour = None if parts[0].colour is None else np.concatenate(colours)
     cause = None
     if any(one is not None for one in causes):
@@ -57,7 +60,8 @@ def joined(parts: list[Hits]) -> Hits:
                 for part in parts
             ]
         )
-    return Hits(*map(np.concatenate, own))._replace(colour=colour, cause=cause)
+    width = None if parts[0].width is None else np.concatenate(widths)
+    return Hits(*map(np.concatenate, own))._replace(colour=colour, cause=cause, width=width)
 
 
 @dataclass(frozen=True)

@@ -291,6 +291,18 @@ class BatchReturns:
         return np.asarray(self.intensity / lost)
 
     @property
+    def amplitude(self) -> NDArray[np.float64]:
+        """Height of the echo in the waveform; that of an echo as narrow as the pulse is its energy."""
+        assert self.found.amplitude is not None  # or the survey would have refused the column
+        return self.found.amplitude
+
+    @property
+    def pulse_width(self) -> NDArray[np.float64]:
+        """Full width at half maximum of the echo in the waveform, nanoseconds."""
+        assert self.found.width is not None  # likewise
+        return self.found.width
+
+    @property
     def return_number(self) -> NDArray[np.uint8]:
         """Number among the reported returns of its pulse."""
         return self.found.number

@@ -1,0 +1,227 @@
+"""Waveforms: returns by peaks and by decomposition, and waveforms that are recorded."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.lidarpool.casting import cast_between
+from tests.lidarpool.test_echoes import beam_along_x, cast, wall
+
+from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
+from lidarpool.scene.mesh import Mesh
+from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
+from lidarpool.simulator.hits import Hits
+from lidarpool.simulator.rig import Rig
+from lidarpool.simulator.waveform import Receiver, returns_in
+from raybeam import available_backends
+
+SIGMA_NS = 5 / FWHM
+SIGMA_M = SIGMA_NS * LIGHT_M_NS / 2
+COLUMNS = ("ray", "range", "intensity", "amplitude", "pulse_width", "return_number", "returns")
+
+
+def found(apart, decomposes, energies=(2.0, 1.4), sample_ns=1.0):
+    """Ranges behind the first hit, in σ, energies and widths of two hits so many σ apart."""
+    distance = 100 + np.array([0, apart]) * SIGMA_M
+    hits = Hits(np.arange(2), distance, np.zeros(2, np.int32), np.array(energies))
+    made = returns_in(hits, Receiver(SIGMA_NS, sample_ns, decomposes), each=2)
+    return (made.distance - 100) / SIGMA_M, 2 * made.energy, made.width
+
+
+# -- closed form ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("apart", "peaks"), [(0.5, 1), (1.9, 1), (1.99, 1), (2.05, 2), (3, 2)])
+def test_two_equal_echoes_are_two_peaks_beyond_two_standard_deviations(apart, peaks):
+    place, energy, width = found(apart, decomposes=False, energies=(1, 1), sample_ns=0.1)
+    assert len(place) == peaks
+    assert energy.sum() == pytest.approx(2, rel=1e-4)
+    assert place.mean() == pytest.approx(apart / 2, abs=1e-3)
+    if peaks == 1:  # the peak is in the middle, and so high
+        height = 2 * math.exp(-((apart / 2) ** 2) / 2)
+        assert width == pytest.approx([5 * 2 / height], rel=1e-3)
+
+
+@pytest.mark.parametrize("apart", [1.9, 2.5, 3.0, 5.0, 8.0, 20.0])
+def test_decomposition_gives_both_echoes_back(apart):
+    place, energy, width = found(apart, decomposes=True)
+    assert place == pytest.approx([0, apart], abs=2e-5)
+    assert energy == pytest.approx([2.0, 1.4], rel=1e-4)
+    assert width == pytest.approx([5, 5], rel=1e-4)
+
+
+def test_hits_close_together_are_one_echo_in_closed_form():
+    for decomposes in (False, True):
+        place, energy, width = found(0.2, decomposes)
+        mean, share = 0.2 * 1.4 / 3.4, 2 * 1.4 / 3.4**2
+        assert place == pytest.approx([mean])
+        assert energy == pytest.approx([3.4])
+        assert width == pytest.approx([5 * math.sqrt(1 + share * 0.2**2)])
+
+
+def test_the_closed_form_goes_over_into_the_samples():
+    """Just below and just above the width of what is one echo in closed form."""
+    for decomposes in (False, True):
+        below, above = (np.concatenate(found(d, decomposes)) for d in (0.2499, 0.2501))
+        assert above == pytest.approx(below, rel=2e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("decomposes", [False, True])
+def test_any_batch_gives_the_same_bits(decomposes):
+    random = np.random.default_rng(1)
+    pulses, each = 200, 19
+    distance = 100 + np.sort(random.uniform(0, 1, (pulses, each)), axis=1) * 10
+    distance *= random.uniform(0.01, 1, (pulses, 1))
+    energy = random.uniform(0.1, 1, (pulses, each))
+    rays, receiver = np.arange(each), Receiver(SIGMA_NS, 1.0, decomposes)
+
+    def made(some):
+        ray = (rays + each * np.arange(len(some))[:, None]).ravel()
+        surface = np.zeros(len(ray), np.int32)
+        hits = Hits(ray, distance[some].ravel(), surface, energy[some].ravel())
+        out = returns_in(hits, receiver, each)
+        assert np.bincount(out.ray, out.energy) == pytest.approx(energy[some].mean(axis=1), rel=0.3)
+        return out
+
+    whole = made(np.arange(pulses))
+    alone = [made(np.array([pulse])) for pulse in range(pulses)]
+    for name in ("distance", "energy", "width"):
+        joined = np.concatenate([getattr(one, name) for one in alone])
+        assert np.array_equal(getattr(whole, name), joined)
+
+
+# -- surfaces ------------------------------------------------------------------------------------
+
+
+def tilted(degrees):
+    """A wall across x, 20 m away, turned about z."""
+    a = math.radians(degrees)
+    across, up = np.array([-math.sin(a), math.cos(a), 0]), np.array([0, 0, 1.0])
+    middle = np.array([20.0, 0, 0])
+    corners = [
+        middle + s * 30 * across + t * 30 * up for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    return Mesh("W", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
+@pytest.mark.parametrize("degrees", [0, 45, 65, 75])
+def test_a_slanted_wall_stretches_the_echo(waveform, degrees):
+    """By the standard deviation of ranges in a disc, R tan θ · divergence / 4.
+
+    At 75° that is more than the pulse's: the echo is flat at the top, and no Gaussian.
+    """
+    returns = Returns(
+        "all", subrays=61, divergence_mrad=20, pulse_ns=5, waveform=waveform, sample_ns=0.5
+    )
+    given = {"returns": returns, "columns": COLUMNS, "materials": [Material("*", 1.0)]}
+    echo = cast([tilted(degrees)], **given)
+    spread_ns = 20 * math.tan(math.radians(degrees)) * 0.020 / 4 * 2 / LIGHT_M_NS
+    width = FWHM * math.hypot(SIGMA_NS, spread_ns)
+    assert len(echo["range"]) == 1
+    # The near side returns more, which moves the peak by some centimetres.
+    assert echo["range"] == pytest.approx([20], abs=0.06 if degrees == 75 else 0.01)
+    assert echo["pulse_width"] == pytest.approx([width], rel=0.08 if degrees == 75 else 0.02)
+    energy = math.cos(math.radians(degrees)) / 4
+    assert echo["intensity"] == pytest.approx([energy], rel=0.03)
+    assert echo["amplitude"] == pytest.approx(echo["intensity"] * 5 / echo["pulse_width"], rel=1e-5)
+
+
+@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
+def test_a_road_that_the_beam_grazes_is_one_echo(waveform):
+    returns = Returns("all", subrays=19, divergence_mrad=20, pulse_ns=2, waveform=waveform)
+    echo = cast([tilted(85)], returns=returns, columns=COLUMNS)
+    assert len(echo["range"]) == 1
+    assert echo["pulse_width"] > 10
+
+
+@pytest.mark.parametrize(
+    ("waveform", "apart_m", "echoes"),
+    [("none", 0.7, 1), ("peaks", 0.7, 2), ("peaks", 0.6, 1), ("gaussian", 0.6, 2)],
+)
+def test_what_is_told_apart_at_an_edge(waveform, apart_m, echoes):
+    """By c τ / 2, 0.75 m for 5 ns; by peaks 2 σ, 0.64 m; by decomposition less."""
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 20 + apart_m)]
+    returns = Returns("all", subrays=217, divergence_mrad=1, pulse_ns=5, waveform=waveform)
+    columns = COLUMNS if waveform != "none" else ("range", "intensity")
+    echo = cast(meshes, returns=returns, columns=columns)
+    assert len(echo["range"]) == echoes
+    if echoes == 2:
+        assert echo["object"].tolist() == [0, 1]
+        near = 0.001 if waveform == "gaussian" else 0.25  # peaks attract each other
+        assert echo["range"] == pytest.approx([20, 20 + apart_m], abs=near)
+
+
+def test_the_receiver_widens_the_echo():
+    """A Gaussian receiver of bandwidth B responds with 0.3120 / B (full width at half maximum)."""
+    returns = Returns("all", pulse_ns=3, waveform="peaks", bandwidth_mhz=100)
+    echo = cast([wall("W", 10)], returns=returns, columns=COLUMNS)
+    assert echo["pulse_width"] == pytest.approx([math.hypot(3, 3.120)], rel=1e-3)
+
+
+def test_heights_decide_which_echoes_are_detected_and_strongest():
+    """A slanted wall returns as much light as one at right angles, and half of the height."""
+    returns = Returns("all", subrays=61, divergence_mrad=20, pulse_ns=5, waveform="peaks")
+    columns = COLUMNS
+    seen = cast([tilted(75)], returns=returns, columns=columns)
+    assert seen["amplitude"] < 0.7 * seen["intensity"]
+    energy = float(seen["intensity"][0])
+    # A threshold just below the energy, five standard deviations above the height.
+    limit = 10 * math.sqrt(0.1 / (0.95 * energy))
+    noise = Noise(detection_range_m=limit)
+    lost = [
+        len(
+            cast([tilted(75)], returns=returns, columns=columns, noise=replace(noise, seed=k))[
+                "ray"
+            ]
+        )
+        for k in range(20)
+    ]
+    assert sum(lost) <= 2, "by energy, more than half of them would be there"
+
+
+# -- surveys -------------------------------------------------------------------------------------
+
+
+def fence():
+    """Pales at several distances, which beams hit two or three of."""
+    pales = range(60)
+    return Scene.from_meshes(
+        [wall(f"P{k}", 5 + 0.3 * (7 * k % 10), y=(0.2 * k, 0.2 * k + 0.25)) for k in pales]
+    )
+
+
+def survey(**given):
+    beams = Beams(np.radians([-30, -15, -8, 0]))
+    sensor = Sensor(beams, Spin(1800, 10), optics=Optics(divergence_mrad=30))
+    returns = given.pop("returns", Returns("all", subrays=19, waveform="gaussian", pulse_ns=4))
+    options = {"poses": [(0, 0, 1)], "steps": 8, "columns": COLUMNS, "returns": returns}
+    return Survey(sensor, **options | given)
+
+
+@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
+def test_scans_in_one_cast_or_each_by_itself_are_the_same(waveform):
+    noise = Noise(range_m=0.02, angle_deg=0.1, detection_range_m=60)
+    made = survey(noise=noise, returns=Returns("all", subrays=19, waveform=waveform, pulse_ns=4))
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 8])
+    assert len(whole["x"]) > 4 * 400
+    assert cast_between(rig, made, range(9)) == (whole, tally)
+
+
+@pytest.mark.skipif("embree" not in available_backends(), reason="needs Embree")
+def test_embree_and_numpy_agree():
+    rigs = [Rig(fence(), survey(), backend) for backend in ("numpy", "embree")]
+    first, second = (cast_between(rig, rig.survey, [0, 8]) for rig in rigs)
+    assert first == second
+
+
+def test_what_does_not_fit_together_is_refused():
+    with pytest.raises(LidarpoolError, match=r"sample_ns is 1, and the pulse is 1 ns wide"):
+        survey(returns=Returns(waveform="peaks", pulse_ns=1))
+    with pytest.raises(LidarpoolError, match=r"amplitude is of echoes in waveforms"):
+        survey(returns=Returns())
+    assert Returns(pulse_ns=5).system_ns(Optics()) == pytest.approx(SIGMA_NS)
