@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import struct
 from dataclasses import replace
 
 import numpy as np
@@ -11,11 +12,15 @@ from tests.lidarpool.casting import cast_between
 from tests.lidarpool.test_echoes import beam_along_x, cast, wall
 
 from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
+from lidarpool.columns.parts import pack, unpack
+from lidarpool.columns.table import AXES, SCAN
+from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
+from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.hits import Hits
 from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.waveform import Receiver, returns_in
+from lidarpool.simulator.waveform import Digitizer, returns_in
 from raybeam import available_backends
 
 SIGMA_NS = 5 / FWHM
@@ -27,7 +32,7 @@ def found(apart, decomposes, energies=(2.0, 1.4), sample_ns=1.0):
     """Ranges behind the first hit, in σ, energies and widths of two hits so many σ apart."""
     distance = 100 + np.array([0, apart]) * SIGMA_M
     hits = Hits(np.arange(2), distance, np.zeros(2, np.int32), np.array(energies))
-    made = returns_in(hits, Receiver(SIGMA_NS, sample_ns, decomposes), each=2)
+    made = returns_in(hits, Digitizer(SIGMA_NS, sample_ns, decomposes), each=2)
     return (made.distance - 100) / SIGMA_M, 2 * made.energy, made.width
 
 
@@ -76,7 +81,7 @@ def test_any_batch_gives_the_same_bits(decomposes):
     distance = 100 + np.sort(random.uniform(0, 1, (pulses, each)), axis=1) * 10
     distance *= random.uniform(0.01, 1, (pulses, 1))
     energy = random.uniform(0.1, 1, (pulses, each))
-    rays, receiver = np.arange(each), Receiver(SIGMA_NS, 1.0, decomposes)
+    rays, receiver = np.arange(each), Digitizer(SIGMA_NS, 1.0, decomposes)
 
     def made(some):
         ray = (rays + each * np.arange(len(some))[:, None]).ravel()
@@ -146,8 +151,7 @@ def test_what_is_told_apart_at_an_edge(waveform, apart_m, echoes):
     """By c τ / 2, 0.75 m for 5 ns; by peaks 2 σ, 0.64 m; by decomposition less."""
     meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 20 + apart_m)]
     returns = Returns("all", subrays=217, divergence_mrad=1, pulse_ns=5, waveform=waveform)
-    columns = COLUMNS if waveform != "none" else ("range", "intensity")
-    echo = cast(meshes, returns=returns, columns=columns)
+    echo = cast(meshes, returns=returns, columns=COLUMNS)
     assert len(echo["range"]) == echoes
     if echoes == 2:
         assert echo["object"].tolist() == [0, 1]
@@ -222,6 +226,124 @@ def test_embree_and_numpy_agree():
 def test_what_does_not_fit_together_is_refused():
     with pytest.raises(LidarpoolError, match=r"sample_ns is 1, and the pulse is 1 ns wide"):
         survey(returns=Returns(waveform="peaks", pulse_ns=1))
-    with pytest.raises(LidarpoolError, match=r"amplitude is of echoes in waveforms"):
-        survey(returns=Returns())
     assert Returns(pulse_ns=5).system_ns(Optics()) == pytest.approx(SIGMA_NS)
+
+
+# -- recorded ------------------------------------------------------------------------------------
+
+
+def cloud_of(made, scene=None):
+    """Cloud of all scans of a survey, as its part has it."""
+    rig = Rig(scene or fence(), made, "numpy")
+    part = unpack(bytes(pack(columns_of(list(rig.cast(0, made.scan_count))))))
+    table = (SCAN, *(c for c in made.stored_columns if c not in AXES and c.name != WAVEFORM))
+    return part.cloud(table, made.precision_m, np.zeros(3))
+
+
+def test_a_recorded_waveform_is_the_sum_of_the_echoes():
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 22)]
+    beam = beam_along_x(divergence_mrad=1)
+    returns = Returns("all", subrays=217, pulse_ns=5, waveform="gaussian")
+    options = {"returns": returns, "columns": COLUMNS, "waveform_samples": 60}
+    made = Survey(beam, poses=[(0, 0, 0)], steps=1, precision_m=1e-6, **options)
+    cloud = cloud_of(made, Scene.from_meshes(meshes))
+    waves = cloud.waveforms
+    assert len(cloud) == 2
+    assert waves.samples.shape == (2, 60)
+    assert np.array_equal(waves.samples[0], waves.samples[1]), "one pulse, one window"
+    assert waves.location_ns == pytest.approx(cloud["range"] * 2 / LIGHT_M_NS, abs=1e-5)
+    model = sum(
+        height * np.exp(-0.5 * ((waves.times_ns[0] - at) / SIGMA_NS) ** 2)
+        for height, at in zip(cloud["amplitude"], waves.location_ns, strict=True)
+    )
+    step = 2.0 ** np.ceil(np.log2(model.max() / 63_487))
+    assert waves.samples[0] == pytest.approx(model, abs=step + 2e-3 * model.max())
+
+
+def test_returns_that_are_far_apart_have_windows_of_their_own():
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 60)]
+    returns = Returns("all", subrays=61, pulse_ns=5, divergence_mrad=1)
+    made = Survey(beam_along_x(), poses=[(0, 0, 0)], steps=1, returns=returns, waveform_samples=40)
+    waves = cloud_of(made, Scene.from_meshes(meshes)).waveforms
+    assert waves.times_ns[1, 0] - waves.times_ns[0, 0] == pytest.approx(40 * 2 / LIGHT_M_NS, abs=1)
+    peaks = waves.times_ns[[0, 1], waves.samples.argmax(axis=1)]
+    assert peaks == pytest.approx(waves.location_ns, abs=0.51)
+
+
+def test_recorded_noise_is_a_fifth_of_the_threshold():
+    noise = Noise(detection_range_m=30)
+    made = survey(noise=noise, waveform_samples=100)
+    waves = cloud_of(made).waveforms
+    tail = waves.samples[:, -20:][waves.samples.max(axis=1) < 50 * noise.threshold]
+    quiet = tail[np.abs(tail) < noise.threshold]
+    assert len(quiet) > 2000
+    assert quiet.std() == pytest.approx(noise.threshold / 5, rel=0.1)
+    assert quiet.mean() == pytest.approx(0, abs=noise.threshold / 50)
+
+
+def test_recording_changes_no_point_and_no_batch_changes_a_record():
+    made = survey(noise=Noise(range_m=0.02, detection_range_m=60), waveform_samples=64)
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 8])
+    assert cast_between(rig, made, range(9)) == (whole, tally)
+    without = replace(made, waveform_samples=0)
+    bare, _ = cast_between(Rig(fence(), without, "numpy"), without, [0, 8])
+    assert whole.keys() - bare.keys() == {WAVEFORM}
+    assert all(whole[name] == values for name, values in bare.items())
+
+
+def read_packets(path):
+    """Waveform packets of a LAS file by the specification: head, descriptors, samples by point."""
+    data = path.read_bytes()
+    start, first, count = struct.unpack_from("<QQI", data, 227)
+    assert (first, count) == (start, 1)
+    _, user, kind, size, _ = struct.unpack_from("<H16sHQ32s", data, start)
+    assert (user.rstrip(b"\0"), kind, size) == (b"LASF_Spec", 65_535, len(data) - start - 60)
+    return data, start
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_las_files_hold_waveforms_that_lead_to_the_points(tmp_path, ending):
+    laspy = pytest.importorskip("laspy")
+    columns = (*COLUMNS, "red", "green", "blue")
+    made = survey(waveform_samples=48, columns=columns, precision_m=1e-4)
+    cloud = cloud_of(made)
+    path = tmp_path / f"cloud.{ending}"
+    cloud.save(path, precision_m=1e-4)
+    las = laspy.read(path)
+    data, start = read_packets(path)
+    assert las.header.point_format.id == 10
+    assert las.header.global_encoding.waveform_data_packets_internal
+    told = {
+        vlr.record_id - 99: vlr.parsed_record for vlr in las.header.vlrs.get("WaveformPacketVlr")
+    }
+    waves, several = cloud.waveforms, 0
+    for row in range(0, len(cloud), 7):
+        kind = told[las.wavepacket_index[row]]
+        assert (kind.bits_per_sample, kind.number_of_samples) == (16, 48)
+        assert kind.temporal_sample_spacing == 1000
+        offset, size = las.wavepacket_offset[row], las.wavepacket_size[row]
+        raw = np.frombuffer(data, "<u2", 48, start + offset)
+        assert size == 96
+        samples = kind.digitizer_offset + kind.digitizer_gain * raw.astype(float)
+        assert np.array_equal(samples, waves.samples[row])
+        # The sensor is on the line of the waveform, as far before sample 0 as light took.
+        toward = np.array([las.x_t[row], las.y_t[row], las.z_t[row]], np.float64)
+        at = las.return_point_wave_location[row] / 1000
+        back_ps = 1000 * (waves.times_ns[row, 0] + at)
+        assert np.linalg.norm(toward) == pytest.approx(LIGHT_M_NS / 2000, rel=1e-6)
+        assert las.xyz[row] + back_ps * toward == pytest.approx([0, 0, 1], abs=1e-3)
+        several += las.number_of_returns[row] > 1
+        # The height of the waveform at the return is its amplitude, if nothing is near.
+        if las.number_of_returns[row] == 1:
+            height = np.interp(at, np.arange(48), samples)
+            assert height == pytest.approx(cloud["amplitude"][row], rel=0.1)
+    assert several > 10
+    assert len({*las.wavepacket_offset.tolist()}) < len(cloud), "returns of a pulse share packets"
+
+
+def test_a_window_that_holds_no_echo_is_refused():
+    with pytest.raises(LidarpoolError, match=r"waveform_samples is 8, and one echo takes \d+"):
+        survey(waveform_samples=8)
+    with pytest.raises(LidarpoolError, match="has no waveforms"):
+        _ = cloud_of(survey()).waveforms

@@ -72,6 +72,12 @@ class Noise:
     seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
 
     @property
+    def threshold(self) -> float:
+        """Energy that is detected with probability one half; there must be a detection range."""
+        assert self.detection_range_m is not None
+        return TARGET_REFLECTANCE * at_right_angles(self.detection_range_m)
+
+    @property
     def loses(self) -> bool:
         """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None
@@ -103,8 +109,7 @@ class Noise:
         """
         seen = uniform(self.seed, _LOSS, scan, ray, number) >= self.dropout
         if self.detection_range_m is not None:
-            threshold = TARGET_REFLECTANCE * at_right_angles(self.detection_range_m)
-            above = THRESHOLD_SIGMAS * (energy / threshold - 1)
+            above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
             seen &= above + normal(self.seed, _DETECTION, scan, ray, number) > 0
         return seen
 

@@ -16,6 +16,7 @@ from .disc import SUBRAYS
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
 FWHM = sqrt(8 * log(2))  # full width at half maximum of a Gaussian, in standard deviations
+WINDOW_SIGMAS = 10  # that an echo takes in a waveform, to both sides together
 # Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
 _RESPONSE = sqrt(log(2)) / (2 * pi)
 
@@ -72,7 +73,7 @@ class Returns:
         Pulse | None,
         Field(
             description="length of the pulse: surfaces less than half of it apart are "
-            "one return; by default the sensor's, or 5. Of waveforms the full width at half maximum",
+            "one return; its full width at half maximum in waveforms. By default the sensor's, or 5",
             examples=[5.0],
         ),
     ] = None
@@ -110,15 +111,16 @@ class Returns:
                 f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
-        return (wide or 0.0) / 1000, LIGHT_M_NS * self._pulse_ns(optics) / 2
+        return (wide or 0.0) / 1000, LIGHT_M_NS * self.length_ns(optics) / 2
 
-    def _pulse_ns(self, optics: Optics) -> float:
+    def length_ns(self, optics: Optics) -> float:
+        """Length of the pulse."""
         return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
 
     def system_ns(self, optics: Optics) -> float:
-        """Standard deviation of the system waveform, the pulse as the receiver sees it, ns.
+        """Return the standard deviation of the system waveform, ns.
 
-        It is Gaussian: that of the pulse, convolved with the response of the receiver.
+        That is the pulse as the receiver sees it: both are Gaussian, and convolved.
 
         Raises
         ------
@@ -126,7 +128,7 @@ class Returns:
             If the samples are too far apart for it.
         """
         response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
-        sigma = sqrt((self._pulse_ns(optics) / FWHM) ** 2 + response**2)
+        sigma = sqrt((self.length_ns(optics) / FWHM) ** 2 + response**2)
         if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
             raise LidarpoolError(
                 f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "

@@ -15,13 +15,14 @@ from raybeam import Pattern, ScanReturns
 from ..scene.scene import Scene
 from ..sensor import Returns, Sensor, Survey
 from ..sensor.disc import disc
+from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import Mode, spread
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products
 from .paths import Paths
 from .separation import separated
 from .surfaces import Surfaces
-from .waveform import Receiver, returns_in
+from .waveform import Digitizer, recorded, returns_in
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
@@ -44,6 +45,7 @@ class Echoes(ScanReturns):
     # (k,): full width at half maximum in the waveform, ns, and height; None without waveforms.
     width: Real | None = None
     amplitude: Real | None = None
+    waveform: NDArray[np.void] | None = None  # (k,): recorded, but for the location
 
 
 class EchoCaster:
@@ -57,8 +59,11 @@ class EchoCaster:
         self._returns, self._noise = survey.returns_each[number], survey.noise_each[number]
         self._paths = Paths(caster, scene, survey, self._sensor, surfaces)
         # Whether each ray that hits something has one return.
-        self._receiver = receiver_of(self._returns, self._sensor)
-        several = self._returns.subrays > 1 or self._noise.loses or self._receiver is not None
+        self._finds = self._returns.waveform != "none"  # returns in waveforms
+        self._records = survey.waveform_samples  # of each return
+        waves = self._finds or self._records > 0
+        self._digitizer = digitizer_of(self._returns, self._sensor) if waves else None
+        several = self._returns.subrays > 1 or self._noise.loses or waves
         self._one_each = surfaces.materials.plain and not several
         # Whether its returns are the caster's hits.
         self.plain = self._one_each and not self._noise.displaces
@@ -115,12 +120,15 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window)
-                if self._receiver is None:
-                    returns = separated(hits, self._gap_m, len(beam), planes)
+                if self._finds:
+                    assert self._digitizer is not None
+                    returns = returns_in(hits, self._digitizer, len(beam), planes)
                 else:
-                    returns = returns_in(hits, self._receiver, len(beam), planes)
-                returns = returns._replace(ray=start + returns.ray)
-                chunks.append(self._reported(returns, keys))
+                    returns = separated(hits, self._gap_m, len(beam), planes)
+                returns = self._reported(returns._replace(ray=start + returns.ray), keys)
+                if self._records:
+                    returns = self._with_waveforms(returns, hits, start, keys)
+                chunks.append(returns)
             found = self._kept(joined(chunks), groups, tally)
         if noise.range_m or noise.range_per_m:
             reported = noise.ranges(found.distance, *keys.of(found.ray), found.number)
@@ -202,9 +210,22 @@ class EchoCaster:
 
     def _heights(self, returns: Hits) -> Hits:
         """Return returns with the heights of their echoes in place of energies."""
-        if self._receiver is None or returns.width is None:
+        if returns.width is None or self._digitizer is None:
             return returns
-        return returns._replace(energy=self._receiver.amplitude(returns.energy, returns.width))
+        return returns._replace(energy=self._digitizer.amplitude(returns.energy, returns.width))
+
+    def _with_waveforms(self, returns: Hits, hits: Hits, start: int, keys: Keys) -> Hits:
+        """Record the waveforms of returns; `start` is the beam of the first sub-rays."""
+        assert self._digitizer is not None
+        noise = None
+        if self._noise.detection_range_m is not None:
+            sigma = self._noise.threshold / THRESHOLD_SIGMAS
+            here = Keys(keys.scan, keys.begins - start)
+            noise = sigma, self._noise.seed, here
+        given = returns._replace(ray=returns.ray - start)
+        each = len(self._beam)
+        waveform = recorded(hits, given, self._digitizer, each, self._records, noise)
+        return returns._replace(waveform=waveform)
 
     def _kept(self, returns: Hits, groups: Whole, tally: bool) -> Echoes:
         """Count the returns of each scan and thin them out."""
@@ -231,15 +252,14 @@ class EchoCaster:
             cause=thinned.cause,
             width=thinned.width,
             amplitude=amplitude,
+            waveform=thinned.waveform,
         )
 
 
-def receiver_of(returns: Returns, sensor: Sensor) -> Receiver | None:
-    """Return the receiver of a sensor's waveforms; None if its returns are made without them."""
-    if returns.waveform == "none":
-        return None
+def digitizer_of(returns: Returns, sensor: Sensor) -> Digitizer:
+    """Return what samples the waveforms of a sensor."""
     system_ns = returns.system_ns(sensor.optics)
-    return Receiver(system_ns, returns.sample_ns, returns.waveform == "gaussian")
+    return Digitizer(system_ns, returns.sample_ns, returns.waveform == "gaussian")
 
 
 def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:

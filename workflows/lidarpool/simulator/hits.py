@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -33,6 +33,7 @@ class Hits(NamedTuple):
     cause: NDArray[np.uint8] | None = None  # None if all are surfaces
     # Full width at half maximum in the waveform, ns; None if returns are made without.
     width: Real | None = None
+    waveform: NDArray[np.void] | None = None  # of returns: recorded, see `recorded`
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
@@ -40,7 +41,8 @@ class Hits(NamedTuple):
         cause = None if self.cause is None else self.cause[rows]
         width = None if self.width is None else self.width[rows]
         own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
-        return Hits(*own, colour, cause, width)
+        waveform = None if self.waveform is None else self.waveform[rows]
+        return Hits(*own, colour, cause, width, waveform)
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
@@ -49,19 +51,28 @@ Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
 
 
 def joined(parts: list[Hits]) -> Hits:
-    """Concatenate hits; all have colours and widths, or none; those without a cause are surfaces."""
-    *own, colours, causes, widths = zip(*parts, strict=True)
+    """Concatenate hits; all have colours, or none.
+
+    Those without a cause are surfaces, and those without a width have the width 0.
+    """
+    *own, colours, causes, widths, waveforms = zip(*parts, strict=True)
     colour = None if parts[0].colour is None else np.concatenate(colours)
-    cause = None
-    if any(one is not None for one in causes):
-        cause = np.concatenate(
-            [
-                np.zeros(len(part.ray), np.uint8) if part.cause is None else part.cause
-                for part in parts
-            ]
-        )
-    width = None if parts[0].width is None else np.concatenate(widths)
-    return Hits(*map(np.concatenate, own))._replace(colour=colour, cause=cause, width=width)
+    waveform = None if parts[0].waveform is None else np.concatenate(waveforms)
+    cause, width = _filled(parts, causes, np.uint8), _filled(parts, widths, np.float64)
+    both = Hits(*map(np.concatenate, own))
+    return both._replace(colour=colour, cause=cause, width=width, waveform=waveform)
+
+
+def _filled(
+    parts: list[Hits], given: Sequence[NDArray[Any] | None], kind: type[np.generic]
+) -> NDArray[Any] | None:
+    """Concatenate what some parts have, with zeros for the others; None if none has it."""
+    if all(one is None for one in given):
+        return None
+    some = zip(parts, given, strict=True)
+    return np.concatenate(
+        [np.zeros(len(part.ray), kind) if one is None else one for part, one in some]
+    )
 
 
 @dataclass(frozen=True)

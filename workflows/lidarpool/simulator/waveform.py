@@ -15,12 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..sensor.optics import FWHM, LIGHT_M_NS
-from .hits import Hits, Planes, Real, Whole, numbers, runs
+from ..columns.waveforms import SILENT, ZERO, record
+from ..sensor.noise import normal, raw
+from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
+from .hits import Hits, Keys, Planes, Real, Whole, numbers, runs
 from .separation import continued
 
 # All in standard deviations of the system waveform.
-CUT = 5.0  # beyond that an echo is 0; it is 4e-6 of its height there
+CUT = WINDOW_SIGMAS / 2  # beyond that an echo is 0; it is 4e-6 of its height there
 # Hits within this are one echo in closed form: position and height err by 1e-3 at most.
 NARROW = 0.25
 MEET = 1.0  # planes of neighbouring hits that meet as closely are one surface, see `continued`
@@ -35,10 +37,13 @@ GAIN, ENOUGH = 1e-3, 1e-9  # share of the squares that a step must gain, and squ
 MOVES = 2.0  # standard deviations that a fit may move from its first guess
 HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
 BLOCK_HITS = 1 << 15  # whose waveforms are made at a time
+BLOCK_SAMPLES = 1 << 20  # of recorded waveforms that are made at a time
+
+_SAMPLES, _SAMPLE = 50, 51  # purposes of random numbers
 
 
 @dataclass(frozen=True)
-class Receiver:
+class Digitizer:
     """Standard deviation of the system waveform and the time between samples, ns."""
 
     sigma_ns: float
@@ -55,13 +60,19 @@ class Receiver:
         """Standard deviation of the system waveform, samples."""
         return self.sigma_ns / self.sample_ns
 
+    @property
+    def reach(self) -> int:
+        """Samples before and behind an echo that it reaches."""
+        return int(np.ceil(CUT * self.sigma))
+
     def samples(self, distance: Real) -> Real:
         """Return when light comes back, samples after the pulse."""
         return distance * (2 / LIGHT_M_NS / self.sample_ns)
 
     def amplitude(self, energy: Real, width: Real) -> Real:
-        """Heights of echoes (n,) by energy and full width at half maximum, ns."""
-        return np.asarray(energy * (FWHM * self.sigma_ns / width))
+        """Heights of echoes (n,) by energy and full width at half maximum, ns; 0 is unknown."""
+        system_ns = FWHM * self.sigma_ns
+        return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
 
 
 @dataclass(frozen=True)
@@ -73,7 +84,9 @@ class _Found:
     width: Real  # of the system waveform's
 
 
-def returns_in(hits: Hits, receiver: Receiver, each: int = 1, planes: Planes | None = None) -> Hits:
+def returns_in(
+    hits: Hits, digitizer: Digitizer, each: int = 1, planes: Planes | None = None
+) -> Hits:
     """Make returns of the waveforms of beams; arguments and order as of `separated`.
 
     Hits that lie close together are one Gaussian, whose position and width are theirs. Other
@@ -94,50 +107,50 @@ def returns_in(hits: Hits, receiver: Receiver, each: int = 1, planes: Planes | N
     new[begins] = True
     echo = np.full(len(rows), -1)  # of each hit, where its waveform was searched
     found = _Found(*np.zeros((3, 0)))
-    narrow = NARROW * receiver.sigma_m
+    narrow = NARROW * digitizer.sigma_m
     wide = np.flatnonzero(np.repeat(extent > narrow, counts))
     if len(wide):
         order = np.arange(len(rows))
         order[wide] = wide[np.lexsort((hits.distance[wide], beam[wide]))]
         rows, hits = rows[order], hits.take(order)
-        new[1:] |= np.diff(hits.distance) > 2 * CUT * receiver.sigma_m
+        new[1:] |= np.diff(hits.distance) > 2 * CUT * digitizer.sigma_m
         # Of those beams, what is together and yet not narrow.
-        begins, counts = runs(np.cumsum(new)[wide])
+        begins, counts = runs(np.cumsum(new, dtype=np.int64)[wide])
         ends = wide[begins + counts - 1]
         broad = hits.distance[ends] - hits.distance[wide[begins]] > narrow
         on = wide[np.repeat(broad, counts)]
         if len(on):
             share, together = hits.energy[on] / each, counts[broad]
-            echo[on], found = _searched(hits.distance[on], share, together, receiver)
+            echo[on], found = _searched(hits.distance[on], share, together, digitizer)
             new[on] |= np.diff(echo[on], prepend=-1) != 0
         if planes is not None and each > 1:
             begins, counts = runs(beam[wide])
             several = np.add.reduceat(new[wide], begins, dtype=np.int64) > 1
             falls = wide[np.repeat(several, counts)]
             if len(falls):
-                part, marks, gap_m = hits.take(falls), new[falls], MEET * receiver.sigma_m
+                part, marks, gap_m = hits.take(falls), new[falls], MEET * digitizer.sigma_m
                 new[falls] &= ~continued(part, marks, gap_m, each, *planes(rows[falls]))
     begins = np.flatnonzero(new)
     which = np.cumsum(new) - 1
     energy = np.bincount(which, hits.energy).astype(np.float64)
     distance = np.bincount(which, hits.energy * hits.distance) / energy
-    off = (hits.distance - distance[which]) / receiver.sigma_m
+    off = (hits.distance - distance[which]) / digitizer.sigma_m
     width = np.sqrt(1 + np.bincount(which, hits.energy * off**2) / energy)
     energy /= each
     # What was found in a waveform, if no surface joins it with anything else.
     last = np.append(begins[1:], len(rows)) - 1
     alone = np.flatnonzero((echo[begins] >= 0) & (echo[begins] == echo[last]))
     what = echo[begins[alone]]
-    distance[alone] = found.position[what] * (receiver.sample_ns * LIGHT_M_NS / 2)
+    distance[alone] = found.position[what] * (digitizer.sample_ns * LIGHT_M_NS / 2)
     energy[alone], width[alone] = found.energy[what], found.width[what]
     strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
     first = hits.take(strongest[numbers(which[strongest]) == 0])
-    width *= FWHM * receiver.sigma_ns
+    width *= FWHM * digitizer.sigma_ns
     return first._replace(ray=beam[begins], distance=distance, energy=energy, width=width)
 
 
 def _searched(
-    distance: Real, energy: Real, counts: Whole, receiver: Receiver
+    distance: Real, energy: Real, counts: Whole, digitizer: Digitizer
 ) -> tuple[Whole, _Found]:
     """Find the echoes of pulses, and which of them each hit belongs to, or -1.
 
@@ -149,7 +162,7 @@ def _searched(
     while done < len(counts):
         stop = max(done + 1, int(np.searchsorted(ends, begin + BLOCK_HITS, side="right")))
         part, end = slice(begin, ends[stop - 1]), int(ends[stop - 1])
-        echo, some = _of_block(distance[part], energy[part], counts[done:stop], receiver)
+        echo, some = _of_block(distance[part], energy[part], counts[done:stop], digitizer)
         echoes.append(np.where(echo < 0, -1, echo + before))
         found.append(some)
         before, begin, done = before + len(some.position), end, stop
@@ -185,10 +198,10 @@ def _key(time: Real, shift: Whole) -> Whole:
 
 
 def _of_block(
-    distance: Real, energy: Real, counts: Whole, receiver: Receiver
+    distance: Real, energy: Real, counts: Whole, digitizer: Digitizer
 ) -> tuple[Whole, _Found]:
-    sigma = receiver.sigma
-    when = receiver.samples(distance)
+    sigma = digitizer.sigma
+    when = digitizer.samples(distance)
     ends = np.cumsum(counts)
     first, many = first_samples(when, sigma)
     lows = first[ends - counts] - 1
@@ -199,7 +212,7 @@ def _of_block(
     samples = np.zeros(int(lengths.sum()))
     add_echoes(samples, shift, when, energy, sigma)
     waves = _Waves(samples, begins, lows, np.maximum.reduceat(samples, begins))
-    find = _gaussians if receiver.decomposes else _peaks
+    find = _gaussians if digitizer.decomposes else _peaks
     until, owner, found = find(waves, sigma)
     if not len(owner):
         return np.full(len(distance), -1), found
@@ -320,8 +333,8 @@ def fitted(x: Real, y: Real, owner: Whole, guess: Real) -> Real:
     """Fit sums of Gaussians by least squares: heights, places and widths, (3, k, fits).
 
     The method is that of Levenberg and Marquardt; a fit ends when a step gains nothing, or after
-    `STEPS`. Heights are `HIGHEST` at most, places within `MOVES` of the guess, and widths, which are
-    standard deviations, at least 1.
+    `STEPS`. Heights are `HIGHEST` at most, places within `MOVES` of the guess, and widths, standard
+    deviations, at least 1.
 
     Parameters
     ----------
@@ -407,3 +420,91 @@ def _solved(normal: Real, right: Real) -> Real:
             out[row] -= lower[k, row] * out[k]
         out[row] /= lower[row, row]
     return out
+
+
+def recorded(
+    hits: Hits,
+    returns: Hits,
+    digitizer: Digitizer,
+    each: int,
+    count: int,
+    noise: tuple[float, int, Keys] | None = None,
+) -> NDArray[np.void]:
+    """Record the waveform around each return, `count` samples: (n,), see `record`.
+
+    A window begins where the echo of its first return does, and returns of the same pulse share it
+    as long as their echoes end within. Windows of a pulse that overlap hold the same samples.
+
+    Parameters
+    ----------
+    hits
+        Of all sub-rays, `each` of a beam, in the order of rays.
+    returns
+        Their `ray` is the beam, in order.
+    noise
+        Standard deviation of a sample, the seed, and the keys of beams.
+    """
+    out = np.zeros(len(returns.ray), record(count))
+    out["sample_ps"] = round(1000 * digitizer.sample_ns)
+    when = digitizer.samples(returns.distance)
+    first = np.maximum(np.floor(when).astype(np.int64) - digitizer.reach, 0)
+    last = np.ceil(when).astype(np.int64) + digitizer.reach
+    place = numbers(returns.ray)
+    begin = first.copy()
+    for number in range(1, int(place.max(initial=0)) + 1):
+        rows = np.flatnonzero(place == number)
+        shared = (last[rows] < begin[rows - 1] + count) & (first[rows] >= begin[rows - 1])
+        begin[rows] = np.where(shared, begin[rows - 1], first[rows])
+    new = (place == 0) | (np.diff(begin, prepend=-1) != 0)
+    window = np.cumsum(new) - 1
+    beam, begins = returns.ray[new], begin[new]
+    low, high = (np.searchsorted(hits.ray, (beam + step) * each) for step in (0, 1))
+    unit = max(count, each * (2 * digitizer.reach + 1))
+    size = max(1, BLOCK_SAMPLES // unit)
+    out["begin"] = begin
+    for start in range(0, len(beam), size):
+        block = slice(start, start + size)
+        samples = _window(hits, digitizer, each, begins[block], low[block], high[block], count)
+        if noise is not None:
+            sigma, seed, keys = noise
+            scan, ray = keys.of(beam[block])
+            stream = raw(seed, _SAMPLES, scan, ray)[:, None]
+            number = begins[block, None] + np.arange(count)
+            samples += sigma * normal(seed, _SAMPLE, stream, number >> 8, number & 255)
+        steps, exponents = digitised(samples)
+        rows = slice(*np.searchsorted(window, [start, start + size]))
+        out["samples"][rows], out["exponent"][rows] = (
+            made[window[rows] - start] for made in (steps, exponents)
+        )
+    return out
+
+
+def _window(
+    hits: Hits, digitizer: Digitizer, each: int, begins: Whole, low: Whole, high: Whole, count: int
+) -> Real:
+    """Sample the waveforms of some windows, of the hits from `low` to `high`: (windows, count)."""
+    sizes = high - low
+    mine = np.repeat(np.arange(len(begins)), sizes)
+    rows = np.arange(len(mine)) + np.repeat(low - np.cumsum(sizes) + sizes, sizes)
+    when = digitizer.samples(hits.distance[rows])
+    first, many = first_samples(when, digitizer.sigma)
+    time = first[:, None] + np.arange(many)
+    height = np.exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
+    height *= hits.energy[rows, None] / each
+    place = time - begins[mine, None]
+    inside = (place >= 0) & (place < count)
+    place += count * mine[:, None]
+    samples = np.bincount(place[inside], height[inside], minlength=len(begins) * count)
+    return samples.reshape(len(begins), count).astype(np.float64)
+
+
+def digitised(samples: Real) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+    """Round samples (n, k) to whole numbers from `ZERO`, of a power of two that holds all of each.
+
+    Returns them, uint16 (n, k), and the exponents (n,).
+    """
+    most = np.maximum(samples.max(axis=1) / (65_535 - ZERO), -samples.min(axis=1) / ZERO)
+    _, exponents = np.frexp(most)
+    exponents = np.clip(np.where(most > 0, exponents, SILENT), SILENT, 127)
+    steps = np.rint(np.ldexp(samples, -exponents[:, None])) + ZERO
+    return np.clip(steps, 0, 65_535).astype(np.uint16), exponents.astype(np.int8)
