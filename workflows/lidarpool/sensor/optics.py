@@ -72,8 +72,8 @@ class Returns:
     pulse_ns: Annotated[
         Pulse | None,
         Field(
-            description="length of the pulse: surfaces less than half of it apart are "
-            "one return; its full width at half maximum in waveforms. By default the sensor's, or 5",
+            description="length of the pulse, in waveforms at half of its maximum: surfaces less "
+            "than half of it apart are one return; by default the sensor's, or 5",
             examples=[5.0],
         ),
     ] = None
