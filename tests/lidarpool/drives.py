@@ -33,7 +33,8 @@ def the_sweeps(scene: Scene) -> Sweeps:
     track = Track([0, 1], [[0, 0, 1], [10, 5, 1]], [[0, 0, 0, 1], [0, 0, half, half]])
     lidar = Sensor.grid(360, 4)
     sensors = [Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front"), Mounted(lidar, name="rear/left")]
-    return Sweeps.of(Survey(sensors=sensors, trajectory=track, steps=TURNS * SCANS), scene)
+    survey = Survey(sensors=sensors, trajectory=track, steps=TURNS * SCANS, columns=["ray"])
+    return Sweeps.of(survey, scene)
 
 
 def points_of(scene: Scene, number: int) -> Cloud:
@@ -42,9 +43,12 @@ def points_of(scene: Scene, number: int) -> Cloud:
     scan = np.sort(rng.integers(0, 2 * TURNS * SCANS, 900))
     scan = scan[scan // SCANS != 1]
     count = len(scan)
+    ray = rng.integers(0, 40, count)
+    ray = ray[np.lexsort((ray, scan))]
     columns = {
         "scan": scan,
-        "channel": rng.integers(0, 4, count),
+        "ray": ray,
+        "channel": ray % 4,
         "object": rng.integers(0, len(scene.names) + 2, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
         "class": rng.integers(0, 30, count),

@@ -214,6 +214,7 @@ def test_options_of_a_survey_are_checked_too():
 def test_nothing_public_is_left_out():
     """But for what only runs make, or a reader of files."""
     made = {
+        "CampaignRun",
         "Frame",
         "Plan",
         "Result",

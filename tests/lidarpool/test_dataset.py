@@ -214,7 +214,8 @@ def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeyp
     write = Storage.write
 
     def look(storage, name, data):
-        held.append(len(data))
+        if not name.startswith("sweeps/"):  # poses of all
+            held.append(len(data))
         write(storage, name, data)
 
     monkeypatch.setattr(Storage, "write", look)

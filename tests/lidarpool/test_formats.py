@@ -51,7 +51,7 @@ from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.trajectory import matrices
 
 COLUMNS = ("time", "intensity", "reflectivity", "range", "azimuth", "elevation", "class",
-           "return_number", "returns", "sensor")  # fmt: skip
+           "return_number", "returns", "sensor", "ray")  # fmt: skip
 
 
 @pytest.fixture(scope="module")
@@ -84,10 +84,12 @@ def cloud(survey) -> Cloud:
     scan = np.sort(rng.integers(0, survey.scan_count, 3000))
     scan = scan[scan // 36 != 3]
     count = len(scan)
+    ray = rng.integers(0, 40, count)
+    ray = ray[np.lexsort((ray, scan))]
     begins = np.array([survey.begins_ns(k) for k in range(survey.scan_count)])[scan]
     columns = {
         "scan": scan,
-        "channel": rng.integers(0, 4, count),
+        "channel": ray % 4,
         "object": rng.integers(0, 7, count),
         "time": begins.astype(np.int64) + rng.integers(0, 2_000_000, count),
         "intensity": rng.uniform(0, 1, count).astype(np.float32),
@@ -99,6 +101,7 @@ def cloud(survey) -> Cloud:
         "return_number": np.ones(count),
         "returns": np.ones(count) * 2,
         "sensor": scan // 180,
+        "ray": ray,
     }
     return Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 2), columns)
 
@@ -696,7 +699,7 @@ def test_a_format_is_named_as_in_a_scenario():
             Format.of(entry)
 
 
-@pytest.mark.parametrize("name", ["kitti", "nuscenes", "parquet", "pcd"])
+@pytest.mark.parametrize("name", ["kitti", "nuscenes", "parquet", "pcd", "images"])
 def test_workers_and_threads_write_the_same_files(sweeps, cloud, tmp_path, name, monkeypatch):
     """What workers do not see is written here."""
     monkeypatch.setattr(parquet, "CHUNK_POINTS", 1000)

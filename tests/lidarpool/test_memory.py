@@ -45,6 +45,7 @@ STILL = {"poses": [(0, 0, 1)], "steps": 10_000}
 WAY = {"trajectory": Track([0, 60], [(0, 0, 1), (2, 0, 1)], [[0, 0, 0, 1], [0, 0, 1, 0]])}
 ALL = {"columns": OPTIONAL_NAMES}
 HALF = [Material("*", 0.5)]
+SEEN = {"noise": Noise(detection_range_m=100), "returns": Returns("dual", divergence_mrad=3.0)}
 PAINT = {"columns": ["intensity", "red", "green", "blue"], "materials": [Material("*", "texture")]}
 
 SURVEYS = {
@@ -58,6 +59,9 @@ SURVEYS = {
     "colours": Survey(MANY, **STILL, **PAINT),
     "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
+    "rain": Survey(MANY, **STILL, **SEEN, rain_mm_h=20),
+    "snow": Survey(MANY, **STILL, **ALL, **SEEN, snow_mm_h=2),
+    "fog": Survey(MANY, **STILL, **SEEN, visibility_km=0.05, fog_lidar_ratio_sr=65),
 }
 
 

@@ -13,13 +13,14 @@ import pytest
 import yaml
 from lxml import html
 
+import lidarpool.report.page
 from lidarpool import Cloud, Planning, Result, Scene, Survey
 from lidarpool.pipeline import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.cloud_numbers import CountedCloud
-from lidarpool.report.page.page import OBJECTS_MOST, write_page
+from lidarpool.report.page.page import OBJECTS_MOST, STAGES, write_page
 from lidarpool.report.page.timeline import ROWS_MOST
 from lidarpool.report.report import make_report
 from lidarpool.run.trials import TRIAL
@@ -317,3 +318,10 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
     assert Scenario.from_data(yaml.safe_load(shown)).model_dump() == scenario.model_dump()
     many = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
     assert len(write(scenario=many)[0]) < len(write()[0]) + 60_000
+
+
+def test_each_stage_has_a_colour_in_light_and_dark():
+    css = (Path(lidarpool.report.page.__file__).parent / "templates" / "page.css").read_text()
+    for stage in STAGES:
+        assert css.count(f"--{stage}: #") == 2, stage
+        assert f".c-{stage} {{" in css and f".s-{stage} {{" in css, stage

@@ -51,8 +51,12 @@ MOUNT = Pose((0.4, -0.2, 0.3), 30, -8, 3)
 PHYSICS = {
     "materials": [Material("*", 0.5), Material("Bowl", transparent="mirror")],
     "returns": Returns("dual", 7, 3.0),
-    "noise": Noise(0.02, angle_deg=0.05, dropout=0.1, seed=5),
-    "visibility_km": 1.0,
+    "noise": Noise(0.02, angle_deg=0.05, dropout=0.1, detection_range_m=150, seed=5),
+    "visibility_km": 0.1,
+    "fog_lidar_ratio_sr": 18.8,
+    "rain_mm_h": 20.0,
+    "snow_mm_h": 1.0,
+    "dust_mg_m3": 10.0,
 }
 LATE = Sensor(
     Beams(

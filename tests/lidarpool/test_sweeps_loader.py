@@ -57,7 +57,7 @@ def identity(sweep: Sweep) -> tuple[int, str, int]:
     return sweep.job_number, sweep.sensor, sweep.number
 
 
-@pytest.mark.parametrize("name", [*DATA_SETS, "mcap-autoware", "mcap-ouster"])
+@pytest.mark.parametrize("name", [*DATA_SETS, "mcap-autoware", "mcap-ouster", "mcap-images"])
 def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
     data = lidarpool.sweeps(written(name))
     assert len(data) == (JOBS - 1) * 2 * TURNS
@@ -79,7 +79,7 @@ def test_a_sweep_is_what_was_written(written, all_sweeps, name, scene):
         np.testing.assert_allclose(back, points.positions, atol=2e-5 if name != "folder" else 1e-3)
         steps = 255 if name == "mcap-autoware" else 1e9
         np.testing.assert_allclose(sweep.intensity, points.intensity, rtol=1e-6, atol=0.51 / steps)
-        if name in ("kitti", "parquet", "folder"):
+        if name in ("kitti", "parquet", "images", "folder"):
             np.testing.assert_array_equal(sweep.classes, points["class"])
             np.testing.assert_array_equal(sweep.objects, points.object)
             assert sweep.classes.dtype == np.uint16 and sweep.objects.dtype == np.int32

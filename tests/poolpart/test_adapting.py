@@ -167,7 +167,7 @@ def is_kept(partition, queue, begin):
     partition.submit(here).result(LONG_S)
     began, end = len(queue.submitted), begin()
     partition.adapt(0, 1, idle_s=IDLE_S)
-    time.sleep(4 * IDLE_S)
+    time.sleep(2.5 * IDLE_S)
     kept = len(partition) == 1 and len(queue.submitted) == began
     end()
     return kept

@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .export.ply import read_cloud
     from .pipeline import Frame
     from .plan import Plan, Planning
+    from .run.campaign import CampaignRun
     from .run.store import remove_run
     from .scenario.campaign import CampaignJob
     from .scene.actors import Actor
@@ -48,6 +49,7 @@ __all__ = [
     "Beams",
     "Campaign",
     "CampaignJob",
+    "CampaignRun",
     "Cloud",
     "Column",
     "Frame",
@@ -95,6 +97,7 @@ _MODULES = {
     "export.ply": ("read_cloud",),
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
+    "run.campaign": ("CampaignRun",),
     "run.store": ("remove_run",),
     "scenario.campaign": ("CampaignJob",),
     "scene.actors": ("Actor",),

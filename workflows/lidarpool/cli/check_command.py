@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 import shlex
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -242,6 +243,9 @@ def told(job: Job, found: dict[str, Any]) -> Iterator[str]:
     if drive or returns != type(returns)():
         rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
         yield f"returns     {returns.mode} of each pulse{rays}"
+    if alpha := job.survey.extinction(sensor):
+        left = f"{100 * math.exp(-100 * alpha):.2g} % of the light from 50 m is left"
+        yield f"air         takes {1000 * alpha:.3g}/km: {left}"
     if estimate:
         yield (
             f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "

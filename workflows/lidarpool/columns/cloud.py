@@ -69,10 +69,11 @@ class Savable:
             Its ending is .ply, .las, .laz, .e57, .mcap or .parquet, unless there is a `format`.
             Its folder must exist. An existing file is replaced, a folder is not.
         format
-            Such as "laz", and for folders of many files "parquet", "pcd", "kitti", "nuscenes" or
-            "rosbag2".
+            Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
+            "nuscenes" or "rosbag2".
         layout
-            Layout of points in mcap and rosbag2: velodyne, autoware or ouster.
+            Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
+            velodyne with range images.
         precision_m
             Step of stored positions, metres; by default that of the survey, else 0.001.
 

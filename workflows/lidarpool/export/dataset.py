@@ -31,7 +31,8 @@ U = TypeVar("U")
 
 # {format of a data set: format of its jobs}
 DATA_SETS = {
-    "kitti": "kitti", "nuscenes": "nuscenes", "mcap": "mcap", "parquet": "parquet", "folder": "ply",
+    "kitti": "kitti", "nuscenes": "nuscenes", "mcap": "mcap", "parquet": "parquet",
+    "images": "images", "folder": "ply",
 }  # fmt: skip
 INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
@@ -61,6 +62,7 @@ class DataSet:
     - nuscenes: a scene for each job; `finish` writes the tables
     - mcap: `bags/NAME.mcap`
     - parquet: `points/job=7`, one table of Hive's partitions
+    - images: `images/NAME/SENSOR/000000.npz`
     - folder: `jobs/NAME/cloud.ply`
 
     Beside these are `sweeps/NAME.npz` (`Sweeps`) and, where there are actors, `boxes/NAME.npz`,
@@ -72,13 +74,13 @@ class DataSet:
     place
         A folder or URL. Without `durable` a power failure may lose jobs that were written.
     format
-        kitti, nuscenes, mcap, parquet or folder.
+        kitti, nuscenes, mcap, parquet, images or folder.
     layout
-        Of points in mcap: velodyne, autoware or ouster.
+        Of points in mcap: velodyne, autoware, ouster or images.
     """
 
     place: Storage
-    format: Literal["kitti", "nuscenes", "mcap", "parquet", "folder"]
+    format: Literal["kitti", "nuscenes", "mcap", "parquet", "images", "folder"]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
 
     def __post_init__(self) -> None:
@@ -161,8 +163,13 @@ class DataSet:
                         if size is None:
                             place.discard(f"{folder}/{channel}/{name}")
             else:
-                places = {"mcap": f"bags/{name}.mcap", "parquet": f"points/job={number}"}
-                place.discard(places.get(self.format, f"jobs/{name}"))
+                places = {
+                    "mcap": f"bags/{name}.mcap",
+                    "parquet": f"points/job={number}",
+                    "images": f"images/{name}",
+                    "folder": f"jobs/{name}",
+                }
+                place.discard(places[self.format])
             for file in (SWEEPS_FILE, BOXES_FILE):
                 place.remove([job_file(self.format, name, file)])
 

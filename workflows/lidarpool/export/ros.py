@@ -28,6 +28,7 @@ from ..columns.table import COLOURS
 from ..scene.colours import as_float
 from . import reading
 from .boxes import Boxes
+from .images import Image
 from .sweeps import Placed, Sweeps, plain_names
 
 WORLD, CARRIER = "map", "base_link"  # frames
@@ -53,6 +54,7 @@ _LAYOUTS = {
         "itemsize": 48,
     }),
 }  # fmt: skip
+_LAYOUTS["images"] = _LAYOUTS["velodyne"]
 
 
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
@@ -134,6 +136,12 @@ def _messages(
             rows.nbytes, rows.view(np.uint8).ravel(), True,
         )  # fmt: skip
         yield topic, message, time_ns
+        if layout == "images":
+            ranges = Image.of(sweeps, sweep, points).filled(points["range"])
+            ranges[np.isnan(ranges)] = np.inf  # REP 117: nothing was detected
+            for plane, image in enumerate(ranges, 1):
+                name = f"{topic.removesuffix('points')}range_image{plane if plane > 1 else ''}"
+                yield name, make.image(image[::-1], frame, time_ns), time_ns
         if actors:
             boxes = Boxes.of(sweeps, sweep, points)
             yield "/actors", make.markers(boxes, actors, time_ns), time_ns
@@ -230,7 +238,7 @@ def _rows(
     there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
     light = np.clip(there["intensity"], 0, 1)
     values = dict(zip("xyz", sweeps.in_sensor(sweep, points.positions).T, strict=True))
-    if layout == "velodyne":
+    if layout in ("velodyne", "images"):
         values |= {"intensity": there["intensity"], "ring": there["channel"], "time": since / 1e9}
     elif layout == "autoware":
         values |= {
@@ -287,6 +295,14 @@ class _Messages:
             )
             for parent, name, placed, which in frames
         ])  # fmt: skip
+
+    def image(self, values: NDArray[np.float32], frame: str, time_ns: int) -> Any:
+        """Image of numbers (height, width)."""
+        height, width = values.shape
+        data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()
+        header = self.header(frame, time_ns)
+        image = self._types["sensor_msgs/msg/Image"]
+        return image(header, height, width, "32FC1", 0, 4 * width, data)
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""

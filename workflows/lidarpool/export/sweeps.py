@@ -20,6 +20,7 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
+from ..sensor.described import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
 
@@ -51,6 +52,15 @@ class Placed:
 
 
 @dataclass(frozen=True, eq=False)
+class Fired:
+    """What finds the rays of each sweep, with and without returns."""
+
+    sensors: tuple[Sensor, ...]
+    returns: tuple[int, ...]  # that each sensor reports of a pulse at most; 1 if that is unknown
+    steps: NDArray[np.int64]  # (n,): first time step of each sweep, from that of its station
+
+
+@dataclass(frozen=True, eq=False)
 class Sweeps:
     """All sweeps of a survey. A sweep is the scans of one turn, or of one frame, of a sensor."""
 
@@ -69,6 +79,7 @@ class Sweeps:
     precision_m: float  # step to which positions were rounded
     epsg: int | None = None  # code of the coordinate system of the world
     start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
+    fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -105,6 +116,7 @@ class Sweeps:
         """Return the sweeps of a survey of a scene."""
         path = survey.path
         scans, begins, sensors, places, turns, mounts, done = [], [], [], [], [], [], 0
+        first_steps = []
         for number, (carried, steps) in enumerate(
             zip(survey.carried, survey.steps_each, strict=True)
         ):
@@ -119,6 +131,7 @@ class Sweeps:
                 turns.append(rotations @ turned)
                 begins.append(station * survey.station_ns + since)
                 scans.append(done + firsts)
+                first_steps.append(firsts)
                 done += steps
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
         when = np.concatenate(begins)
@@ -132,6 +145,11 @@ class Sweeps:
             np.stack([a.mesh.vertices.min(axis=0), a.mesh.vertices.max(axis=0)])
             for a in scene.actors
         ]
+        fired = None
+        if survey.keep_every == 1 and any(c.name == "ray" for c in survey.stored_columns):
+            most = tuple(2 if each.mode == "dual" else 1 for each in survey.returns_each)
+            lidars = tuple(carried.sensor for carried in survey.carried)
+            fired = Fired(lidars, most, np.concatenate(first_steps))
         return cls(
             np.append(np.concatenate(scans), done),
             when,
@@ -148,6 +166,7 @@ class Sweeps:
             survey.precision_m,
             survey.epsg,
             None if survey.start is None else nanoseconds(survey.start),
+            fired,
         )
 
     def points(self, cloud: CloudLike, first: int = 0, stop: int | None = None) -> Iterator[Cloud]:
@@ -192,6 +211,10 @@ class Sweeps:
         for prefix, poses in placed.items():
             arrays[f"{prefix}positions"] = poses.positions
             arrays[f"{prefix}quaternions"] = poses.quaternions
+        if self.fired is not None and (told := described(self.fired.sensors, arrays)):
+            rays = {"sensors": told, "returns": self.fired.returns}
+            arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
+            arrays["steps"] = self.fired.steps
         memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
         np.savez_compressed(memory, **arrays)
         return memory.getvalue()
@@ -216,7 +239,13 @@ class Sweeps:
                 Placed(arrays[f"{prefix}positions"], arrays[f"{prefix}quaternions"])
                 for prefix in ("", "mount_", *(f"actor{k}_" for k in range(len(words["actors"]))))
             )
+            fired = None
+            if "rays" in arrays:
+                rays = json.loads(arrays["rays"].tobytes())
+                sensors = remade(rays["sensors"], arrays)
+                fired = Fired(sensors, tuple(rays["returns"]), arrays["steps"])
             return cls(
+                fired=fired,
                 pose=pose,
                 mounts=mounts,
                 actor_poses=tuple(actors),

@@ -5,8 +5,10 @@ It is quick to import: help and completion of the command read it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
+
+from ..base.errors import LidarpoolError
 
 
 @dataclass(frozen=True)
@@ -29,10 +31,12 @@ class FormatRow:
         return self.needs + self.layouts.get(layout, ())
 
 
+_ALL_RAYS = ("ray", "range")  # and every return: see `check_whole`
 LAYOUTS = {
     "velodyne": ("intensity", "time"),
     "autoware": ("intensity", "time", "azimuth", "elevation", "range"),
     "ouster": ("intensity", "time", "reflectivity", "range"),
+    "images": ("intensity", "time", *_ALL_RAYS),
 }
 _COLOURS = ("red", "green", "blue")
 _E57 = ("intensity", *_COLOURS)
@@ -47,6 +51,7 @@ FORMATS = {
     "laz": FormatRow("cloud.laz", "las", False, _LAS),
     "parquet": FormatRow("cloud.parquet", "parquet", True, ("pyarrow",)),
     "pcd": FormatRow("pcd", "pcd", True, ("pypcd4",), ("scan",)),
+    "images": FormatRow("images", "images", True, (), ("scan", *_ALL_RAYS)),
     "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), _E57),
     "kitti": FormatRow("kitti", "kitti", True, (), ("scan", *_LABELS), _LABELS),
     "nuscenes": FormatRow("nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS),
@@ -54,3 +59,12 @@ FORMATS = {
     "rosbag2": FormatRow("rosbag2", "ros", *_BAG),
 }
 EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
+
+
+def check_whole(needs: Iterable[str], keep_every: int) -> None:
+    """Refuse to thin out the returns for a format that shows which rays had none."""
+    if "ray" in needs and keep_every > 1:
+        raise LidarpoolError(
+            f"Range images need every return, and keep_every is {keep_every}: set cloud.keep_every "
+            "to 1."
+        )

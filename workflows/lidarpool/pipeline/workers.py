@@ -140,8 +140,8 @@ class CastingWorkers:
         with sending():
             if scene is None:
                 scene = self._packed("scene", plan.packed_scene())
+            self._scenes[plan.still] = (plan, scene)  # the last used
             rig = self._packed(job, plan.packed(scene.name))
-        self._scenes[plan.still] = (plan, scene)  # the last used
         self._surveys[job] = _Survey(plan, rig, scene)
 
     def remove(self, job: str) -> None:

@@ -25,6 +25,7 @@ from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import sweeps
 from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
+from ..run.identity import OF_CAMPAIGN
 from ..run.job import Job
 from ..run.progress import Show
 from ..run.store import RUN_FOLDER, remove_run
@@ -40,7 +41,7 @@ CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that
 _OWN = re.compile(
     r"run|campaign\.json|dataset\.json|README\.md|report\.(html|json)|pictures|splits|"
     r"jobs\.(csv|parquet)|\.?jobs|sweeps|boxes|sequences|poses|samples|maps|v1\.0-lidarpool|"
-    r"bags|points|job-.+|[0-9a-f]{16}-dataset"
+    r"bags|points|images|job-.+|[0-9a-f]{16}-dataset"
 )
 
 
@@ -199,7 +200,7 @@ def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
             "Install it, or make the job in a folder of its own with --out."
         )
     for name, value in campaign.identity.items():
-        if made["identity"].get(f"campaign: {name}") != value:
+        if made["identity"].get(OF_CAMPAIGN + name) != value:
             raise LidarpoolError(
                 f"{place} is of another campaign: its {name} differs. Make the job in a folder of "
                 "its own with --out."

@@ -35,6 +35,8 @@ _FORMATS = {
     "mcap": "`bags/` has a recording of ROS 2 for each job.",
     "parquet": "`points/` is one table, partitioned by job: "
     '`pyarrow.dataset.dataset("points", partitioning="hive")`.',
+    "images": "`images/` has range images of each job as NumPy archives, also of rays without a "
+    "return.",
     "folder": "`jobs/` has a cloud in PLY for each job, which `lidarpool.read_cloud` reads.",
 }
 

@@ -23,7 +23,8 @@ from ..run.result import RunResult
 from ..run.trials import TRIAL
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.survey import CloudOptions, Weather
+from ..sensor.survey import CloudOptions
+from ..sensor.weather import Weather
 from .cloud_numbers import CountedCloud
 
 ELEVATION_RAYS = 20_000  # whose elevations are examined

@@ -11,7 +11,6 @@ from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from types import MappingProxyType
 from typing import Any
 
 from distributed import Client, Future
@@ -33,6 +32,7 @@ from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet
 from ..export.jobs import JobRow, Tally, Value
 from ..export.sweeps import Sweeps
+from ..export.table import check_whole
 from ..pipeline import EXPORT, INTERSECT, LIDAR, Crew, JobError, SurveyDriver
 from ..pipeline.failures import raise_if_failed, was_killed
 from ..pipeline.task_book import StageTotals, TaskBook
@@ -51,7 +51,6 @@ ANNOUNCED = 2  # jobs whose scans stage 1 has yet to describe
 SPARE = 8  # jobs under way beside two for each GPU slot
 WRITING = 2  # jobs that wait to be written, for each free slot of LIDAR
 BEGIN_S = 10.0  # for any job to begin to be written; then the driver writes one
-SENSORS_TOLD = 8  # kinds of a sensor that are named
 STOP_S = 10.0  # for a job that is being made when the run ends
 
 
@@ -64,7 +63,6 @@ class Entry:
     store: RunStore
     sweeps: Sweeps
     driver: SurveyDriver | None = None
-    row: JobRow | None = None
     casting: float = 0.0  # seconds of its tasks
 
     @property
@@ -117,12 +115,12 @@ class CampaignPage:
 
 @dataclass(frozen=True)
 class CampaignRun:
-    """What a campaign has given.
+    """What `Campaign.run` returns.
 
     Parameters
     ----------
     failed
-        Rows of the jobs that have failed.
+        Jobs that have failed, with `number`, `name`, `values` and `error`; see `jobs.csv`.
     done, points, rays
         Jobs in the data set, their points, and the rays that were cast for them.
     casting_seconds
@@ -134,7 +132,7 @@ class CampaignRun:
     stages
         Tasks of each stage.
     notes, sensors
-        Remarks for the user, and the sensors, {name: what it is}.
+        Remarks for the user, and the sensors of the jobs that are done, {name: models and rates}.
     """
 
     failed: tuple[JobRow, ...]
@@ -165,6 +163,7 @@ def described_job(
         assert described.made is not None, "either of both"
         backend = options.pop("backend", None) or "auto"
         job = Job(described.made.scene, described.made.survey, backend=backend, **options)
+    check_whole(columns, job.survey.keep_every)
     there = {column.name for column in job.survey.stored_columns}
     if missing := [name for name in columns if name not in there]:
         survey = replace(job.survey, columns=(*job.survey.columns, *missing))
@@ -230,7 +229,10 @@ class _Maker:
             told = str(error) if isinstance(error, LidarpoolError) else repr(error)
             name = described.name if described else f"{number:04}"
             return failed_row(number, name, told, described)
-        return Entry(described, job, self._store.store_of(described.name, job), sweeps)
+        try:
+            return Entry(described, job, self._store.store_of(described.name, job), sweeps)
+        except JobError as error:  # any other is of the place, which all jobs need
+            return failed_row(number, described.name, error, described)
 
     def _put(self, found: Entry | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():
@@ -265,7 +267,8 @@ def write_job(
     (place, *probe), (parts, *other) = probes
     if not place.sees(*probe) or not parts.sees(*other):
         return None, recorder.done()
-    return _written(dataset, number, name, cloud, sweeps), recorder.done(len(sweeps))
+    written = _written(dataset, number, name, cloud, sweeps)
+    return written, recorder.done(int(sweeps.scans[-1]))
 
 
 def _written(
@@ -407,9 +410,6 @@ class CampaignDriver(Surveys):
         self._committed = 0
         self._begun = (0, 0)  # jobs, and their scans
         self.books = TaskBook()
-        self.casting = 0.0
-        self.points = self.scans_done = 0
-        self.sensors: dict[str, str] = {}
 
     @property
     def finished(self) -> bool:
@@ -481,10 +481,9 @@ class CampaignDriver(Surveys):
                 continue
             try:
                 self._cluster.check(found.job)
-            except LidarpoolError as error:
+                self._begin(found)
+            except JobError as error:  # too large for the workers, or it cannot be pickled
                 self._fail(found, error)
-                continue
-            self._begin(found)
         return moved
 
     @property
@@ -540,13 +539,11 @@ class CampaignDriver(Surveys):
             seconds=entry.casting,
             **made,
         )
-        for carried in survey.carried:
-            sensor, name = carried.sensor, carried.name or "lidar"
-            words = f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz"
-            told = self.sensors.setdefault(name, words).split("; ")
-            if words not in told and len(told) <= SENSORS_TOLD:
-                more = words if len(told) < SENSORS_TOLD else "and others"
-                self.sensors[name] = "; ".join([*told, more])
+        self._store.name_sensors(
+            (carried.name or "lidar", f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz")
+            for carried in survey.carried
+            for sensor in [carried.sensor]
+        )
         self._commit(row)
         self._drop(entry, row)
 
@@ -677,7 +674,7 @@ def run_campaign(
     notes = [*cluster.notes]
     if writer.hidden:
         notes.append(f"no worker of {LIDAR} sees {dataset.place}: the driver wrote the data set")
-    return run_result(store.rows(), started, stages, notes, driver.sensors, store)
+    return run_result(store.rows(), started, stages, notes, store)
 
 
 def _first(maker: _Maker, store: CampaignStore, page: CampaignPage) -> Entry | None:
@@ -710,7 +707,6 @@ def run_result(
     started: float,
     stages: tuple[StageTotals, ...] = (),
     notes: Sequence[str] = (),
-    sensors: Mapping[str, str] = MappingProxyType({}),
     store: CampaignStore | None = None,
 ) -> CampaignRun:
     """Sum up the rows of a campaign."""
@@ -731,5 +727,5 @@ def run_result(
         time.monotonic() - started,
         stages,
         (*(store.notes if store else ()), *notes),
-        sensors,
+        store.sensors if store else {},
     )

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import json
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
@@ -13,8 +14,11 @@ from ..base.storage import Storage
 from ..columns.parts import files_of
 from ..export.jobs import JobRow
 from ..pipeline.database import RunDatabase, mark_of_folder, parts_folder
+from .identity import OF_CAMPAIGN
 from .job import Job
 from .store import JOBS, KeptRun, RunStore, remove_run
+
+SENSORS_TOLD = 8  # kinds of a sensor that are named
 
 
 class CampaignStore(KeptRun):
@@ -34,7 +38,7 @@ class CampaignStore(KeptRun):
         resume: bool = False,
     ) -> None:
         self.count = count
-        whole = software() | {f"campaign: {name}": value for name, value in identity.items()}
+        whole = software() | {OF_CAMPAIGN + name: value for name, value in identity.items()}
         super().__init__(whole, 0, backend, place, parts, resume=resume)
         self.resumed = len(self.db.jobs)  # jobs of an earlier run
 
@@ -52,11 +56,6 @@ class CampaignStore(KeptRun):
         """Numbers of the jobs that have not ended."""
         return [number for number in range(self.count) if number not in self.db.jobs]
 
-    @property
-    def failed(self) -> int:
-        """How many jobs have failed."""
-        return sum(self.db.jobs.values())
-
     def forget_failed(self) -> None:
         """Let the jobs that have failed be done again."""
         self.db.forget_failed_jobs()
@@ -71,6 +70,23 @@ class CampaignStore(KeptRun):
     def end(self, row: JobRow) -> None:
         """Commit that a job has ended."""
         self.db.end_job(row.number, asdict(row), failed=bool(row.error))
+
+    @property
+    def sensors(self) -> dict[str, str]:
+        """Sensors of the jobs that are done, {name: models and rates}."""
+        found: dict[str, str] = json.loads(self.db.meta.get("sensors", "{}"))
+        return found
+
+    def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
+        """Keep names of sensors with model and rate, for the card of the data set."""
+        kept = self.sensors
+        for name, words in sensors:
+            told = kept.setdefault(name, words).split("; ")
+            if words not in told and len(told) <= SENSORS_TOLD:
+                more = words if len(told) < SENSORS_TOLD else "and others"
+                kept[name] = "; ".join([*told, more])
+        if kept != self.sensors:
+            self.db.set(sensors=json.dumps(kept))
 
     # -- jobs under way --------------------------------------------------------------------
 

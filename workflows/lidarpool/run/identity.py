@@ -5,14 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import fields
 
+from ..base.errors import LidarpoolError
 from ..base.fingerprint import fingerprint
 from ..base.software import software
+from ..pipeline import JobError
 from ..scenario.sections import TaskOptions
 from .job import Job
 
 # Fields of a job that do not change a result: a run may go on with others. Every other field is
 # part of its identity, with all of its own fields.
 _MAY_CHANGE = {*TaskOptions.__dataclass_fields__, "wait_s", "patience_s"}
+OF_CAMPAIGN = "campaign: "  # before names of the content of a campaign
 
 
 def identity_of(job: Job) -> dict[str, str]:
@@ -20,10 +23,13 @@ def identity_of(job: Job) -> dict[str, str]:
 
     The software of the workers that cast is no part of it: see `RunStore.casting`.
 
-    LidarpoolError if a sensor, column or trajectory has a field without a fingerprint.
+    JobError if a sensor, column or trajectory has a field without a fingerprint.
     """
     names = [field.name for field in fields(job) if field.name not in _MAY_CHANGE]
-    return software() | {name: fingerprint(getattr(job, name)) for name in names}
+    try:
+        return software() | {name: fingerprint(getattr(job, name)) for name in names}
+    except LidarpoolError as error:
+        raise JobError(str(error)) from error
 
 
 def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
@@ -32,5 +38,7 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
         if there.get(name) != value:
             if name in Job.__dataclass_fields__:
                 return f"it is of another {name}"
+            if name.startswith(OF_CAMPAIGN):
+                return f"it is of another campaign: its {name.removeprefix(OF_CAMPAIGN)} differs"
             return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
     return ""

@@ -122,7 +122,7 @@ class Campaign:
     seed
         Another seed gives other random numbers.
     keep
-        Format of the data set: "kitti", "nuscenes", "mcap", "parquet" or "folder"; or
+        Format of the data set: "kitti", "nuscenes", "mcap", "parquet", "images" or "folder"; or
         ``{"format": "mcap", "layout": "ouster"}``.
     splits
         {name: share of the jobs}; they add up to 1.

@@ -22,7 +22,7 @@ from .draws import SHARE_LEAST, SIGMAS, Draw
 from .sections import Section, told
 
 COUNT_MOST = 10_000_000
-KEPT = ("kitti", "nuscenes", "mcap", "parquet", "folder")
+KEPT = ("kitti", "nuscenes", "mcap", "parquet", "images", "folder")
 Value = bool | int | float | str  # in the table of jobs
 
 _SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
@@ -259,7 +259,7 @@ class Keep:
 
     format: Annotated[
         Literal[KEPT],  # type: ignore[valid-type]
-        Field(description="kitti, nuscenes, mcap, parquet; folder: a cloud for each job"),
+        Field(description="kitti, nuscenes, mcap, parquet, images; folder: a cloud for each job"),
     ] = "kitti"
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]

@@ -21,6 +21,7 @@ from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
+from ..export.table import check_whole
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor, box, one_mesh
@@ -710,7 +711,8 @@ class Scenario(Section):
             cloud = dict(self.cloud) | {"columns": (*self.cloud.columns, *self.output.needs)}
             cloud["epsg"] = self.cloud.epsg or self._epsg
             if self.scene.has_seed and cloud["keep_every"] is None:
-                cloud["keep_every"] = SEED_KEPT
+                cloud["keep_every"] = 1 if "ray" in self.output.needs else SEED_KEPT
+            check_whole(self.output.needs, cloud["keep_every"] or 1)
             alone = not self.sensors and self.mount is None
             return Survey(
                 poses=poses,

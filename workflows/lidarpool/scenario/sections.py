@@ -31,7 +31,8 @@ from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
 from ..sensor.models import load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
-from ..sensor.survey import CloudOptions, Weather
+from ..sensor.survey import CloudOptions
+from ..sensor.weather import Weather
 
 COPIES_MOST = 1_000_000  # of one entry
 
@@ -469,7 +470,7 @@ class NoiseSection(Section, Noise):
 
 
 class WeatherSection(Section, Weather):
-    """Extinction of the air."""
+    """Extinction of the air, and returns from it."""
 
 
 class Obstacle(Section):

@@ -70,6 +70,15 @@ class Noise:
         ),
     ] = None
     seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
+    overlap_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1000,
+            description="from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "and dust do not return more",
+        ),
+    ] = 10.0
 
     @property
     def threshold(self) -> float:
@@ -86,6 +95,13 @@ class Noise:
     def displaces(self) -> bool:
         """Whether directions or ranges deviate."""
         return self.angle_deg > 0 or self.range_m > 0 or self.range_per_m > 0
+
+    @property
+    def threshold(self) -> float:
+        """Energy of which half of the returns are detected; 0 if all are."""
+        if self.detection_range_m is None:
+            return 0.0
+        return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     def ranges(self, distance: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
         """Return the reported ranges of returns (n,), metres, at least 0."""

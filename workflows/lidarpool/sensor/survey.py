@@ -25,17 +25,19 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
-from .materials import Material, extinction
+from .materials import Material
 from .noise import Noise
 from .optics import WINDOW_SIGMAS, Precision, Returns
 from .sensor import Sensor
 from .trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
+from .weather import EXIT_M, FAINTEST, Air, Weather, reach
 
 STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
 Steps = Annotated[int, Field(ge=1, le=STEPS_MOST)]
 OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
 SENSORS_MOST = 255  # the type of the column
+PARTICLES_MOST = 100  # that a pulse may return from
 RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
 LASTS_MOST_NS = 2.0**63  # the type of the column time: 292 years
@@ -104,21 +106,6 @@ class ScanSpec:
     def ray_count(self) -> int:
         """Rays in this scan."""
         return (self.firings[1] - self.firings[0]) * self.channels
-
-
-@dataclass(frozen=True, kw_only=True)
-class Weather:
-    """Extinction of the air."""
-
-    visibility_km: Annotated[
-        float | None,
-        Field(
-            ge=0.001,
-            le=1e6,
-            description="meteorological visibility; by default without extinction",
-            examples=[10.0],
-        ),
-    ] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -222,7 +209,7 @@ class Survey(CloudOptions, Weather):
     noise
         Noise of ranges and angles, and lost returns.
     **options
-        The fields of `Weather` and `CloudOptions`, such as `visibility_km` and `keep_every`.
+        The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
     Raises
     ------
@@ -301,6 +288,29 @@ class Survey(CloudOptions, Weather):
                         f"waveform_samples is {self.waveform_samples}, and one echo takes {least} "
                         f"samples of {returns.sample_ns:g} ns: record as many at least."
                     )
+        if self.returns_light:
+            for number in range(len(self.carried)):
+                self._check_air(number)
+
+    def _check_air(self, number: int) -> None:
+        """Check that a sensor says what it detects, and that this is not too much."""
+        carried = self.carried[number]
+        sensor, name = carried.sensor, f" of {carried.name}" if carried.name else ""
+        if self.noise_each[number].detection_range_m is None:
+            raise LidarpoolError(
+                f"Rain, snow, dust and fog that return light need noise.detection_range_m{name}: "
+                "it says what the sensor detects. A data sheet has it as the range at 10 %."
+            )
+        wide = (self.returns_each[number].divergence_mrad, sensor.optics.divergence_mrad)
+        if self.particles and wide == (None, None):
+            raise LidarpoolError(
+                f"Rain and snow need the width of the beam{name}: give returns.divergence_mrad."
+            )
+        if (met := self.met(number)) > PARTICLES_MOST:
+            raise LidarpoolError(
+                f"A pulse{name} would return from {met:,.0f} drops or flakes, more than "
+                f"{PARTICLES_MOST}: make rain_mm_h, snow_mm_h or noise.detection_range_m smaller."
+            )
 
     def _check_duration(self, sensor: Sensor, steps: int) -> None:
         """Check that the trajectory lasts as long as a sensor, and that its numbers do not end."""
@@ -355,7 +365,22 @@ class Survey(CloudOptions, Weather):
 
     def extinction(self, sensor: Sensor) -> float:
         """Extinction of the air for a sensor's light, 1/m."""
-        return extinction(self.visibility_km, sensor.optics.wavelength_nm)
+        return self.takes(sensor.optics.wavelength_nm)
+
+    def air(self, number: int) -> Air:
+        """Air as a sensor sees it."""
+        optics = self.carried[number].sensor.optics
+        divergence, _ = self.returns_each[number].of(optics)
+        overlap_m = self.noise_each[number].overlap_m
+        return Air(self.takes(optics.wavelength_nm), EXIT_M, divergence, overlap_m)
+
+    def met(self, number: int) -> float:
+        """Count drops and flakes that a pulse of a sensor may return from, on the average."""
+        if not self.particles:
+            return 0.0
+        sensor, least = self.carried[number].sensor, FAINTEST * self.noise_each[number].threshold
+        air, span = self.air(number), reach(sensor.min_range_m, sensor.max_range_m)
+        return sum(air.met(kind, least, *span) for kind in self.particles)
 
     @cached_property
     def steps_each(self) -> tuple[int, ...]:

@@ -17,6 +17,7 @@ from ..sensor import Returns, Sensor, Survey
 from ..sensor.disc import disc
 from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import Mode, spread
+from .air import AirCaster
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products
 from .paths import Paths
@@ -58,6 +59,7 @@ class EchoCaster:
         self._sensor = survey.carried[number].sensor
         self._returns, self._noise = survey.returns_each[number], survey.noise_each[number]
         self._paths = Paths(caster, scene, survey, self._sensor, surfaces)
+        self._air = AirCaster(number, survey, surfaces) if survey.returns_light else None
         # Whether each ray that hits something has one return.
         self._finds = self._returns.waveform != "none"  # returns in waveforms
         self._records = survey.waveform_samples  # of each return
@@ -120,6 +122,8 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window)
+                if self._air is not None:
+                    hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
                 if self._finds:
                     assert self._digitizer is not None
                     returns = returns_in(hits, self._digitizer, len(beam), planes)

@@ -32,6 +32,7 @@ POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, an
 SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
+AIR, AIR_HIT = 110, 200  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # A hit of those whose waveforms are searched at a time, by how returns are found; up to twice the
@@ -66,9 +67,10 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     made_there = on_device and plain and not (passing or dark or recorded)
     by_numpy = not made_there or needs_hits(survey)
     most = 0.0
-    for carried, steps, reported, noise in zip(
+    each = zip(
         survey.carried, survey.steps_each, survey.returns_each, survey.noise_each, strict=True
-    ):
+    )
+    for number, (carried, steps, reported, noise) in enumerate(each):
         sensor, subrays = carried.sensor, reported.subrays
         waves = survey.waveform_samples > 0 or reported.waveform != "none"
         echoes = subrays > 1 or noise.loses or passing or dark or waves
@@ -76,7 +78,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         first, stop = sensor.firings(0)
         firings = (stop - first) * scans
         rays = firings * sensor.channels
-        returns = rays * (RETURNS if several else 1)
+        in_air = 0.0  # hits of a pulse
+        if survey.returns_light:
+            in_air = survey.met(number) + bool(survey.scatters(sensor.optics.wavelength_nm))
+        more = {"all": in_air, "dual": min(in_air, 1.0)}.get(reported.mode, 0.0)
+        returns = rays * max(RETURNS if several else 1, 1 + more)
         points = returns / survey.keep_every
         repeats, by_head = rays_repeat(sensor, survey.path.moves)
         poses = firings if survey.path.moves or by_head else 0
@@ -91,6 +97,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
             found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            if survey.returns_light:
+                found += AIR * chunk + AIR_HIT * in_air * chunk / subrays
             found += SEARCHED[reported.waveform] * min(chunk, BLOCK_HITS) * (subrays > 1)
             every = RETURN_ALL * returns + RETURN_KEPT * points
             if recorded:

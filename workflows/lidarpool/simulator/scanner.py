@@ -58,7 +58,8 @@ class Scanner:
         What is scanned.
     sensor
         The lidar, or the lidar `Mounted` on a carrier: then poses are the carrier's.
-    columns, precision_m, coordinates, materials, returns, noise, visibility_km
+    columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
+    fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3
         As of `Survey`.
     backend
         "cuda", "embree", "numpy", or "auto" for the first of these that can be used.
@@ -95,6 +96,10 @@ class Scanner:
         returns: Returns | None = None,
         noise: Noise | None = None,
         visibility_km: float | None = None,
+        fog_lidar_ratio_sr: float | None = None,
+        rain_mm_h: float = 0.0,
+        snow_mm_h: float = 0.0,
+        dust_mg_m3: float = 0.0,
         backend: str = "auto",
         threads: int | None = None,
         device: int | None = None,
@@ -110,6 +115,10 @@ class Scanner:
             returns=returns or Returns(),
             noise=noise or Noise(),
             visibility_km=visibility_km,
+            fog_lidar_ratio_sr=fog_lidar_ratio_sr,
+            rain_mm_h=rain_mm_h,
+            snow_mm_h=snow_mm_h,
+            dust_mg_m3=dust_mg_m3,
         )
         check_backend_here(backend)
         warn_of_grey(scene, survey)

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..sensor.disc import neighbours
-from .hits import Hits, Planes, Real, Whole, numbers, runs
+from .hits import NO_SURFACE, Hits, Planes, Real, Whole, numbers, runs
 from .motion import products
 
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
@@ -75,13 +75,16 @@ def continued(
     """
     beam = hits.ray // each
     # The hit of each sub-ray, after so many panes of glass: a row for each beam and number of them.
-    order = np.argsort(hits.ray, kind="stable")
-    panes = np.empty(len(beam), np.int64)
+    solid = np.flatnonzero(hits.triangle != NO_SURFACE)
+    if not len(solid):
+        return np.zeros(len(beam), np.bool_)
+    order = solid[np.argsort(hits.ray[solid], kind="stable")]
+    panes = np.zeros(len(beam), np.int64)
     panes[order] = numbers(hits.ray[order])
     most = int(panes.max()) + 1
     row = (np.cumsum(np.diff(beam, prepend=beam[0]) != 0)) * most + panes
     table = np.full((int(row.max()) + 1, each), -1)
-    table[row, hits.ray % each] = np.arange(len(beam))
+    table[row[solid], hits.ray[solid] % each] = solid
     one, other = table[:, neighbours(each)].reshape(-1, 2).T
     number = np.cumsum(new)
     pair = (one >= 0) & (other >= 0) & (number[one] != number[other])

@@ -1,0 +1,23 @@
+"""Dust that returns light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.effects import _air
+from lidarpool import Survey
+
+DRAWS = "effect-dust.png"
+WEATHER = {"dust_mg_m3": 100.0}
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey in it."""
+    return _air.on(survey, **WEATHER)
+
+
+def picture(path: Path) -> None:
+    """Draw a street in it, and the energies against range."""
+    figure, right = _air.page("100 mg/m³ of dust", WEATHER, 25.0)
+    _air.energies(right, WEATHER)
+    _air.save(figure, path)

@@ -1,0 +1,23 @@
+"""Rain that returns light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.effects import _air
+from lidarpool import Survey
+
+DRAWS = "effect-rain.png"
+WEATHER = {"rain_mm_h": 50.0}
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey in it."""
+    return _air.on(survey, **WEATHER)
+
+
+def picture(path: Path) -> None:
+    """Draw a street in it, and the numbers of returns against range."""
+    figure, right = _air.page("50 mm/h of rain", WEATHER, 12.0)
+    _air.counts(right, WEATHER, 6.0)
+    _air.save(figure, path)

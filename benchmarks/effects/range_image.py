@@ -1,0 +1,106 @@
+"""Range images: rays that hit nothing, and rays whose return is lost, of a turn in a street."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from matplotlib.colors import ListedColormap, LogNorm
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+
+from lidarpool import Material, Noise, Survey, load_sensor
+from lidarpool.columns.table import SCAN
+from lidarpool.export.formats import Format
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.scene.city import city
+from lidarpool.scene.scene import Scene
+from lidarpool.simulator.batch import columns_of
+from lidarpool.simulator.rig import Rig
+
+DRAWS = "effect-range-image.png"
+SKY, LOST = "#dfe5ec", "#e0182d"
+MATERIALS = (
+    Material("*", 0.12), Material("ground", 0.1), Material("pavement", 0.25),
+    Material("building-*", 0.35),
+    *(Material(f"{tree}*", 0.45) for tree in ("Birch", "Maple", "Oak", "Pine", "Spruce")),
+)  # fmt: skip
+NOISE = Noise(detection_range_m=45, dropout=0.01)
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with the columns that range images need."""
+    return replace(survey, columns=(*survey.columns, "ray", "range"))
+
+
+def image_of(scene: Scene, survey: Survey) -> dict[str, np.ndarray]:
+    """Return the range image of the first sweep, as its file has it."""
+    rig = Rig(scene, survey)
+    part = columns_of(list(rig.cast(0, survey.scan_count)))
+    cloud = part.cloud((SCAN, *survey.stored_columns[3:]), survey.precision_m, scene.origin)
+    with tempfile.TemporaryDirectory() as folder:
+        Format("images").write(Path(folder, "images"), cloud, Sweeps.of(survey, scene))
+        return dict(np.load(Path(folder, "images/lidar/000000.npz")).items())
+
+
+def picture(path: Path) -> None:
+    """Draw a turn of an OS1-128 without and with a threshold of detection."""
+    scene = city(200_000, trees=60, cars=60)
+    sensor = load_sensor("ouster/os1-128", max_range_m=170)
+    survey = on(Survey(sensor, poses=[(45, 1, 2)], steps=36, materials=MATERIALS))
+    clear = image_of(scene, survey)
+    noisy = image_of(scene, replace(survey, noise=NOISE))
+
+    figure = Figure((11, 5.2), dpi=110)
+    norm = LogNorm(3, 170)
+    shown = (
+        (clear, "every hit returns"),
+        (noisy, "10 % of reflectance detected to 45 m, 1 % of the returns lost"),
+    )
+    # The beams of a firing look to four sides, so each row has an order of its own; the left of the
+    # sensor is on the left.
+    order = np.argsort(-clear["azimuth"], axis=1)
+    extent = (360.0, 0.0, *np.degrees(sensor.beams.elevation[[0, -1]]))
+    for number, (image, title) in enumerate(shown):
+        axes = figure.add_axes((0.062, 0.56 - 0.44 * number, 0.835, 0.33))
+        ranges, without = (
+            np.take_along_axis(one["range"], order, axis=1)[::-1] for one in (image, clear)
+        )
+        hits = np.isfinite(without)
+        lost = hits & np.isnan(ranges)
+        axes.set_facecolor(SKY)
+        axes.imshow(
+            ranges, cmap="viridis_r", norm=norm, extent=extent, aspect="auto",
+            interpolation="nearest",
+        )  # fmt: skip
+        axes.imshow(
+            np.where(lost, 1.0, np.nan), cmap=ListedColormap([LOST]), extent=extent,
+            aspect="auto", interpolation="nearest",
+        )  # fmt: skip
+        rays, returned = ranges.size, int(np.isfinite(ranges).sum())
+        axes.set_title(
+            f"{title}: {rays:,} rays, {returned:,} returns, {int((~hits).sum()):,} hit nothing"
+            + (f", {int(lost.sum()):,} lost" if lost.any() else ""),
+            fontsize=9.5, loc="left",
+        )  # fmt: skip
+        axes.set_xticks(range(0, 361, 45))
+        axes.set_yticks((-20, -10, 0, 10, 20))
+        axes.set_ylabel("elevation (°)", fontsize=9)
+        axes.tick_params(labelsize=8.5)
+        if number:
+            axes.set_xlabel("azimuth (°), counter-clockwise from the street", fontsize=9)
+    bar = figure.add_axes((0.912, 0.12, 0.014, 0.77))
+    scale = matplotlib.cm.ScalarMappable(norm, "viridis_r")
+    figure.colorbar(scale, bar, ticks=(3, 5, 10, 20, 50, 100, 170), format="%g")
+    bar.set_ylabel("range (m)", fontsize=9)
+    bar.tick_params(labelsize=8.5)
+    keys = [
+        Line2D([], [], marker="s", ls="", color=colour, mec="#9aa4b0", mew=0.5, label=words)
+        for colour, words in ((SKY, "no return: nothing within range"), (LOST, "return lost"))
+    ]
+    figure.legend(handles=keys, loc="upper right", ncols=2, fontsize=9, frameon=False)
+    figure.text(0.062, 0.957, "Range image of a turn of an OS1-128", fontsize=12, weight="bold")
+    figure.savefig(path)

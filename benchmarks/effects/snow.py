@@ -1,0 +1,23 @@
+"""Snow that returns light."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from benchmarks.effects import _air
+from lidarpool import Survey
+
+DRAWS = "effect-snow.png"
+WEATHER = {"snow_mm_h": 1.0}
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey in it."""
+    return _air.on(survey, **WEATHER)
+
+
+def picture(path: Path) -> None:
+    """Draw a street in it, and the numbers of returns against range."""
+    figure, right = _air.page("1 mm/h of snow", WEATHER, 20.0)
+    _air.counts(right, WEATHER, 16.0)
+    _air.save(figure, path)

@@ -1,0 +1,379 @@
+"""Rain, snow, fog and dust: what they take, and what they send back, against closed forms."""
+
+import math
+from itertools import pairwise
+from statistics import NormalDist
+
+import numpy as np
+import pytest
+
+from lidarpool import (
+    Beams,
+    LidarpoolError,
+    Material,
+    Mounted,
+    Noise,
+    Optics,
+    Returns,
+    Scene,
+    Sensor,
+    Spin,
+    Survey,
+)
+from lidarpool.columns.table import CAUSES
+from lidarpool.scene.mesh import Mesh
+from lidarpool.sensor.materials import extinction
+from lidarpool.sensor.weather import EXIT_M, dust, rain, snow
+from lidarpool.simulator import echoes
+from lidarpool.simulator.air import highest
+from lidarpool.simulator.rig import Rig
+from raybeam import available_backends
+
+SEEN = Noise(detection_range_m=100)
+THRESHOLD = 0.1 * (10 / 100) ** 2
+DIVERGENCE = 0.003
+ALL = Returns("all", divergence_mrad=1000 * DIVERGENCE, pulse_ns=0)
+NOTHING = Mesh("Nothing", np.array([[0, 0, -9], [1, 0, -9], [0, 1, -9.0]]), np.array([[0, 1, 2]]))
+COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "cause", "class")
+AIR = CAUSES.index("air")
+CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
+
+
+def wall(name, x, y=(-50.0, 50.0)):
+    """A rectangle across the x axis."""
+    corners = [[x, y[0], -50], [x, y[1], -50], [x, y[1], 50], [x, y[0], 50]]
+    return Mesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def beams(rays=20_000, max_range_m=200.0, min_range_m=0.5, **optics):
+    """A sensor that fires so many beams along x, or all around if they are many."""
+    optics = {"divergence_mrad": 1000 * DIVERGENCE, **optics}
+    firings = -(-rays // 50_000)
+    return Sensor(
+        Beams(np.zeros(rays // firings)), Spin(firings, 360), min_range_m, max_range_m,
+        optics=Optics(**optics),
+    )  # fmt: skip
+
+
+def survey_of(sensor=None, **options):
+    """One scan from the origin, with all returns."""
+    options = {"noise": SEEN, "returns": ALL, "columns": COLUMNS, "steps": 1, **options}
+    return Survey(sensor or beams(), poses=[(0, 0, 0)], **options)
+
+
+def cast(meshes=(NOTHING,), sensor=None, backend="numpy", **options):
+    """Points of a survey, by column."""
+    survey = survey_of(sensor, **options)
+    found = list(Rig(Scene.from_meshes(meshes), survey, backend).cast(0, survey.scan_count))
+    return {
+        column.name: np.concatenate([column.make(batch) for batch in found])
+        for column in survey.stored_columns
+    }
+
+
+def same(one, other):
+    return all(np.array_equal(one[name], other[name]) for name in one)
+
+
+# -- what is taken ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("mm_h", [1.0, 5.0, 20.0, 50.0])
+def test_rain_takes_what_was_published(mm_h):
+    """Of Marshall and Palmer's drops: 1.45 R^0.64 dB/km by Ulbrich and Atlas (1985)."""
+    published = 1.45 * mm_h**0.64 * math.log(10) / 10  # 1/km
+    assert 1000 * rain(mm_h).extinction == pytest.approx(published, rel=0.1)
+    by_hand = math.pi * 8000e-6 / (4.1 * mm_h**-0.21) ** 3  # 2 · π/4 · N0 · 2/Λ³
+    assert rain(mm_h).extinction == pytest.approx(by_hand)
+
+
+@pytest.mark.parametrize("mm_h", [0.5, 1.0, 3.0])
+def test_snow_falls_as_fast_as_flakes_do(mm_h):
+    """The water in the air of Gunn and Marshall, and what reaches the ground: 1 m/s."""
+    kind, density = snow(mm_h), 0.1
+    water = density * math.pi / 6 * kind.number * 6 / kind.slope**4 * 1e-9  # m³ in m³
+    assert mm_h / 1000 / 3600 / water == pytest.approx(1.0, rel=0.08)
+
+
+def test_dust_takes_and_returns_in_proportion_to_its_mass():
+    assert dust(10.0) == pytest.approx((0.006, 0.006 / 60))
+    found = cast([wall("W", 60)], dust_mg_m3=2, noise=Noise(detection_range_m=50))
+    assert found["intensity"][0] == pytest.approx(0.5 / 36 * math.exp(-2 * 0.0012 * 60))
+
+
+def test_what_the_air_takes_is_not_in_the_reflectivity():
+    weather = {"visibility_km": 0.5, "rain_mm_h": 10, "snow_mm_h": 0.1, "dust_mg_m3": 1}
+    # What returns from less than half of the range is too little to be detected.
+    noise = Noise(detection_range_m=20)
+    clear, dull = (cast([wall("W", 12)], noise=noise, **some) for some in ({}, weather))
+    wet = [one.extinction for one in (rain(10), snow(0.1))]
+    alpha = extinction(0.5, 905) + sum(wet) + dust(1)[0]
+    assert dull["reflectivity"][0] == pytest.approx(clear["reflectivity"][0])
+    assert clear["intensity"][0] * math.exp(-24 * alpha) == pytest.approx(dull["intensity"][0])
+
+
+# -- drops and flakes ------------------------------------------------------------------------------
+
+
+def expected(number, slope, largest_mm, reflectance, alpha, edges, brighter=0.0):
+    """Returns of a pulse in ranges, by integration over size and range, written out.
+
+    Of those `brighter` times as strong as the threshold.
+    """
+    detected = np.vectorize(NormalDist().cdf, otypes=[float])
+    size = np.linspace(0, largest_mm, 3001)[1:]
+    counts = []
+    for begin, end in pairwise(edges):
+        rates = []
+        for r in np.linspace(begin, end, 9):
+            wide = math.hypot(EXIT_M, DIVERGENCE * r)
+            energy = reflectance * (10 / max(r, 10)) ** 2 * math.exp(-2 * alpha * r)
+            energy = energy * np.minimum(size / 1000 / wide, 1) ** 2
+            drawn = energy >= max(0.5, brighter) * THRESHOLD
+            seen = number * np.exp(-slope * size[drawn])
+            seen = seen * detected(5 * (energy[drawn] / THRESHOLD - 1))
+            rates.append(math.pi / 4 * wide**2 * seen.sum() * (size[1] - size[0]))
+        counts.append(np.trapezoid(rates, dx=(end - begin) / 8))
+    return np.array(counts)
+
+
+@pytest.mark.parametrize(
+    ("weather", "rays", "given"),
+    [
+        ({"rain_mm_h": 50.0}, 200_000, (8000, 4.1 * 50**-0.21, 6, 0.02358)),
+        (
+            {"snow_mm_h": 0.4},
+            20_000,
+            (3800 * 0.4**-0.87 / 10 ** (1 / 3), 2.55 * 0.4**-0.48 / 10 ** (1 / 3), 20, 0.2513),
+        ),
+    ],
+    ids=["rain", "snow"],
+)
+@pytest.mark.parametrize("brighter", [0.0, 1.5])
+def test_numbers_of_returns_against_range(weather, rays, given, brighter):
+    """Within four standard deviations in each range, and in all of them together."""
+    kind = rain(50) if "rain_mm_h" in weather else snow(0.4)
+    edges = np.array([0.5, 2, 4, 6, 8, 10, 12, 16, 24])
+    found = cast(sensor=beams(rays), **weather)
+    assert (found["cause"] == AIR).all() and (found["object"] == -1).all()
+    strong = found["intensity"] >= brighter * THRESHOLD
+    counts, _ = np.histogram(found["range"][strong], edges)
+    means = rays * expected(*given, kind.extinction, edges, brighter)
+    assert means.sum() > 150
+    assert (np.abs(counts - means) <= 4 * np.sqrt(means) + 1).all(), (counts, means)
+    assert abs(counts.sum() - means.sum()) <= 3 * math.sqrt(means.sum())
+    assert found["range"].max() < 40
+
+
+def test_pulses_meet_a_number_of_flakes_that_is_poissons():
+    found = cast(snow_mm_h=1.0, noise=Noise(detection_range_m=200))
+    each = np.bincount(found["ray"], minlength=20_000)
+    mean = each.mean()
+    assert 3 < mean < 8
+    assert each.var() == pytest.approx(mean, rel=0.05)
+    none = math.exp(-mean)
+    assert (each == 0).mean() == pytest.approx(none, abs=4 * math.sqrt(none / 20_000))
+    assert found["return_number"].max() == each.max(), "all of them are reported"
+
+
+def test_more_rain_returns_more_and_takes_more():
+    amounts = [2.0, 10.0, 40.0, 150.0]
+    counts = [len(cast(sensor=beams(100_000), rain_mm_h=one)["range"]) for one in amounts]
+    assert counts == sorted(counts) and counts[0] < counts[-1] / 20
+    assert np.diff([rain(one).extinction for one in amounts]).min() > 0
+
+
+def test_what_falls_behind_a_surface_does_not_return_and_before_it_is_the_same():
+    free = cast(snow_mm_h=1.0)
+    blocked = cast([wall("W", 5)], snow_mm_h=1.0, materials=[Material("*", 0.5)])
+    air = blocked["cause"] == AIR
+    near = free["range"] < 5
+    assert 2000 < near.sum() < len(near) - 2000
+    for name in ("ray", "range", "intensity", "x"):
+        assert np.array_equal(blocked[name][air], free[name][near])
+    assert (blocked["object"][air] == -1).all() and (blocked["object"][~air] == 0).all()
+    pane = cast([wall("W", 5)], snow_mm_h=1.0, materials=[Material("*", transparent="pass")])
+    assert same(pane, free), "snow falls behind a pane as well"
+
+
+def test_each_sub_ray_is_blocked_by_its_own_surface():
+    beam = Returns("all", subrays=19, divergence_mrad=1000 * DIVERGENCE, pulse_ns=0)
+    free, half = (
+        cast([mesh], snow_mm_h=1.0, returns=beam) for mesh in (NOTHING, wall("W", 4, (0, 50)))
+    )
+    behind = [((one["cause"] == AIR) & (one["range"] > 4)).sum() for one in (free, half)]
+    # The middle sub-ray and half of the others, which hit the edge, or not.
+    assert behind[1] / behind[0] == pytest.approx(0.5, abs=0.06)
+    before = [((one["cause"] == AIR) & (one["range"] < 4)).sum() for one in (free, half)]
+    assert before[0] == before[1]
+    alone = cast(snow_mm_h=1.0)
+    assert len(alone["range"]) == len(free["range"]), "as many as of a beam of one ray"
+    assert np.array_equal(alone["intensity"], free["intensity"])
+
+
+def test_a_road_in_the_snow_is_one_return_of_a_beam_that_grazes_it():
+    road = Mesh(
+        "Road", np.array([[0, -9, -1], [300, -9, -1], [300, 9, -1], [0, 9, -1.0]]),
+        np.array([[0, 1, 2], [0, 2, 3]]),
+    )  # fmt: skip
+    down = Sensor(
+        Beams(np.radians(np.full(2000, -2.0))), Spin(1, 360), 0.5, 200,
+        optics=Optics(divergence_mrad=3.0),
+    )  # fmt: skip
+    beam = Returns("all", subrays=19, pulse_ns=5)
+    noise = Noise(detection_range_m=300)
+    found = cast([road], down, snow_mm_h=1.0, returns=beam, noise=noise)
+    on_road = found["ray"][found["cause"] == 0]
+    assert (found["cause"] == AIR).sum() > 2000
+    assert len(np.unique(on_road)) > 1900, "of the others a flake in the light on the road is"
+    assert len(on_road) == len(np.unique(on_road))
+
+
+# -- fog and dust ----------------------------------------------------------------------------------
+
+
+def test_fog_returns_what_hahner_et_al_have():
+    """β = 0.046 / MOR; the pulse receives half of its length of it, less what the fog takes."""
+    visibility_km, length = 0.1, 0.299792458 * 10 / 2
+    sensor = beams(wavelength_nm=550, min_range_m=1.0, pulse_ns=10)
+    found = cast(
+        sensor=sensor,
+        visibility_km=visibility_km,
+        fog_lidar_ratio_sr=math.log(20) / 0.046,
+        returns=Returns("all"),
+    )
+    mor = 1000 * visibility_km * math.log(20) / 3.91  # of a contrast of 5 % instead of 2 %
+    alpha, beta = math.log(20) / mor, 0.046 / mor
+    begin, end = 1.0, 1.0 + length
+    energy = math.pi * beta * (math.exp(-2 * alpha * begin) - math.exp(-2 * alpha * end))
+    energy /= 2 * alpha
+    first = found["range"] < end
+    assert energy > 1.5 * THRESHOLD and first.mean() > 0.5
+    assert found["intensity"][first] == pytest.approx(energy, rel=1e-5)
+    assert (found["cause"] == AIR).all() and len(np.unique(found["ray"])) == len(found["ray"])
+
+
+def test_the_peak_of_fog_is_where_signal_and_noise_are_highest():
+    signals = np.array([4.0, 3.5, 3.0, 1.0])
+    rng = np.random.default_rng(1)
+    noisy = signals + rng.normal(size=(400_000, 4))
+    table = highest(signals)
+    for count in range(1, 5):
+        share = np.bincount(noisy[:, :count].argmax(axis=1), minlength=4)[:count] / 400_000
+        assert np.diff(table[count, :count], prepend=0) == pytest.approx(share, abs=0.004)
+
+
+def test_fog_ends_at_surfaces_and_competes_with_them():
+    dense = {"visibility_km": 0.04, "fog_lidar_ratio_sr": 65.0}
+    strongest = Returns("strongest", pulse_ns=5)
+    near, far = (cast([wall("W", x)], returns=strongest, **dense)["cause"].mean() for x in (8, 60))
+    assert near == 0 and far == 1, "the wall is stronger from near, the fog from far away"
+    pairs = cast([wall("W", 3)], returns=Returns("all", pulse_ns=5), **dense)
+    air = pairs["cause"] == AIR
+    assert air.any() and pairs["range"][air].max() < 3
+    thin = cast([wall("W", 8)], visibility_km=1.0, fog_lidar_ratio_sr=65.0, returns=strongest)
+    assert (thin["cause"] == 0).all()
+
+
+def test_fog_without_a_lidar_ratio_returns_nothing():
+    some = {"visibility_km": 0.04, "returns": Returns("all", pulse_ns=5)}
+    assert len(cast(**some)["range"]) == 0
+    assert same(cast([wall("W", 9)], **some), cast([wall("W", 9)], rain_mm_h=0.0, **some))
+
+
+# -- bytes -----------------------------------------------------------------------------------------
+
+
+STORM = {
+    "rain_mm_h": 30.0,
+    "snow_mm_h": 1.0,
+    "dust_mg_m3": 50.0,
+    "visibility_km": 0.2,
+    "fog_lidar_ratio_sr": 18.8,
+    "noise": Noise(detection_range_m=150, range_m=0.01, angle_deg=0.01, seed=5),
+    "returns": Returns("dual", subrays=7, divergence_mrad=3, pulse_ns=5),
+    "keep_every": 3,
+}
+
+
+@pytest.mark.parametrize("backend", CPU)
+def test_batches_chunks_and_backends_do_not_matter(backend, monkeypatch):
+    sensor = Sensor(
+        Beams(np.radians(np.linspace(-30, 30, 16))), Spin(720, 30), 0.5, 100,
+        optics=Optics(divergence_mrad=3.0),
+    )  # fmt: skip
+    survey = survey_of(sensor, **STORM | {"steps": 6})
+    scene = Scene.from_meshes([wall("Near", 4, (0, 9)), wall("Far", 30)])
+    rig = Rig(scene, survey, backend)
+
+    def values(*spans):
+        found = [batch for span in spans for batch in rig.cast(*span)]
+        return {
+            column.name: np.concatenate([column.make(batch) for batch in found])
+            for column in survey.stored_columns
+        }
+
+    whole = values((0, 6))
+    assert {0, AIR} == {*whole["cause"].tolist()}
+    assert same(whole, values(*((n, n + 1) for n in range(6))))
+    plain = Rig(scene, survey, "numpy")
+    (batch,) = plain.cast(0, 6)
+    assert all(np.array_equal(whole[c.name], c.make(batch)) for c in survey.stored_columns)
+    monkeypatch.setattr(echoes, "CHUNK_RAYS", 700)
+    assert same(whole, values((0, 6)))
+
+
+def test_another_seed_is_another_sky():
+    one, other = (
+        cast(snow_mm_h=1.0, noise=Noise(detection_range_m=100, seed=seed)) for seed in (1, 2)
+    )
+    assert not np.array_equal(one["range"][:1000], other["range"][:1000])
+
+
+def test_what_is_no_surface_is_grey_and_of_no_class():
+    material = [Material("*", reflectance=0.2, semantic_class=7)]
+    found = cast(
+        [wall("W", 9)], snow_mm_h=1.0, materials=material, columns=(*COLUMNS, "red", "triangle")
+    )
+    air = found["cause"] == AIR
+    assert {*found["class"][air].tolist()} == {0} and {*found["class"][~air].tolist()} == {7}
+    assert {*found["red"].tolist()} == {188}
+    assert (found["triangle"][air] == -1).all() and (found["triangle"][~air] >= 0).all()
+
+
+# -- what fits together ----------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"rain_mm_h": 5, "noise": Noise()}, r"need noise\.detection_range_m"),
+        ({"dust_mg_m3": 5, "noise": Noise()}, r"need noise\.detection_range_m"),
+        ({"snow_mm_h": -1}, "snow_mm_h"),
+        (
+            {"rain_mm_h": 5, "sensor": beams(divergence_mrad=None), "returns": Returns()},
+            r"returns\.divergence_mrad",
+        ),
+        ({"snow_mm_h": 5, "noise": Noise(detection_range_m=1e5)}, "drops or flakes, more than"),
+    ],
+)
+def test_what_does_not_fit_is_said(options, message):
+    with pytest.raises(LidarpoolError, match=message) as refused:
+        survey_of(**options)
+    assert len(str(refused.value).splitlines()) == 1
+
+
+def test_each_sensor_has_its_own_air():
+    sensors = [Mounted(beams(5000), name=name, noise=noise) for name, noise in (
+        ("far", Noise(detection_range_m=200)), ("near", Noise(detection_range_m=50)),
+    )]  # fmt: skip
+    survey = Survey(sensors=sensors, poses=[(0, 0, 0)], steps=1, snow_mm_h=1.0, returns=ALL)
+    batches = list(Rig(Scene.from_meshes([NOTHING]), survey, "numpy").cast(0, 2))
+    counts = {batch.carried.name: len(batch) for batch in batches}
+    assert counts["far"] > 5 * counts["near"] > 0
+    with pytest.raises(LidarpoolError, match="of near"):
+        Survey(
+            sensors=[sensors[0], Mounted(beams(), name="near", noise=Noise())],
+            poses=[(0, 0, 0)],
+            snow_mm_h=1.0,
+        )

@@ -1,0 +1,273 @@
+"""Hits in the air: drops, flakes, fog and dust in front of surfaces.
+
+Which particles a beam meets follows from random numbers for each pulse alone. Only those that the
+sensor may detect are drawn: their number is Poisson's, their ranges and diameters are quantiles.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import cache, lru_cache
+from statistics import NormalDist
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from ..scene.colours import GREY, packed
+from ..sensor import Survey
+from ..sensor.noise import THRESHOLD_SIGMAS, raw, uniform
+from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
+from ..sensor.weather import reach as reach_of
+from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, numbers
+from .surfaces import Surfaces
+
+QUANTILES = 1 << 16
+TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
+CELLS_MOST = 255  # pulse lengths of fog
+TAIL_SIGMAS = 6.0
+# Purposes of random numbers.
+_FOG_CELL, _FOG_PLACE = 10, 11
+_COUNT, _RANGE, _DIAMETER, _PLACE = 12, 13, 14, 15  # of the first kind of particles, then 4 more
+_PURPOSES = 4
+
+
+class _Seen(NamedTuple):
+    """Particles of one kind that may be detected; the arrays (QUANTILES,) are by range."""
+
+    counts: Real  # (k,): cumulative probabilities of 0, 1, … in a beam
+    distance: Real  # before which an equal share of them is
+    smallest: Real  # diameter that may be detected, mm
+    larger: Real  # 1 - exp(-slope * (largest - smallest))
+    step: float  # 1 / slope, mm
+    energy: Real  # of a particle of 1 mm
+    most: Real  # of one that fills the beam
+
+
+class _Fog(NamedTuple):
+    """Cells of half a pulse's length, from the sensor on."""
+
+    begins: float  # metres
+    cell: float
+    energy: Real  # (cells,)
+    # Cumulative probabilities that a cell has the highest peak of some first cells: the row of n
+    # cells is n plus them.
+    peaks: Real
+
+
+class AirCaster:
+    """Finds where the air returns light to one sensor.
+
+    Raises
+    ------
+    LidarpoolError
+        If one of its beams would return from too many particles.
+    """
+
+    def __init__(self, number: int, survey: Survey, surfaces: Surfaces) -> None:
+        sensor, noise = survey.carried[number].sensor, survey.noise_each[number]
+        self._seed, self._surfaces = noise.seed, surfaces
+        self._wavelength_nm = sensor.optics.wavelength_nm
+        _, self._gap_m = survey.returns_each[number].of(sensor.optics)
+        air, least = survey.air(number), FAINTEST * noise.threshold
+        begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
+        self._seen = [_seen(air, kind, least, begins, ends) for kind in survey.particles]
+        scatters = survey.scatters(self._wavelength_nm)
+        self._fog = _fog(air, scatters, noise.threshold, begins, ends, self._gap_m)
+
+    def added(
+        self, hits: Hits, planes: Planes, rays: tuple[int, int], keys: Keys, each: int
+    ) -> tuple[Hits, Planes]:
+        """Add hits in the air to those of surfaces, of beams `rays` with `each` sub-rays.
+
+        The hits are in the order of rays, numbered from the first beam's.
+        """
+        scan, ray = keys.of(np.arange(*rays))
+        reach = self._reach(hits, len(ray) * each)
+        parts = [
+            self._met(seen, _PURPOSES * which, scan, ray, reach, each)
+            for which, seen in enumerate(self._seen)
+            if seen is not None
+        ]
+        if self._fog is not None:
+            parts.append(self._in_fog(self._fog, scan, ray, reach, each))
+        if not parts:
+            return hits, planes
+        sub, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+        if parts[1:] or each > 1:
+            order = np.argsort(sub, kind="stable")
+            sub, distance, energy = sub[order], distance[order], energy[order]
+        return _inserted(hits, planes, sub, distance, energy)
+
+    def _reach(self, hits: Hits, count: int) -> Real:
+        """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
+        materials = self._surfaces.at(self._wavelength_nm)
+        ends = hits.distance
+        on = materials.passes | materials.mirrors
+        if on.any():
+            ends = np.where(on[self._surfaces.objects(hits.triangle)], np.inf, ends)
+        reach = np.full(count, np.inf)
+        reach[hits.ray] = ends  # of several, the last
+        return reach
+
+    def _met(
+        self, seen: _Seen, first: int, scan: Whole, ray: Whole, reach: Real, each: int
+    ) -> tuple[Whole, Real, Real]:
+        """Sub-rays, distances and energies of particles of a kind."""
+        chance = uniform(self._seed, _COUNT + first, scan, ray)
+        some = np.flatnonzero(chance >= seen.counts[0])
+        beam = np.repeat(some, np.searchsorted(seen.counts, chance[some], side="right"))
+        key = scan[beam], ray[beam], numbers(beam)
+        place = (raw(self._seed, _RANGE + first, *key) >> np.uint64(48)).astype(np.intp)
+        distance = seen.distance[place]
+        sub = beam * each
+        if each > 1:
+            sub += (raw(self._seed, _PLACE + first, *key) % np.uint64(each)).astype(np.int64)
+        before = np.flatnonzero(distance < reach[sub])
+        place, key = place[before], (key[0][before], key[1][before], key[2][before])
+        rank = uniform(self._seed, _DIAMETER + first, *key) * seen.larger[place]
+        longer = seen.step * _exponential()[(rank * QUANTILES).astype(np.intp)]
+        diameter = seen.smallest[place] + longer
+        energy = np.minimum(seen.energy[place] * diameter * diameter, seen.most[place])
+        return sub[before], distance[before], each * energy
+
+    def _in_fog(
+        self, fog: _Fog, scan: Whole, ray: Whole, reach: Real, each: int
+    ) -> tuple[Whole, Real, Real]:
+        """Sub-rays, distances and energies of the peaks of fog."""
+        cells = len(fog.energy)
+        free = (np.minimum(reach[::each], FARTHEST_M) - fog.begins) / fog.cell
+        free = np.clip(free, 0, cells).astype(np.int64)
+        some = np.flatnonzero(free)
+        free, scan, ray = free[some], scan[some], ray[some]
+        chance = free + uniform(self._seed, _FOG_CELL, scan, ray)
+        cell = np.searchsorted(fog.peaks, chance, side="right") - free * cells
+        place = uniform(self._seed, _FOG_PLACE, scan, ray)
+        return some * each, fog.begins + (cell + place) * fog.cell, each * fog.energy[cell]
+
+
+def _inserted(
+    hits: Hits, planes: Planes, ray: Whole, distance: Real, energy: Real
+) -> tuple[Hits, Planes]:
+    """Insert hits in the air before the others of their rays."""
+    count = len(hits.ray) + len(ray)
+    new = np.searchsorted(hits.ray, ray) + np.arange(len(ray))
+    old = np.ones(count, np.bool_)
+    old[new] = False
+
+    def both(before: NDArray, added: NDArray) -> NDArray:  # type: ignore[type-arg]
+        out = np.empty(count, before.dtype)
+        out[old], out[new] = before, added
+        return out
+
+    grey = packed(GREY[0])[0]
+    triangle = np.full(len(ray), NO_SURFACE, np.int32)
+    causes = np.zeros(len(hits.ray), np.uint8) if hits.cause is None else hits.cause
+    merged = Hits(
+        both(hits.ray, ray),
+        both(hits.distance, distance),
+        both(hits.triangle, triangle),
+        both(hits.energy, energy),
+        None if hits.colour is None else both(hits.colour, np.full(len(ray), grey)),
+        both(causes, np.full(len(ray), AIR, np.uint8)),
+    )
+    row = np.cumsum(old) - 1
+
+    def seen(rows: NDArray[np.intp]) -> tuple[Real, Real]:
+        normals, directions = np.zeros((2, len(rows), 3))
+        solid = old[rows]
+        if solid.any():
+            normals[solid], directions[solid] = planes(row[rows[solid]])
+        return normals, directions
+
+    return merged, seen
+
+
+@lru_cache(TABLES_KEPT)
+def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) -> _Seen | None:
+    """Make the tables of particles that return at least an energy; None if there are none."""
+    distance = np.geomspace(begins, max(ends, begins * 1.001), NODES)
+    some = np.flatnonzero(air.rate(kind, energy, distance) > 0)
+    if not len(some):
+        return None
+    last = min(some[-1] + 1, NODES - 1)
+    distance = np.geomspace(distance[max(some[0] - 1, 0)], distance[last], NODES)
+    rate = air.rate(kind, energy, distance)
+    parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
+    sums = np.concatenate([[0.0], np.cumsum(parts)])
+    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    distance = single(np.interp(shares, sums / sums[-1], distance))
+    smallest = np.minimum(air.smallest(kind, energy, distance), kind.largest)
+    larger = -np.expm1(-kind.slope * (kind.largest - smallest))
+    most = kind.reflectance * air.white(distance)
+    one = most / (1000 * air.width(distance)) ** 2
+    return _Seen(
+        _poisson(float(sums[-1])),
+        distance,
+        single(smallest),
+        single(larger),
+        1 / kind.slope,
+        single(one),
+        single(most),
+    )
+
+
+def _poisson(mean: float) -> Real:
+    """Cumulative probabilities of 0, 1, … events; the last is 1."""
+    sums, term, count = [], math.exp(-mean), 0
+    total = term
+    while count < mean or 1 - total > 1e-9:
+        sums.append(total)
+        count += 1
+        term *= mean / count
+        total += term
+    return single(np.array([*sums, 1.0]))
+
+
+@lru_cache(TABLES_KEPT)
+def _fog(
+    air: Air, scatters: float, threshold: float, begins: float, ends: float, cell: float
+) -> _Fog | None:
+    """Cells that may be detected; None if there are none."""
+    count = int(min((ends - begins) / cell, CELLS_MOST)) if cell else 0
+    edges = begins + cell * np.arange(count + 1, dtype=np.float64)
+    energy = air.cloud(scatters, edges[:-1], edges[1:])
+    energy = energy[: int(np.sum(np.cumprod(energy >= FAINTEST * threshold)))]
+    if not len(energy):
+        return None
+    peaks = highest(THRESHOLD_SIGMAS * energy / threshold)
+    rows = np.arange(len(energy) + 1)[:, None] + single(peaks)
+    return _Fog(begins, cell, single(energy), rows.reshape(-1))
+
+
+def highest(signals: Real) -> Real:
+    """Cumulative probabilities of which of the first n signals is the highest: (k + 1, k).
+
+    The signals (k,) fall, and have noise of standard deviation 1. The row of none is 1.
+    """
+    count = len(signals)
+    out = np.ones((count + 1, count))
+    # The highest is about the first, or somewhat higher.
+    at = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
+    normal = NormalDist()
+    below = np.array([[normal.cdf(x - signal) for x in at] for signal in signals])
+    density = np.exp(-((at - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
+    product = np.ones(len(at))
+    for number in range(1, count + 1):
+        product = product * below[number - 1]
+        share = (density[:number] * product).sum(axis=1)
+        out[number, :number] = np.cumsum(share / share.sum())
+        out[number, number - 1 :] = 1.0
+    return out
+
+
+def single(table: Real) -> Real:
+    """Round to single precision, in which exponentials are the same on every machine."""
+    return table.astype(np.float32).astype(np.float64)
+
+
+@cache
+def _exponential() -> Real:
+    """Quantiles of the exponential distribution, of equal shares."""
+    shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
+    return single(-np.log1p(-shares))
