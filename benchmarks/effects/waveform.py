@@ -36,7 +36,7 @@ def on(survey: Survey) -> Survey:
     return replace(survey, returns=returns)
 
 
-def _seen(scene: Scene, at: tuple[float, float], **returns: Any) -> Cloud:
+def _seen(scene: Scene, at: tuple[float, float], samples: int = 0, **returns: Any) -> Cloud:
     """Points of one pulse that looks straight down."""
     sensor = Sensor(Beams(np.zeros(1)), Spin(1, 360), optics=Optics(divergence_mrad=2.5))
     given = {"subrays": 217, "pulse_ns": _PULSE_NS, "mode": "all", **returns}
@@ -48,7 +48,7 @@ def _seen(scene: Scene, at: tuple[float, float], **returns: Any) -> Cloud:
         materials=[Material("*", 0.4)],
         returns=Returns(**given),
         precision_m=1e-3,
-        waveform_samples=0 if given["pulse_ns"] < 1 else 160,
+        waveform_samples=samples,
     )
     part = columns_of(list(Rig(scene, survey).cast(0, 1)))
     table = (SCAN, *(c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM))
@@ -63,7 +63,7 @@ def _flat(name: str, height: float, x: tuple[float, float]) -> Mesh:
 def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, float]) -> None:
     """Draw the waveform of a pulse over height, its parts, and what is found."""
     hits = _seen(scene, at, pulse_ns=0.001)
-    found = {name: _seen(scene, at, waveform=name) for name in _LANES}
+    found = {name: _seen(scene, at, 160, waveform=name) for name in _LANES}
     waves = found["gaussian"].waveforms
     heights = _HEIGHT_M - waves.times_ns[0] * LIGHT_M_NS / 2
     top = waves.samples[0].max()
@@ -73,10 +73,11 @@ def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, 
     )  # fmt: skip
     axes.plot(heights, waves.samples[0] / top, ".", color="black", ms=4, zorder=4, label="samples")
     fine = np.linspace(*span, 800)
-    sigma_m = _PULSE_NS / FWHM * LIGHT_M_NS / 2
-    rays = hits["intensity"][:, None], (_HEIGHT_M - hits["range"])[:, None]
-    whole = (rays[0] * np.exp(-0.5 * ((fine - rays[1]) / sigma_m) ** 2)).sum(axis=0)
-    axes.plot(fine, whole / top, color="black", lw=1, label="waveform")
+    finer = _seen(scene, at, 1600, waveform="peaks", sample_ns=0.1).waveforms
+    axes.plot(
+        _HEIGHT_M - finer.times_ns[0] * LIGHT_M_NS / 2, finer.samples[0] / top, color="black", lw=1,
+        label="waveform",
+    )  # fmt: skip
     parts = found["gaussian"]
     for row in range(len(parts)):
         wide = parts["pulse_width"][row] / FWHM * LIGHT_M_NS / 2
@@ -104,7 +105,7 @@ def picture(path: Path) -> None:
     left.set_ylabel("received power, of the highest sample")
     oak = tree(SPECIES[0])
     wood = Scene.from_meshes([_flat("Ground", 0.0, (-20, 20)), oak])
-    _panel(right, wood, (2.2, 0.6), (-1.5, 13.0))
+    _panel(right, wood, (2.8, 2.0), (-1.5, 14.5))
     right.set_title("an oak", fontsize=10)
     for axes in (left, right):
         for lane, (label, colour, _) in enumerate(_LANES.values()):

@@ -115,10 +115,7 @@ def tilted(degrees):
 @pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
 @pytest.mark.parametrize("degrees", [0, 45, 65, 75])
 def test_a_slanted_wall_stretches_the_echo(waveform, degrees):
-    """By the standard deviation of ranges in a disc, R tan θ · divergence / 4.
-
-    At 75° that is more than the pulse's: the echo is flat at the top, and no Gaussian.
-    """
+    """By the standard deviation of ranges in a disc, R tan θ · divergence / 4."""
     returns = Returns(
         "all", subrays=61, divergence_mrad=20, pulse_ns=5, waveform=waveform, sample_ns=0.5
     )
@@ -129,7 +126,7 @@ def test_a_slanted_wall_stretches_the_echo(waveform, degrees):
     assert len(echo["range"]) == 1
     # The near side returns more, which moves the peak by some centimetres.
     assert echo["range"] == pytest.approx([20], abs=0.06 if degrees == 75 else 0.01)
-    assert echo["pulse_width"] == pytest.approx([width], rel=0.08 if degrees == 75 else 0.02)
+    assert echo["pulse_width"] == pytest.approx([width], rel=0.02)
     energy = math.cos(math.radians(degrees)) / 4
     assert echo["intensity"] == pytest.approx([energy], rel=0.03)
     assert echo["amplitude"] == pytest.approx(echo["intensity"] * 5 / echo["pulse_width"], rel=1e-5)

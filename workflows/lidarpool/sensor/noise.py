@@ -81,12 +81,6 @@ class Noise:
     ] = 10.0
 
     @property
-    def threshold(self) -> float:
-        """Energy that is detected with probability one half; there must be a detection range."""
-        assert self.detection_range_m is not None
-        return TARGET_REFLECTANCE * at_right_angles(self.detection_range_m)
-
-    @property
     def loses(self) -> bool:
         """Whether returns can be lost."""
         return self.dropout > 0 or self.detection_range_m is not None

@@ -222,7 +222,7 @@ class EchoCaster:
         """Record the waveforms of returns; `start` is the beam of the first sub-rays."""
         assert self._digitizer is not None
         noise = None
-        if self._noise.detection_range_m is not None:
+        if self._noise.threshold:
             sigma = self._noise.threshold / THRESHOLD_SIGMAS
             here = Keys(keys.scan, keys.begins - start)
             noise = sigma, self._noise.seed, here

@@ -32,7 +32,7 @@ POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, an
 SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
-AIR, AIR_HIT = 110, 200  # of a sub-ray where the air returns light; a hit in the air
+AIR, AIR_HIT = 110, 170  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # A hit of those whose waveforms are searched at a time, by how returns are found; up to twice the

@@ -30,7 +30,7 @@ APART = 6.0  # Gaussians that are farther apart are fitted separately
 CLOSE = 1.0  # Gaussians that are nearer are one return
 
 FAINT = 0.01  # of the strongest echo around: weaker ones are not found
-CURVED = 0.03  # of the greatest curvature of that, likewise for Gaussians
+CURVED = 0.005  # of the greatest curvature of that, likewise for Gaussians
 TOGETHER = 4  # Gaussians that are fitted together at most
 STEPS = 10  # of Levenberg and Marquardt at most
 GAIN, ENOUGH = 1e-3, 1e-9  # share of the squares that a step must gain, and squares that are none
@@ -89,10 +89,9 @@ def returns_in(
 ) -> Hits:
     """Make returns of the waveforms of beams; arguments and order as of `separated`.
 
-    Hits that lie close together are one Gaussian, whose position and width are theirs. Other
-    waveforms are sampled and searched. Echoes of one surface that the beam grazes are one return
-    with the moments of its hits, see `continued`. The triangle and colour of a return are those of
-    its strongest hit.
+    Hits that lie close together, or on one surface (see `continued`), are one Gaussian with their
+    mean and variance. Other waveforms are sampled and searched. The triangle and colour of a return
+    are those of its strongest hit.
     """
     rows = np.arange(len(hits.ray))
     some = hits.energy > 0
@@ -118,6 +117,14 @@ def returns_in(
         begins, counts = runs(np.cumsum(new, dtype=np.int64)[wide])
         ends = wide[begins + counts - 1]
         broad = hits.distance[ends] - hits.distance[wide[begins]] > narrow
+        gap_m = MEET * digitizer.sigma_m
+        if planes is not None and each > 1 and broad.any():
+            on = wide[np.repeat(broad, counts)]
+            alone = np.ones(len(on), np.bool_)
+            inside = continued(hits.take(on), alone, gap_m, each, *planes(rows[on]))
+            starts = np.cumsum(counts[broad]) - counts[broad]
+            inside[starts] = True
+            broad[broad] = ~np.logical_and.reduceat(inside, starts)
         on = wide[np.repeat(broad, counts)]
         if len(on):
             share, together = hits.energy[on] / each, counts[broad]
@@ -128,7 +135,7 @@ def returns_in(
             several = np.add.reduceat(new[wide], begins, dtype=np.int64) > 1
             falls = wide[np.repeat(several, counts)]
             if len(falls):
-                part, marks, gap_m = hits.take(falls), new[falls], MEET * digitizer.sigma_m
+                part, marks = hits.take(falls), new[falls]
                 new[falls] &= ~continued(part, marks, gap_m, each, *planes(rows[falls]))
     begins = np.flatnonzero(new)
     which = np.cumsum(new) - 1
