@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from lidarpool import (
     Mesh,
     Mounted,
     Noise,
+    Optics,
     Returns,
     Scene,
     Sensor,
@@ -34,8 +36,9 @@ RAYS = 600_000
 
 BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
 COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
+PLATE = Mesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
 SCENE = Scene.from_meshes(
-    [Mesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS)]
+    [Mesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS), PLATE]
 )
 
 DELAYS = 300.0 * np.arange(128)
@@ -47,6 +50,11 @@ ALL = {"columns": OPTIONAL_NAMES}
 HALF = [Material("*", 0.5)]
 SEEN = {"noise": Noise(detection_range_m=100), "returns": Returns("dual", divergence_mrad=3.0)}
 PAINT = {"columns": ["intensity", "red", "green", "blue"], "materials": [Material("*", "texture")]}
+ALERT = replace(MANY, max_range_m=150.0, optics=Optics(divergence_mrad=3.0))
+BOTH = [Mounted(ALERT, name="one"), Mounted(ALERT, name="other")]
+FAINT = {"detection_range_m": 500.0}
+EVERY = {"returns": Returns("all")}
+SIGN = {"materials": [Material("*", 0.5), Material("Sign", 1.0, retro=True)]}
 
 SURVEYS = {
     "positions": Survey(MANY, **STILL),
@@ -58,6 +66,9 @@ SURVEYS = {
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
     "colours": Survey(MANY, **STILL, **PAINT),
     "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
+    "false alarms": Survey(ALERT, **STILL, noise=Noise(**FAINT, false_alarm_hz=1e6), **EVERY),
+    "stray light": Survey(ALERT, **WAY, noise=Noise(**FAINT, stray_light=1e-5), **SIGN),
+    "crosstalk": Survey(sensors=BOTH, **STILL, noise=Noise(**FAINT, crosstalk=True)),
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
     "rain": Survey(MANY, **STILL, **SEEN, rain_mm_h=20),
     "snow": Survey(MANY, **STILL, **ALL, **SEEN, snow_mm_h=2),

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
         Spin,
         Survey,
     )
-    from .sensor.models import load_sensor
+    from .sensor.models import datasheet, load_sensor
     from .sensor.trajectory import Track
     from .sensor.trajectory_files import load_trajectory
     from .simulator import Scanner
@@ -75,6 +75,7 @@ __all__ = [
     "Sweep",
     "Track",
     "__version__",
+    "datasheet",
     "load_robot",
     "load_sensor",
     "load_trajectory",
@@ -106,7 +107,7 @@ _MODULES = {
     "scene.robot": ("Robot",),
     "scene.scene": ("Scene",),
     "scene.urdf": ("load_robot",),
-    "sensor.models": ("load_sensor",),
+    "sensor.models": ("datasheet", "load_sensor"),
     "sensor": (
         "Beams",
         "Material",

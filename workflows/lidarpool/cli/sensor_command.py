@@ -23,7 +23,7 @@ def sensors(model: str | None, out: Path | None) -> None:
       lidarpool sensors
       lidarpool sensors velodyne/vlp16 --out vlp16.png
     """  # noqa: D301 - click wants the character, not its name
-    from ..sensor.models import load_sensor, model_names, read_model
+    from ..sensor.models import datasheet, load_sensor, model_names, read_model, shown_noise
 
     if model is None:
         heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
@@ -38,10 +38,17 @@ def sensors(model: str | None, out: Path | None) -> None:
     target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
     if target.suffix.lower() != ".png":
         raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
-    draw_beams(target, load_sensor(model))
     click.echo(described.name)
     for figure, source in described.sources.items():
-        click.echo(f"{figure:<10}  {source}")
+        click.echo(f"{figure:<11}  {source}")
+    if described.performance is not None:
+        sheet = datasheet(model)
+        click.echo(f"{'noise':<11}  {shown_noise(sheet.noise)}")
+        returns = f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"
+        click.echo(f"{'returns':<11}  {returns}")
+        if sheet.missing:
+            click.echo(f"{'unknown':<11}  {', '.join(sheet.missing)}")
+    draw_beams(target, load_sensor(model))
     click.echo(click.format_filename(target))
 
 

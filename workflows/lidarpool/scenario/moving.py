@@ -17,7 +17,16 @@ from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import MeshEntry, PoseSection, Section, SensorSection, ShapeSection, told
+from .sections import (
+    MeshEntry,
+    NoiseSection,
+    PoseSection,
+    ReturnsSection,
+    Section,
+    SensorSection,
+    ShapeSection,
+    told,
+)
 from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
@@ -49,10 +58,18 @@ class CarriedSection(SensorSection):
         told("its time steps (scans), instead of the survey's", 120),
     ] = None
 
-    def mounted(self, folder: Path, name: str, mount: Pose) -> Mounted:
+    def mounted(
+        self,
+        folder: Path,
+        mount: Pose,
+        noise: NoiseSection,
+        returns: ReturnsSection,
+        name: str = "",
+    ) -> Mounted:
         """Return it on its carrier; LidarpoolError if its files cannot be used."""
-        sensor = replace(self.sensor(folder), start_ns=self.start_s * 1e9)
-        return Mounted(sensor, mount, name, self.steps)
+        carried = super().mounted(folder, mount, noise, returns, name)
+        sensor = replace(carried.sensor, start_ns=self.start_s * 1e9)
+        return replace(carried, sensor=sensor, steps=self.steps)
 
 
 class TimedPose(PoseSection):

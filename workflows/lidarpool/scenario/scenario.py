@@ -37,6 +37,7 @@ from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import SENSORS_MOST, Steps
+from ..sensor.trajectory import CENTRE
 from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .placing import Placing, inside_note, place
@@ -313,8 +314,8 @@ class Scenario(Section):
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
                 with mistakes.noted(), prefixed(self._source):
-                    sensor = section.sensor(self._folder)
-                    self.returns.of(sensor.optics)
+                    one = section.mounted(self._folder, CENTRE, self.noise, self.returns)
+                    (one.returns or self.returns).of(one.sensor.optics)
         for path in self.files if mistakes.lines else ():
             if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
                 mistakes.lines.append(f"{self._source}: {str(path)!r} does not exist.")
@@ -713,7 +714,8 @@ class Scenario(Section):
             if self.scene.has_seed and cloud["keep_every"] is None:
                 cloud["keep_every"] = 1 if "ray" in self.output.needs else SEED_KEPT
             check_whole(self.output.needs, cloud["keep_every"] or 1)
-            alone = not self.sensors and self.mount is None
+            own_noise = all(one.noise is not None for one in carried)
+            alone = not self.sensors and self.mount is None and carried[0].noise is None
             return Survey(
                 poses=poses,
                 trajectory=track,
@@ -721,7 +723,7 @@ class Scenario(Section):
                 steps=self.steps,
                 materials=self._materials(scene),
                 returns=Returns(**dict(self.returns)),
-                noise=Noise(**dict(self.noise)),
+                noise=Noise() if own_noise else Noise(**dict(self.noise)),
                 **dict(self.weather),
                 **cloud,
             )
@@ -758,13 +760,14 @@ class Scenario(Section):
 
     def _carried(self) -> list[Mounted]:
         """Return the sensors on their carrier."""
+        common = self.noise, self.returns
         if self.sensors:
             return [
-                section.mounted(self._folder, name, self._mount(section.mount))
+                section.mounted(self._folder, self._mount(section.mount), *common, name)
                 for name, section in self.sensors.items()
             ]
         mount = MountSection() if self.mount is None else self.mount
-        return [Mounted(self.sensor.sensor(self._folder), self._mount(mount))]
+        return [self.sensor.mounted(self._folder, self._mount(mount), *common)]
 
     def _read_still(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
         lost = f"{self._path(entry.file)} moves "

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,10 +26,10 @@ from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
 from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
-from ..sensor import Material, Noise, Pose, Returns, Sensor
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
-from ..sensor.models import load_sensor
+from ..sensor.models import datasheet, load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
 from ..sensor.survey import CloudOptions
 from ..sensor.weather import Weather
@@ -365,6 +365,14 @@ class SensorSection(Section):
         MaxRange | None, told("farther returns are ignored; by default the model's, or .inf", 100.0)
     ] = None
 
+    performance: Annotated[
+        Literal["ideal", "datasheet"],
+        told(
+            "datasheet: noise, detection range and beam by the model's data sheet; what noise and "
+            "returns say counts more"
+        ),
+    ] = "ideal"
+
     @model_validator(mode="after")
     def _one_source(self) -> SensorSection:
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
@@ -372,6 +380,8 @@ class SensorSection(Section):
         grid = [name for name in _GRID if getattr(self, name) != _GRID[name]]
         if own and grid:
             raise ValueError(f"a {own[0]} defines the beams: leave out {grid[0]}.")
+        if self.performance == "datasheet" and self.model is None:
+            raise ValueError("performance: datasheet needs a model: give its name.")
         if self.columns is not None and "rays_per_revolution" in grid:
             raise ValueError("columns and rays_per_revolution mean the same: give one of them.")
         return self
@@ -392,9 +402,7 @@ class SensorSection(Section):
             azimuths = self.columns or self.rays_per_revolution
             fov = self.vertical_fov_deg
             return Sensor.grid(azimuths, self.layers, fov, self.step_deg, **given)
-        model = self.model
-        if model is not None and self.has_own_model:
-            model = str(folder / Path(model).expanduser())
+        model = self._found(folder)
         unit = self.calibration
         return load_sensor(
             model,
@@ -403,6 +411,36 @@ class SensorSection(Section):
             step_deg=self.step_deg,
             **given,
         )
+
+    def _found(self, folder: Path) -> str | None:
+        """Its model, a user's file from a folder."""
+        if self.model is None or not self.has_own_model:
+            return self.model
+        return str(folder / Path(self.model).expanduser())
+
+    def mounted(
+        self,
+        folder: Path,
+        mount: Pose,
+        noise: NoiseSection,
+        returns: ReturnsSection,
+        name: str = "",
+    ) -> Mounted:
+        """Return it on its carrier; LidarpoolError if its files cannot be used.
+
+        With `performance: datasheet` it has noise and returns of its own: those of the data sheet,
+        but for the fields that the sections give.
+        """
+        carried = Mounted(self.sensor(folder), mount, name)
+        model = self._found(folder)
+        if self.performance == "ideal" or model is None:
+            return carried
+        sheet = datasheet(model)
+        own: dict[str, Any] = {"noise": sheet.noise, "returns": sheet.returns}
+        for part, section in {"noise": noise, "returns": returns}.items():
+            given = {field: getattr(section, field) for field in section.model_fields_set}
+            own[part] = replace(own[part], **given)
+        return replace(carried, **own)
 
 
 _GRID = {  # {field of a grid: its default}
@@ -466,7 +504,7 @@ class ReturnsSection(Section, Returns):
 
 
 class NoiseSection(Section, Noise):
-    """Noise of ranges and angles, and lost returns."""
+    """Noise of ranges and angles, lost returns and false ones."""
 
 
 class WeatherSection(Section, Weather):

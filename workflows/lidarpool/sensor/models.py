@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from fractions import Fraction
 from functools import cache
 from importlib.resources import files
 from importlib.resources.abc import Traversable
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from statistics import NormalDist
+from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +22,8 @@ from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
 from .calibrations import UNUSABLE, Calibration, read_calibration, said
-from .optics import Optics
+from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
+from .optics import LIGHT_M_NS, Mode, Optics, Returns
 from .rays import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
@@ -96,6 +99,94 @@ class OpticsPart(_Part, Optics):
     """See `Optics`."""
 
 
+class Precision(_Part):
+    """Standard deviation of the ranges of a surface, at right angles."""
+
+    sigma_m: Positive
+    range_m: Positive
+    reflectance: Annotated[float, Field(gt=0, le=1)]
+
+
+class Detection(_Part):
+    """Range at which a share of the pulses on a surface, at right angles, return."""
+
+    range_m: Positive
+    reflectance: Annotated[float, Field(gt=0, le=1)] = TARGET_REFLECTANCE
+    probability: Annotated[float, Field(gt=0.001, lt=0.999)]
+
+    @property
+    def threshold_m(self) -> float:
+        """Range at which a surface of 10 % reflectance returns half of the pulses."""
+        same = self.range_m * (TARGET_REFLECTANCE / self.reflectance) ** 0.5
+        needed = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
+        return float(same * max(needed, 0.0) ** 0.5)
+
+
+class Performance(_Part):
+    """What a data sheet says of a sensor's noise and returns; see `datasheet`.
+
+    The precision of ranges is either `range_m` and `range_per_m`, as of `Noise`, or that of two
+    surfaces, which say how it depends on energy.
+    """
+
+    range_m: Annotated[float, Field(ge=0)] | None = None
+    range_per_m: Annotated[float, Field(ge=0)] = 0.0
+    precision: tuple[Precision, Precision] | None = None
+    angle_deg: Annotated[float, Field(ge=0)] | None = None
+    detection: Detection | None = None
+    false_alarms: Annotated[float, Field(gt=0, lt=0.5)] | None = None  # share of pulses
+    mode: Mode = "strongest"
+
+    @model_validator(mode="after")
+    def _one_precision(self) -> Performance:
+        if self.precision is not None and (self.range_m is not None or self.detection is None):
+            raise ValueError(
+                "precision needs detection, and takes the place of range_m and range_per_m"
+            )
+        if self.false_alarms is not None and self.detection is None:
+            raise ValueError("false_alarms needs detection")
+        return self
+
+    @property
+    def missing(self) -> tuple[str, ...]:
+        """What no source that could be read states."""
+        stated = {
+            "precision of ranges": self.range_m is not None or self.precision is not None,
+            "detection range at a reflectance": self.detection is not None,
+            "accuracy of angles": self.angle_deg is not None,
+            "false alarms": self.false_alarms is not None,
+        }
+        return tuple(name for name, there in stated.items() if not there)
+
+    def noise(self, gate_s: float, seed: int) -> Noise:
+        """Return the noise of a sensor whose receiver waits so many seconds for returns."""
+        made: dict[str, Any] = {"range_m": self.range_m or 0.0, "range_per_m": self.range_per_m}
+        if self.angle_deg is not None:
+            made["angle_deg"] = self.angle_deg
+        if self.detection is not None:
+            made["detection_range_m"] = self.detection.threshold_m
+            if self.precision is not None:
+                near, far = self._by_energy(self.detection.threshold_m)
+                made |= {"range_m": near, "range_at_threshold_m": far}
+        if self.false_alarms is not None:
+            made["false_alarm_hz"] = -float(np.log1p(-self.false_alarms)) / gate_s
+        return Noise(**made, seed=seed)
+
+    def _by_energy(self, threshold_m: float) -> tuple[float, float]:
+        """Fit the standard deviations of strong returns, and of those at the threshold."""
+        assert self.precision is not None
+        # The threshold over the energy: it grows with the square of the range.
+        weak = [
+            TARGET_REFLECTANCE / one.reflectance * (one.range_m / threshold_m) ** 2
+            for one in self.precision
+        ]
+        (x, y), (s, t) = np.square(weak), np.square([one.sigma_m for one in self.precision])
+        slope = (t - s) / (y - x)
+        if not (slope >= 0 and s - slope * x >= 0):
+            raise LidarpoolError("performance.precision does not fall as the energy grows.")
+        return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
+
+
 class SensorModel(_Part):
     """Data file of a sensor. `docs/how-to/sensor.md` describes its fields."""
 
@@ -113,6 +204,7 @@ class SensorModel(_Part):
     mirror: MirrorPart | None = None
     prisms: tuple[PrismPart, ...] = ()
     optics: OpticsPart = OpticsPart()
+    performance: Performance | None = None
     listed: bool = False
 
     @model_validator(mode="after")
@@ -208,6 +300,63 @@ def _read(path: Path | Traversable) -> SensorModel:
         raise LidarpoolError(f"{path}, {place}: {said_of_it}") from error
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
+
+
+class Datasheet(NamedTuple):
+    """Noise and returns of a sensor by its data sheet, and what the sheet leaves out."""
+
+    noise: Noise
+    returns: Returns
+    missing: tuple[str, ...]
+
+
+@checked
+def datasheet(model: str | Path, *, seed: int = 0) -> Datasheet:
+    """Noise and returns of a sensor model, by its data sheet.
+
+    Stated ranges of detection become the range at which half of the pulses on 10 % reflectance
+    return, and stated shares of false alarms a rate. A beam whose divergence is known has 7
+    sub-rays.
+
+    Parameters
+    ----------
+    model
+        Name, such as "ouster/os1-64", or your own data file (.yaml).
+    seed
+        Of the noise.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no such model, or no data sheet of it could be read.
+
+    Examples
+    --------
+    >>> sheet = datasheet("livox/mid70")
+    >>> sheet.noise.range_m, round(sheet.noise.detection_range_m), sheet.returns.subrays
+    (0.02, 101, 7)
+    """
+    described = read_model(model)
+    stated = described.performance
+    if stated is None:
+        raise LidarpoolError(
+            f"{described.name} has no performance in its data file, since no source that could be "
+            "read states it: give noise yourself."
+        )
+    low, high = described.range_m or (0.0, float("inf"))
+    noise = stated.noise(2e-9 * (high - low) / LIGHT_M_NS, seed)
+    subrays = 1 if described.optics.divergence_mrad is None else 7
+    return Datasheet(noise, Returns(stated.mode, subrays=subrays), stated.missing)
+
+
+def shown_noise(noise: Noise) -> str:
+    """Fields of noise that are not their defaults, as in a scenario."""
+    shown = (
+        f"{field.name}: {value:.4g}"
+        for field in fields(noise)
+        if (value := getattr(noise, field.name)) != field.default
+    )
+    return ", ".join(shown)
 
 
 @checked

@@ -1,4 +1,4 @@
-"""Noise of ranges and angles, and lost returns; their random numbers.
+"""Noise of ranges and angles, lost returns and false ones; their random numbers.
 
 A random number is a hash of (seed, purpose, scan, ray, number): the same on every worker and in
 every batch, whatever the order of drawing.
@@ -17,13 +17,16 @@ from pydantic import Field
 
 from ..base.arguments import checked_fields
 from ..base.declared import Seed, Share
+from ..base.errors import LidarpoolError
 from .materials import at_right_angles
 
 # Detection threshold for signal plus noise, in standard deviations.
 THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
+ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
 _RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
+_ALARM, _PEAK, _STRAY, _OTHER = range(20, 24)
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -35,26 +38,40 @@ Real = NDArray[np.float64]
 @dataclass(frozen=True)
 @checked_fields
 class Noise:
-    """Noise of ranges and angles, and lost returns; without arguments there is none.
+    """Noise of ranges and angles, lost returns and false ones; without arguments there is none.
 
-    The standard deviation of a range of r metres is ``range_m + range_per_m * r``. Rays are cast in
-    directions with noise, and reported with angles without. Stated detection ranges are for
-    surfaces at right angles in clear air.
+    The standard deviation of a range of r metres is ``range_m + range_per_m * r``, and
+    `range_at_threshold_m` times the threshold of detection over the return's energy is added in
+    squares. Rays are cast in directions with noise, and reported with angles without. Stated
+    detection ranges are for surfaces at right angles in clear air.
 
     Raises
     ------
     LidarpoolError
-        If a number is outside its range.
+        If a number is outside its range, or needs a detection range and there is none.
     """
 
     range_m: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation of ranges, metres")
+        float,
+        Field(ge=0, le=1000, description="standard deviation of ranges, metres", examples=[0.02]),
     ] = 0.0
     range_per_m: Annotated[
-        float, Field(ge=0, le=1, description="standard deviation added for each metre of range")
+        float,
+        Field(
+            ge=0,
+            le=1,
+            description="standard deviation added for each metre of range",
+            examples=[0.0002],
+        ),
     ] = 0.0
     angle_deg: Annotated[
-        float, Field(ge=0, le=10, description="standard deviation of beam directions, in both axes")
+        float,
+        Field(
+            ge=0,
+            le=10,
+            description="standard deviation of beam directions, in both axes",
+            examples=[0.05],
+        ),
     ] = 0.0
     dropout: Annotated[
         Share, Field(description="share of returns that are lost, whatever their energy")
@@ -79,6 +96,65 @@ class Noise:
             "and dust do not return more",
         ),
     ] = 10.0
+    range_at_threshold_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1000,
+            description="standard deviation of the range of a return at the threshold of "
+            "detection, metres; falls as its energy grows, added in squares",
+            examples=[0.05],
+        ),
+    ] = 0.0
+    walk_m: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=10,
+            description="range walk: a return 1.65 times as strong as the threshold of detection "
+            "appears so much nearer, one 10,000 times as strong 4.3 times as much",
+            examples=[0.02],
+        ),
+    ] = 0.0
+    false_alarm_hz: Annotated[
+        float,
+        Field(
+            ge=0,
+            le=1e9,
+            description="rate of false alarms, dark counts and sun, while the receiver waits for "
+            "returns",
+            examples=[200.0],
+        ),
+    ] = 0.0
+    stray_light: Annotated[
+        Share,
+        Field(
+            description="blooming of retro-reflectors: share of their light that a beam 1 degree "
+            "beside them receives; falls with the square of the angle",
+            examples=[1e-6],
+        ),
+    ] = 0.0
+
+    crosstalk: Annotated[
+        bool, Field(description="whether it receives pulses of the other sensors of the survey")
+    ] = False
+
+    def __post_init__(self) -> None:
+        needs = ("range_at_threshold_m", "walk_m", "false_alarm_hz", "stray_light", "crosstalk")
+        if self.detection_range_m is None:
+            for name in needs:
+                if getattr(self, name) > 0:
+                    raise LidarpoolError(
+                        f"noise.{name} is measured by the threshold of detection: give "
+                        "noise.detection_range_m as well."
+                    )
+
+    @property
+    def threshold(self) -> float:
+        """Threshold of detection: the energy of returns of which half are detected, else 0."""
+        if self.detection_range_m is None:
+            return 0.0
+        return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
 
     @property
     def loses(self) -> bool:
@@ -88,19 +164,65 @@ class Noise:
     @property
     def displaces(self) -> bool:
         """Whether directions or ranges deviate."""
-        return self.angle_deg > 0 or self.range_m > 0 or self.range_per_m > 0
+        return self.angle_deg > 0 or self.moves_ranges
 
     @property
-    def threshold(self) -> float:
-        """Energy of which half of the returns are detected; 0 if all are."""
-        if self.detection_range_m is None:
-            return 0.0
-        return float(TARGET_REFLECTANCE * at_right_angles(self.detection_range_m))
+    def moves_ranges(self) -> bool:
+        """Whether ranges deviate."""
+        return any((self.range_m, self.range_per_m, self.range_at_threshold_m, self.walk_m))
 
-    def ranges(self, distance: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
-        """Return the reported ranges of returns (n,), metres, at least 0."""
+    def ranges(
+        self, distance: Real, energy: Real | None, scan: Whole, ray: Whole, number: Whole
+    ) -> Real:
+        """Return the reported ranges of returns (n,), metres, at least 0.
+
+        The energies are needed where noise or walk depend on them.
+        """
         sigma = self.range_m + self.range_per_m * distance
+        if self.range_at_threshold_m and energy is not None:
+            weak = self.range_at_threshold_m * self.threshold / energy
+            sigma = np.sqrt(sigma * sigma + weak * weak)
+        if self.walk_m and energy is not None:
+            distance = distance - self.walk(energy)
         return np.maximum(distance + sigma * normal(self.seed, _RANGE, scan, ray, number), 0)
+
+    def walk(self, energy: Real) -> Real:
+        """By how much returns (n,) appear nearer than one at the threshold, metres.
+
+        A pulse with the shape of a Gaussian, so high over a fixed threshold, crosses it so many
+        standard deviations before its maximum.
+        """
+        over = np.maximum(energy / self.threshold, 1)
+        return np.asarray(self.walk_m * np.sqrt(2 * np.log(over)))
+
+    def false_alarms(
+        self, gate_s: float, scan: Whole, ray: Whole
+    ) -> tuple[NDArray[np.intp], Real, Real]:
+        """Find false alarms of rays (n,), whose receivers are open for so many seconds.
+
+        They come at the same rate at all times. Each is a maximum of the receiver's noise above the
+        threshold: maxima of normally distributed noise of a narrow band have a Rayleigh
+        distribution (Rice 1944).
+
+        Returns
+        -------
+        Rows of the rays, the time since the receiver opened, in seconds, and energies: (k,) each.
+        """
+        rows, since = np.arange(len(ray)), np.zeros(len(ray))
+        found: list[tuple[NDArray[np.intp], Real, Real]] = []
+        number = 0
+        while len(rows) or not found:
+            # The time until the next one is exponentially distributed.
+            left = uniform(self.seed, _ALARM, scan[rows], ray[rows], number)
+            some = np.flatnonzero(left > np.exp(-self.false_alarm_hz * (gate_s - since)))
+            rows, since, left = rows[some], since[some], left[some]
+            since = np.minimum(since - np.log(left) / self.false_alarm_hz, gate_s)
+            share = 1 - uniform(self.seed, _PEAK, scan[rows], ray[rows], number)
+            peak = np.sqrt(1 - 2 / THRESHOLD_SIGMAS**2 * np.log(share))
+            found.append((rows, since, self.threshold * peak))
+            number += 1
+        row, time, energy = map(np.concatenate, zip(*found, strict=True))
+        return row, time, energy
 
     def angles(self, scan: Whole, ray: Whole) -> tuple[Real, Real]:
         """Deviations of beams, across and up: (n,) and (n,), radians."""
@@ -119,9 +241,25 @@ class Noise:
         """
         seen = uniform(self.seed, _LOSS, scan, ray, number) >= self.dropout
         if self.detection_range_m is not None:
-            above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
-            seen &= above + normal(self.seed, _DETECTION, scan, ray, number) > 0
+            seen &= self._passes(_DETECTION, energy, scan, ray, number)
         return seen
+
+    def detected_stray(self, energy: Real, scan: Whole, ray: Whole) -> NDArray[np.bool_]:
+        """Whether stray light (n,) of retro-reflectors is detected, see `detected`."""
+        return self._passes(_STRAY, energy, scan, ray, np.zeros(len(ray), np.int64))
+
+    def detected_other(
+        self, energy: Real, scan: Whole, ray: Whole, number: Whole
+    ) -> NDArray[np.bool_]:
+        """Whether pulses (n,) of other sensors are detected, see `detected`."""
+        return self._passes(_OTHER, energy, scan, ray, number)
+
+    def _passes(
+        self, purpose: int, energy: Real, scan: Whole, ray: Whole, number: Whole
+    ) -> NDArray[np.bool_]:
+        """Whether signals with their noise pass the threshold."""
+        above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
+        return np.asarray(above + normal(self.seed, purpose, scan, ray, number) > 0)
 
 
 def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

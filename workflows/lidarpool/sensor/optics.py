@@ -59,11 +59,18 @@ class Returns:
     """
 
     mode: Annotated[
-        Mode, Field(description="returns reported for a pulse; dual: strongest and last")
+        Mode,
+        Field(
+            description="returns reported for a pulse; dual: strongest and last",
+            examples=["dual"],
+        ),
     ] = "strongest"
     subrays: Annotated[
         Literal[SUBRAYS],  # type: ignore[valid-type]
-        Field(description="rays in a beam: 1, 7, 19, 37, 61, … 217"),
+        Field(
+            description="rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance",
+            examples=[1],
+        ),
     ] = 1
     divergence_mrad: Annotated[
         Divergence | None,

@@ -14,7 +14,7 @@ from pydantic import Field
 from ..base.arguments import checked, checked_fields
 from ..base.errors import LidarpoolError
 from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
-from .optics import Optics
+from .optics import LIGHT_M_NS, Optics
 
 RaysPerRevolution = Annotated[
     int, Field(ge=1, le=10_000_000, description="for a grid: azimuths in one turn")
@@ -126,6 +126,11 @@ class Sensor:
             min_range_m,
             max_range_m,
         )
+
+    @property
+    def gate_s(self) -> float:
+        """Time for which its receiver waits for returns of a pulse, seconds."""
+        return 2e-9 * (self.max_range_m - self.min_range_m) / LIGHT_M_NS
 
     @property
     def channels(self) -> int:

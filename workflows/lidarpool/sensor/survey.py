@@ -26,7 +26,7 @@ from ..columns.table import (
     waveform_column,
 )
 from .materials import Material
-from .noise import Noise
+from .noise import ALARMS_MOST, Noise
 from .optics import WINDOW_SIGMAS, Precision, Returns
 from .sensor import Sensor
 from .trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
@@ -288,9 +288,32 @@ class Survey(CloudOptions, Weather):
                         f"waveform_samples is {self.waveform_samples}, and one echo takes {least} "
                         f"samples of {returns.sample_ns:g} ns: record as many at least."
                     )
+        for number, noise in enumerate(self.noise_each):
+            _check_alarms(noise, self.carried[number].sensor)
+            if noise.crosstalk:
+                self._check_crosstalk(number)
         if self.returns_light:
             for number in range(len(self.carried)):
                 self._check_air(number)
+
+    def _check_crosstalk(self, number: int) -> None:
+        """Check that there are other sensors, and that what a sensor sees ends."""
+        if len(self.carried) == 1:
+            raise LidarpoolError(
+                "noise.crosstalk needs several sensors, and this survey has one: give sensors."
+            )
+        for carried in self.carried:
+            if not carried.sensor.max_range_m < float("inf"):
+                raise LidarpoolError(
+                    f"noise.crosstalk needs sensors with a greatest range, and {carried.name} has "
+                    "none: give its max_range_m."
+                )
+        wide, _ = self.returns_each[number].of(self.carried[number].sensor.optics)
+        if not wide:
+            raise LidarpoolError(
+                "noise.crosstalk needs a field of view as wide as the beam, and "
+                f"{self.carried[number].name} has no divergence: give returns.divergence_mrad."
+            )
 
     def _check_air(self, number: int) -> None:
         """Check that a sensor says what it detects, and that this is not too much."""
@@ -457,6 +480,20 @@ class Survey(CloudOptions, Weather):
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
         return spec.start_ns + _begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
+
+
+def _check_alarms(noise: Noise, sensor: Sensor) -> None:
+    """Check that false alarms end, and are not too many."""
+    if noise.false_alarm_hz and not sensor.gate_s < float("inf"):
+        raise LidarpoolError(
+            f"noise.false_alarm_hz needs a sensor with a greatest range, and {sensor.model} has "
+            "none: give max_range_m."
+        )
+    if noise.false_alarm_hz and (mean := noise.false_alarm_hz * sensor.gate_s) > ALARMS_MOST:
+        raise LidarpoolError(
+            f"noise.false_alarm_hz is {noise.false_alarm_hz:g}, which are {mean:.3g} false alarms "
+            f"of each pulse; {ALARMS_MOST} are possible: make it or max_range_m smaller."
+        )
 
 
 def _begin_ns(sensor: Sensor, firing: int) -> float:

@@ -21,6 +21,7 @@ from .air import AirCaster
 from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
 from .motion import Poses, products
 from .paths import Paths
+from .receiver import Receiver
 from .separation import separated
 from .surfaces import Surfaces
 from .waveform import Digitizer, recorded, returns_in
@@ -70,6 +71,7 @@ class EchoCaster:
         # Whether its returns are the caster's hits.
         self.plain = self._one_each and not self._noise.displaces
         divergence, self._gap_m = self._returns.of(self._sensor.optics)
+        self._receiver = Receiver(number, survey, caster, scene, surfaces, self._paths)
         self._beam = disc(self._returns.subrays, divergence)
 
     def divided(self, pattern: Pattern) -> Pattern | None:
@@ -129,13 +131,19 @@ class EchoCaster:
                     returns = returns_in(hits, self._digitizer, len(beam), planes)
                 else:
                     returns = separated(hits, self._gap_m, len(beam), planes)
-                returns = self._reported(returns._replace(ray=start + returns.ray), keys)
+                returns = self._detected(returns._replace(ray=start + returns.ray), keys)
+                if self._receiver.adds:
+                    every = np.arange(start, stop)
+                    middles = (every - start) * len(beam)
+                    returns = self._receiver.added(returns, keys, every, beams, here, middles, row)
+                returns = returns.take(chosen(self._heights(returns), self._returns.mode))
                 if self._records:
                     returns = self._with_waveforms(returns, hits, start, keys)
                 chunks.append(returns)
             found = self._kept(joined(chunks), groups, tally)
-        if noise.range_m or noise.range_per_m:
-            reported = noise.ranges(found.distance, *keys.of(found.ray), found.number)
+        if noise.moves_ranges:
+            height = found.energy if found.amplitude is None else found.amplitude
+            reported = noise.ranges(found.distance, height, *keys.of(found.ray), found.number)
             found = replace(found, reported=reported)
         return found
 
@@ -204,13 +212,13 @@ class EchoCaster:
         some = triangle[triangle != NO_SURFACE]
         return np.bincount(surfaces.counter(some), minlength=surfaces.counters)
 
-    def _reported(self, returns: Hits, keys: Keys) -> Hits:
-        """Select detected returns, and among them those that the mode reports."""
-        if self._noise.loses:
-            height = self._heights(returns).energy
-            seen = self._noise.detected(height, *keys.of(returns.ray), numbers(returns.ray))
-            returns = returns.take(seen)
-        return returns.take(chosen(self._heights(returns), self._returns.mode))
+    def _detected(self, returns: Hits, keys: Keys) -> Hits:
+        """Select the returns that are detected."""
+        if not self._noise.loses:
+            return returns
+        height = self._heights(returns).energy
+        seen = self._noise.detected(height, *keys.of(returns.ray), numbers(returns.ray))
+        return returns.take(seen)
 
     def _heights(self, returns: Hits) -> Hits:
         """Return returns with the heights of their echoes in place of energies."""

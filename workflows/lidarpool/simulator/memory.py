@@ -9,7 +9,7 @@ import numpy as np
 
 from ..columns.waveforms import record
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Sensor, Survey
 from .device import needs_hits
 from .echoes import CHUNK_RAYS
 from .rig import rays_repeat
@@ -30,6 +30,9 @@ RAY_TURNED = 20  # by noise of angles, likewise
 RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
 SUBRAY, SUBRAY_PASSING = 200, 650  # of those cast at a time; if light passes or is reflected
+# Of a ray that is cast at a time: false alarms and stray light, and each pulse of another sensor.
+# Each return has a cause then.
+RECEIVED, CROSSED, RETURN_CAUSED = 120, 370, 10
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 AIR, AIR_HIT = 110, 170  # of a sub-ray where the air returns light; a hit in the air
@@ -82,6 +85,9 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         if survey.returns_light:
             in_air = survey.met(number) + bool(survey.scatters(sensor.optics.wavelength_nm))
         more = {"all": in_air, "dual": min(in_air, 1.0)}.get(reported.mode, 0.0)
+        if noise.false_alarm_hz:
+            alarms = noise.false_alarm_hz * sensor.gate_s
+            more += {"all": alarms, "dual": min(alarms, 1.0)}.get(reported.mode, 0.0)
         returns = rays * max(RETURNS if several else 1, 1 + more)
         points = returns / survey.keep_every
         repeats, by_head = rays_repeat(sensor, survey.path.moves)
@@ -89,7 +95,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         here = 0 if made_there else rays  # rays whose hits are on the host
         made = 0 if repeats else rays
         turned = rays if noise.angle_deg and not echoes else 0
-        kept = (
+        kept: float = (
             (RAY + COLOUR * textured) * here + POSE_KEPT * poses + RAY_MADE_KEPT * max(made, turned)
         )
         casting = POSE * poses + RAY_MADE * made + RAY_TURNED * turned
@@ -97,6 +103,11 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         if echoes:
             chunk = min(rays * subrays, CHUNK_RAYS)
             found = (SUBRAY_PASSING if passing else SUBRAY) * chunk + RETURN * returns
+            if noise.false_alarm_hz or noise.stray_light or noise.crosstalk:
+                found += RECEIVED * chunk / subrays
+                kept += RETURN_CAUSED * returns
+            if noise.crosstalk:
+                found += CROSSED * _others(survey, sensor) * chunk / subrays
             if survey.returns_light:
                 found += AIR * chunk + AIR_HIT * in_air * chunk / subrays
             found += SEARCHED[reported.waveform] * min(chunk, BLOCK_HITS) * (subrays > 1)
@@ -115,6 +126,18 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
         small = SCAN * scans + STATION * (1 + scans // steps)
         most = max(most, kept + max(casting, made_columns) + small)
     return int(most) + TRIANGLE * scene.counters
+
+
+def _others(survey: Survey, sensor: Sensor) -> float:
+    """Pulses of all sensors but one in the time in which that one fires once."""
+
+    def rate(one: Sensor) -> float:
+        first, stop = one.firings(0)
+        begin, end = one.begins_ns(np.array([first, stop], np.int64))
+        return float((stop - first) * one.channels / (end - begin))
+
+    every = sum(rate(carried.sensor) for carried in survey.carried)
+    return every / rate(sensor) - 1
 
 
 def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: bool = False) -> int:

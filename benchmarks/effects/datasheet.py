@@ -1,0 +1,76 @@
+"""Data sheets: what sensors detect, and how precisely, as their makers state it."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
+from lidarpool import Material, Survey, datasheet
+from lidarpool.sensor.models import read_model
+
+DRAWS = "effect-datasheet.png"
+SHOWN = {
+    "ouster/os0-64": "#7b3f99",
+    "livox/mid360": "#2e8b57",
+    "hesai/xt32": GREY,
+    "ouster/os1-64": BLUE,
+    "livox/avia": RED,
+}
+RAYS = 2000
+
+
+def on(survey: Survey) -> Survey:
+    """Switch it on: noise and 7 sub-rays."""
+    sheet = datasheet("ouster/os1-64")
+    return replace(survey, noise=sheet.noise, returns=sheet.returns)
+
+
+def picture(path: Path) -> None:
+    """Draw shares of detected pulses and precisions of simulated walls, with stated figures."""
+    figure = Figure((9, 3.7), layout="constrained", dpi=110)
+    shares, sigmas = figure.subplots(1, 2)
+    dark = [Material("*", 0.1)]
+    for name, colour in SHOWN.items():
+        stated = read_model(name).performance.detection
+        noise = datasheet(name).noise
+        places = np.linspace(0.4, 1.5, 23) * stated.range_m
+        made = [len(shot([wall("W", x)], ahead(RAYS), noise, materials=dark)["range"])
+                for x in places]  # fmt: skip
+        shares.plot(places, 100 * np.array(made) / RAYS, "-", lw=1.2, color=colour)
+        share = 100 * stated.probability
+        label = f"{name}: {stated.range_m:g} m, {share:g} %"
+        shares.plot(stated.range_m, share, "o", ms=7, color=colour, label=label)
+    shares.set(xscale="log", xlabel="range of a wall of 10 % reflectance, m", xlim=(1.2, 400))
+    ticks = [5, 10, 20, 50, 100, 200]
+    shares.set_xticks(ticks, [str(tick) for tick in ticks])
+    shares.set_ylabel("pulses that return, %")
+    shares.legend(frameon=False, fontsize=7.5, loc="lower left", title="stated", title_fontsize=8)
+    shares.set_title("detection", fontsize=10)
+    name = "livox/tele15"
+    noise = datasheet(name).noise
+    for reflectance, colour, limits, stated_at in (
+        (0.1, GREY, (20, 180), [(70, 2), (120, 4)]),
+        (0.8, BLUE, (40, 450), [(220, 2), (380, 4)]),
+    ):
+        places = np.geomspace(*limits, 14)
+        found = [
+            shot([wall("W", x)], ahead(RAYS), noise, materials=[Material("*", reflectance)])
+            for x in places
+        ]
+        spread = [100 * one["range"].std() for one in found]
+        label = f"{100 * reflectance:g} % reflectance"
+        sigmas.plot(places, spread, "-", lw=1.2, color=colour, label=f"simulated, {label}")
+        x, y = zip(*stated_at, strict=True)
+        sigmas.plot(x, y, "v", ms=8, color=colour, label=f"stated (less than), {label}")
+    sigmas.set(xscale="log", xlabel="range of a wall, m", ylabel="standard deviation of ranges, cm")
+    sigmas.set_xticks([20, 50, 100, 200, 400], ["20", "50", "100", "200", "400"])
+    sigmas.legend(frameon=False, fontsize=7.5)
+    sigmas.set_title("precision of a Tele-15; the curve is fitted to 10 %", fontsize=10)
+    for axes in (shares, sigmas):
+        axes.minorticks_off()
+        axes.grid(alpha=0.25)
+    figure.savefig(path)

@@ -1,0 +1,63 @@
+"""False alarms."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, points, room, shot, wall
+from lidarpool import Material, Noise, Returns, Survey, load_sensor
+
+DRAWS = "effect-false-alarms.png"
+NOISE = Noise(detection_range_m=100, false_alarm_hz=2e4)
+GATE_M, WALL_M, RAYS = 150.0, 90.0, 60_000
+LIGHT_M_S = 299_792_458.0
+
+
+def on(survey: Survey) -> Survey:
+    """Switch it on."""
+    return replace(survey, noise=NOISE)
+
+
+def picture(path: Path) -> None:
+    """Draw a turn of a VLP-16 in a yard, and how false alarms lie before and behind a wall."""
+    figure = Figure((9, 3.9), layout="constrained", dpi=110)
+    above, lies = figure.subplots(1, 2, width_ratios=[1, 1.15])
+    sensor = load_sensor("velodyne/vlp16", max_range_m=100)
+    survey = Survey(sensor, poses=[(0, 0, 0)], steps=36, noise=NOISE, columns=["cause"])
+    found = points(room(30, 18, 3), survey)
+    x, y = (survey.precision_m * found[axis] for axis in ("x", "y"))
+    alarm = found["cause"] == 2
+    above.plot(x[~alarm], y[~alarm], ".", ms=1, color=GREY, label="walls")
+    above.plot(x[alarm], y[alarm], ".", ms=4, color=RED, label=f"{alarm.sum()} false alarms")
+    above.set(aspect="equal", xlabel="x, m", ylabel="y, m", xlim=(-100, 100), ylim=(-100, 100))
+    above.legend(frameon=False, fontsize=8, loc="upper right")
+    above.set_title("one turn of a VLP-16 in a yard, 20 kHz", fontsize=10)
+    mean = 2 * NOISE.false_alarm_hz / LIGHT_M_S  # a metre
+    edges = np.linspace(0, GATE_M, 31)
+    middle, step = (edges[1:] + edges[:-1]) / 2, edges[1]
+    for mode, colour, label in (("all", BLUE, "all returns"), ("first", RED, "first returns")):
+        seen = shot(
+            [wall("W", WALL_M)],
+            ahead(RAYS, GATE_M),
+            replace(NOISE, false_alarm_hz=2e5),
+            returns=Returns(mode),  # type: ignore[arg-type]
+            materials=[Material("*", 0.8)],
+        )
+        counts = np.histogram(seen["range"][seen["cause"] == 2], edges)[0]
+        lies.errorbar(middle, counts, counts**0.5, fmt="o", ms=3, lw=0.8, color=colour, label=label)
+        rate = 10 * mean
+        expected = RAYS * rate * step * np.ones(len(middle))
+        if mode == "first":
+            expected *= np.exp(-rate * middle) * (middle < WALL_M)
+        lies.step(middle, expected, where="mid", color=colour, lw=1)
+    lies.axvline(WALL_M, color=GREY, lw=1, ls="--")
+    lies.text(WALL_M + 1, 40, "wall", color=GREY, fontsize=8)
+    lies.set(xlabel="range, m", ylabel="false alarms in 5 m, of 60,000 pulses", ylim=(0, None))
+    lies.legend(frameon=False, fontsize=8, loc="lower left")
+    lies.set_title("200 kHz: lines are the Poisson process", fontsize=10)
+    lies.grid(alpha=0.25)
+    figure.savefig(path)

@@ -1,0 +1,64 @@
+"""Noise of ranges and range walk, by the energy of returns."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from benchmarks.effects._receiver import BLUE, GREY, RED, ahead, shot, wall
+from lidarpool import Material, Noise, Survey
+
+DRAWS = "effect-range-noise.png"
+NOISE = Noise(0.01, detection_range_m=100, range_at_threshold_m=0.1)
+WALK = Noise(0.01, detection_range_m=100, walk_m=0.02)
+RAYS = 4000
+
+
+def on(survey: Survey) -> Survey:
+    """Switch it on."""
+    return replace(survey, noise=replace(NOISE, walk_m=0.02))
+
+
+def picture(path: Path) -> None:
+    """Draw scatter and walk of simulated walls against energy, with the model's curves."""
+    kinds = {
+        "10 % reflectance": (Material("*", 0.1), GREY, np.geomspace(4, 105, 9)),
+        "80 %": (Material("*", 0.8), BLUE, np.geomspace(10, 250, 9)),
+        "retro-reflector": (Material("*", 1.0, retro=True), RED, np.geomspace(20, 250, 5)),
+    }
+    figure = Figure((9, 3.7), layout="constrained", dpi=110)
+    scatter, walk = figure.subplots(1, 2)
+    for name, (material, colour, places) in kinds.items():
+        energies, sigmas, shifts = [], [], []
+        for place in places:
+            made = [wall("W", place)]
+            found = shot(made, ahead(RAYS), NOISE, materials=[material])
+            energies.append(np.median(found["intensity"]) / NOISE.threshold)
+            sigmas.append(found["range"].std())
+            shifts.append(
+                shot(made, ahead(RAYS), WALK, materials=[material])["range"].mean() - place
+            )
+        scatter.plot(energies, 100 * np.array(sigmas), "o", ms=5, color=colour, label=name)
+        walk.plot(energies, 100 * np.array(shifts), "o", ms=5, color=colour)
+    ratio = np.geomspace(0.8, 1e6, 200)
+    both = np.hypot(NOISE.range_m, NOISE.range_at_threshold_m / ratio)
+    scatter.plot(ratio, 100 * both, "k-", lw=1, zorder=0, label="σ = 1 cm ⊕ 10 cm · T / E")
+    scatter.plot([1, 1e6], [1, 1], "k:", lw=1, zorder=0, label="without (σ = 1 cm)")
+    scatter.set(xscale="log", yscale="log", ylabel="standard deviation of ranges, cm")
+    scatter.set_yticks([1, 2, 5, 10], ["1", "2", "5", "10"])
+    scatter.minorticks_off()
+    scatter.legend(frameon=False, fontsize=8)
+    scatter.set_title("noise: walls at 4 to 250 m", fontsize=10)
+    walk.plot(ratio, -100 * WALK.walk(ratio * WALK.threshold), "k-", lw=1, zorder=0,
+              label="−2 cm · √(2 ln E / T)")  # fmt: skip
+    walk.plot([1, 1e6], [0, 0], "k:", lw=1, zorder=0, label="without")
+    walk.set(xscale="log", ylabel="mean range − true range, cm")
+    walk.legend(frameon=False, fontsize=8)
+    walk.set_title("walk: signs appear nearer", fontsize=10)
+    for axes in (scatter, walk):
+        axes.set_xlabel("energy E / threshold of detection T")
+        axes.grid(alpha=0.25)
+    figure.savefig(path)

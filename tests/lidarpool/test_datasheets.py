@@ -1,0 +1,143 @@
+"""Data sheets of sensors: what their figures become, and that simulated walls give them back."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from tests.lidarpool.test_echoes import beam_along_x, cast, wall
+
+from lidarpool import LidarpoolError, Material, Returns, datasheet
+from lidarpool.cli.sensor_command import sensors
+from lidarpool.scenario.scenario import Scenario
+from lidarpool.scene.scene import Scene
+from lidarpool.sensor.models import Detection, Performance, model_names, read_model
+
+RAYS = 20_000
+STATED = [name for name in model_names() if read_model(name).performance]
+DETECTED = [name for name in STATED if read_model(name).performance.detection]
+
+
+def returned(name, distance, reflectance):
+    """Ranges of the returns of a wall, one ray to a pulse, with a data sheet's noise."""
+    noise = datasheet(name).noise
+    sensor = beam_along_x(RAYS, 1e4)
+    materials = [Material("*", reflectance=reflectance)]
+    columns = ("range", "cause")
+    found = cast([wall("W", distance)], sensor, noise=noise, materials=materials, columns=columns)
+    return found["range"][found["cause"] == 0]
+
+
+@pytest.mark.parametrize("name", model_names())
+def test_each_model_says_where_its_figures_are_from_or_that_none_were_found(name):
+    model = read_model(name)
+    if model.performance is None:
+        assert model.sources["performance"].startswith("none that could be read")
+        with pytest.raises(LidarpoolError, match="give noise yourself"):
+            datasheet(name)
+        return
+    sheet = datasheet(name, seed=5)
+    assert model.sources["performance"]
+    assert sheet.noise.seed == 5
+    assert len(sheet.missing) < 4
+    assert sheet.returns.subrays == (1 if model.optics.divergence_mrad is None else 7)
+
+
+def test_most_models_have_figures():
+    assert (len(model_names()), len(STATED), len(DETECTED)) == (34, 27, 19)
+
+
+@pytest.mark.parametrize("name", DETECTED)
+def test_a_wall_at_the_stated_range_returns_the_stated_share(name):
+    stated = read_model(name).performance.detection
+    count = len(returned(name, stated.range_m, stated.reflectance))
+    spread = RAYS * stated.probability * (1 - stated.probability)
+    assert abs(count - RAYS * stated.probability) < 4 * math.sqrt(spread)
+
+
+@pytest.mark.parametrize("name", [name for name in STATED if datasheet(name).noise.range_m])
+def test_a_wall_has_the_stated_scatter(name):
+    stated = read_model(name).performance
+    places = [(20.0, 0.8, (stated.range_m or 0) + 20 * stated.range_per_m)]
+    if stated.precision:
+        places = [(one.range_m, one.reflectance, one.sigma_m) for one in stated.precision]
+    for distance, reflectance, sigma in places:
+        found = returned(name, distance, reflectance)
+        assert len(found) == RAYS
+        assert np.std(found) == pytest.approx(sigma, rel=4 / math.sqrt(2 * RAYS))
+
+
+def test_a_stated_range_becomes_that_of_half_the_pulses_on_ten_per_cent():
+    assert Detection(range_m=90, probability=0.5).threshold_m == pytest.approx(90)
+    # 90 % of pulses need 1 + 1.2816 / 5 of the threshold's energy.
+    assert Detection(range_m=90, probability=0.9).threshold_m == pytest.approx(90 * 1.25631**0.5)
+    white = Detection(range_m=90, reflectance=0.8, probability=0.5)
+    assert white.threshold_m == pytest.approx(90 / 8**0.5)
+
+
+def test_stated_false_alarms_are_a_share_of_the_pulses():
+    noise = datasheet("livox/mid40").noise
+    gate_s = 2 * (260 - 1) / 299_792_458
+    assert -math.expm1(-noise.false_alarm_hz * gate_s) == pytest.approx(1e-4)
+
+
+def test_two_precisions_of_one_energy_are_refused():
+    near = {"sigma_m": 0.02, "range_m": 100, "reflectance": 0.1}
+    far = {"sigma_m": 0.04, "range_m": 50, "reflectance": 0.1}
+    stated = Performance(precision=(near, far), detection={"range_m": 100, "probability": 0.5})
+    with pytest.raises(LidarpoolError, match="does not fall as the energy grows"):
+        stated.noise(1e-6, 0)
+
+
+def carried(**sections):
+    survey = Scenario.from_data({"poses": [[0, 0, 1]], **sections}).survey(Scene.seed())
+    return list(zip(survey.noise_each, survey.returns_each, strict=True))
+
+
+def test_a_scenario_takes_the_data_sheet_with_one_word_and_its_own_figures_before_it():
+    sensor = {"model": "ouster/os1-64", "performance": "datasheet"}
+    sheet = datasheet("ouster/os1-64")
+    assert carried(sensor=sensor) == [(sheet.noise, sheet.returns)]
+    ((noise, returns),) = carried(
+        sensor=sensor, noise={"range_m": 0.0, "walk_m": 0.05, "seed": 3}, returns={"subrays": 1}
+    )
+    assert (noise.range_m, noise.walk_m, noise.seed) == (0, 0.05, 3)
+    assert noise.detection_range_m == sheet.noise.detection_range_m
+    assert returns == Returns()
+    ((noise, _),) = carried(sensor={"model": "ouster/os1-64"})
+    assert not noise.loses
+
+
+def test_each_of_several_sensors_has_its_own():
+    found = carried(
+        sensors={
+            "roof": {"model": "hesai/xt32", "performance": "datasheet"},
+            "front": {"model": "livox/mid70"},
+        },
+        noise={"range_m": 0.5},
+    )
+    (roof, _), (front, returns) = found
+    assert (roof.range_m, roof.detection_range_m is not None) == (0.5, True)
+    assert (front.range_m, front.detection_range_m, returns) == (0.5, None, Returns())
+
+
+@pytest.mark.parametrize(
+    ("sensor", "says"),
+    [
+        ({"performance": "datasheet"}, "needs a model"),
+        ({"model": "velodyne/hdl32e", "performance": "datasheet"}, "give noise yourself"),
+        ({"model": "velodyne/vlp16", "performance": "typical"}, "datasheet"),
+    ],
+)
+def test_a_switch_that_cannot_work_says_so(sensor, says):
+    with pytest.raises(LidarpoolError, match=says):
+        carried(sensor=sensor)
+
+
+def test_the_command_shows_what_a_data_sheet_says(tmp_path):
+    run = CliRunner().invoke(sensors, ["livox/mid70", "--out", str(tmp_path / "a.png")])
+    assert "noise        range_m: 0.02, angle_deg: 0.1, detection_range_m: 100.9" in run.output
+    assert "returns      mode: strongest, subrays: 7" in run.output
+    assert "unknown      false alarms" in run.output

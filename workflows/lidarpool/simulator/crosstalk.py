@@ -1,0 +1,210 @@
+"""Crosstalk: pulses of the other sensors of a survey that a receiver takes for its own."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern
+
+from ..sensor import Sensor, Survey
+from ..sensor.materials import at_right_angles
+from ..sensor.optics import LIGHT_M_NS
+from .hits import Real, Whole
+from .motion import Clock, Poses, into_axes, products, turned
+from .surfaces import Surfaces
+from .world import World
+
+CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
+FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
+SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
+SLACK_NS = 10.0  # by which the time of a pulse at the receiver may be off before it is computed
+
+
+class _Spots(NamedTuple):
+    """Where pulses of a sensor hit something: arrays (n,)."""
+
+    time: Real  # when, nanoseconds since the station began
+    place: Real  # (n, 3)
+    normal: Real  # (n, 3)
+    triangle: NDArray[np.int32]
+    distance: Real  # from that sensor
+
+
+class Crosstalk:
+    """Finds the pulses of other sensors that a sensor receives.
+
+    A pulse of another sensor lights a spot. A ray receives its light if the spot is in the field of
+    view of its receiver, as wide as its beam, nothing stands between them, and the light arrives
+    while the receiver waits for its own pulse.
+    """
+
+    def __init__(self, number: int, survey: Survey, world: World, surfaces: Surfaces) -> None:
+        self._survey, self._world, self._surfaces = survey, world, surfaces
+        self._number, self._sensor = number, survey.carried[number].sensor
+        wide, _ = survey.returns_each[number].of(self._sensor.optics)
+        self._cosine = np.cos(wide / 2)
+        nm = self._sensor.optics.wavelength_nm
+        self._others = [
+            other
+            for other, carried in enumerate(survey.carried)
+            if other != number and abs(carried.sensor.optics.wavelength_nm - nm) <= FILTER_NM
+        ]
+
+    def received(
+        self, scan: int, rays: Whole, origins: Real, directions: Real, poses: Poses
+    ) -> tuple[NDArray[np.intp], Real, Real]:
+        """Find pulses of other sensors that consecutive rays (n,) receive.
+
+        `rays` count from the begin of a scan. Origins and directions are (n, 3).
+
+        Returns
+        -------
+        Rows of the rays, distances at which they seem to be, metres, and energies: (k,) each.
+        """
+        spec, sensor = self._survey.scan(scan), self._sensor
+        firing, channel = np.divmod(rays, sensor.channels)
+        firing = firing + spec.firings[0]
+        fired = sensor.begins_ns(firing) + sensor.beams.time_ns[channel]
+        gate = 2 / LIGHT_M_NS * np.array([sensor.min_range_m, sensor.max_range_m])
+        order = np.argsort(fired, kind="stable")
+        found: list[tuple[NDArray[np.intp], Real, Real]] = []
+        for other in self._others:
+            lidar = self._survey.carried[other].sensor
+            reach = (lidar.max_range_m + sensor.max_range_m) / LIGHT_M_NS
+            span = fired[order[0]] - reach, fired[order[-1]] + gate[1]
+            spots = self._spots(other, spec.station, spec.start_ns, span, poses)
+            row, spot = self._open(fired, order, origins, directions, spots, gate)
+            towards = spots.place[spot] - origins[row]
+            far = np.sqrt(products(towards.T, towards.T))
+            arrives = spots.time[spot] + far / LIGHT_M_NS
+            distance = (arrives - fired[row]) * (LIGHT_M_NS / 2)
+            seen = products(towards.T, directions[row].T) >= self._cosine * far
+            seen &= (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
+            some = np.flatnonzero(seen & (far > 0))
+            when = fired[row[some]] + spec.start_ns
+            some = some[self._free(origins[row[some]], towards[some], far[some], when, poses)]
+            energy = self._energy(spots, spot[some], towards[some], far[some])
+            found.append((row[some], distance[some], energy))
+        if not found:
+            return np.zeros(0, np.intp), np.zeros(0), np.zeros(0)
+        rows, distances, energies = map(np.concatenate, zip(*found, strict=True))
+        return rows, distances, energies
+
+    def _open(
+        self,
+        fired: Real,
+        order: NDArray[np.intp],
+        origins: Real,
+        directions: Real,
+        spots: _Spots,
+        gate: Real,
+    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        """Pairs of a ray and a spot that it may see, whose light arrives while it waits."""
+        times = fired[order]
+        about = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
+        away = spots.place - origins[order[about]]
+        far = np.sqrt(products(away.T, away.T))
+        arrives = spots.time + far / LIGHT_M_NS
+        first = np.searchsorted(times, arrives - gate[1] - SLACK_NS)
+        stop = np.searchsorted(times, arrives - gate[0] + SLACK_NS, side="right")
+        # Rays that are fired one after the other look into a cone; few spots are in it.
+        begins = np.arange(0, len(order), CELL_RAYS)
+        ahead = directions[order]
+        sums = np.add.reduceat(ahead, begins, axis=0)
+        axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
+        least = np.minimum.reduceat(
+            products(axes[np.arange(len(order)) // CELL_RAYS].T, ahead.T), begins
+        )
+        opening = np.arccos(np.clip(least, -1, 1)) + np.arccos(self._cosine)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            opening_m = SLACK_NS * LIGHT_M_NS / far  # rays of a cell start at different places
+        spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
+        off = np.arccos(np.clip(products(axes[cell].T, away[spot].T) / far[spot], -1, 1))
+        seen = ~(off > opening[cell] + opening_m[spot])
+        spot, cell = spot[seen], cell[seen]
+        low = np.maximum(first[spot], cell * CELL_RAYS)
+        high = np.minimum(stop[spot], (cell + 1) * CELL_RAYS)
+        pair, place = _expanded(low, high)
+        return order[place], spot[pair]
+
+    def _spots(
+        self, other: int, station: int, start_ns: int, span: tuple[float, float], poses: Poses
+    ) -> _Spots:
+        """Where the pulses of another sensor hit something, fired within a span of time."""
+        carried, path = self._survey.carried[other], self._survey.path
+        sensor: Sensor = carried.sensor
+        firings = np.arange(*_fired_in(sensor, self._survey.steps_each[other], span))
+        begins = sensor.begins_ns(firings)
+        ahead = sensor.directions(firings)
+        starts = sensor.origins(firings)
+        starts = np.zeros_like(ahead) if starts is None else starts
+        fired = (begins[:, None] + sensor.beams.time_ns).reshape(-1)
+        ahead = turned(ahead.reshape(-1, 3), carried.mount.rotation)
+        starts = turned(starts.reshape(-1, 3), carried.mount.rotation) + carried.mount.position
+        places, turns = path.poses(station, np.minimum(begins + sensor.lead_ns, path.duration_ns))
+        if turns is not None:
+            back = np.repeat(turns.transpose(0, 2, 1), sensor.channels, axis=0)
+            ahead, starts = into_axes(ahead, back), into_axes(starts, back)
+        starts = starts + np.repeat(places, sensor.channels, axis=0)
+        now = Poses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
+        low, high = sensor.min_range_m, sensor.max_range_m
+        found = self._world.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
+        ray, distance = found.ray.astype(np.int64), found.distance
+        times = fired[ray] + start_ns
+        return _Spots(
+            fired[ray] + distance / LIGHT_M_NS,
+            starts[ray] + distance[:, None] * ahead[ray],
+            self._surfaces.normals(found.triangle, times, poses.ways),
+            found.triangle,
+            distance,
+        )
+
+    def _free(
+        self, origins: Real, towards: Real, far: Real, times: Real, poses: Poses
+    ) -> NDArray[np.bool_]:
+        """Whether nothing stands before points (n, 3), seen from origins."""
+        free = np.ones(len(far), np.bool_)
+        if len(far):
+            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), poses.ways))
+            found = self._world.scan(Pattern(towards / far[:, None], origins), now)
+            free[found.ray] = found.distance > far[found.ray] * (1 - SHORT)
+        return free
+
+    def _energy(self, spots: _Spots, spot: NDArray[np.intp], towards: Real, far: Real) -> Real:
+        """Energies that are received of spots: (n,), as of a sensor's own pulses."""
+        surfaces, nm = self._surfaces, self._sensor.optics.wavelength_nm
+        triangle = spots.triangle[spot]
+        cosine = np.abs(products(spots.normal[spot].T, towards.T)) / far
+        # The air on the way there and back.
+        both = self._survey.extinction(self._sensor) * (spots.distance[spot] + far)
+        owners, table = surfaces.objects(triangle), surfaces.at(nm)
+        # A retro-reflector sends the light of a sensor back to that one alone.
+        share = table.reflectance[owners] * ~table.retro[owners]
+        return np.asarray(share * cosine * at_right_angles(far) * np.exp(-both))
+
+
+def _expanded(
+    first: NDArray[np.intp], stop: NDArray[np.intp]
+) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Row and number of each whole number of ranges (n,): (k,) each."""
+    each = np.maximum(stop - first, 0)
+    row = np.repeat(np.arange(len(each)), each)
+    return row, first[row] + np.arange(len(row)) - np.repeat(np.cumsum(each) - each, each)
+
+
+def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
+    """First firing within a span of time, and one past the last."""
+    last = range(sensor.firings(steps - 1)[1])
+
+    def begins(firing: int) -> float:
+        return float(sensor.begins_ns(np.array([firing], np.int64))[0])
+
+    slowest = float(sensor.beams.time_ns.max())
+    return (
+        bisect_left(last, span[0] - slowest, key=begins),
+        bisect_left(last, span[1], key=begins),
+    )

@@ -1,0 +1,371 @@
+"""What a receiver adds to the returns of its pulses: false alarms, stray light, other pulses."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from raybeam import Pattern
+
+from ..scene.colours import GREY, packed
+from ..scene.scene import Scene
+from ..sensor import Survey
+from ..sensor.optics import LIGHT_M_NS
+from .crosstalk import Crosstalk
+from .hits import (
+    BLOOMING,
+    CROSSTALK,
+    FALSE_ALARM,
+    NO_SURFACE,
+    Hits,
+    Keys,
+    Real,
+    Whole,
+    joined,
+    numbers,
+)
+from .motion import Clock, Poses, into_axes, products
+from .paths import Paths
+from .surfaces import Surfaces
+from .world import World
+
+CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
+TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
+CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
+STRAY_MOST = np.radians(30.0)  # no stray light comes from farther aside
+FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
+INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
+SHORT = 1e-3  # of the distance: a ray that ends so much before a triangle has reached it
+
+
+def unreal(ray: Whole, distance: Real, energy: Real, cause: int, *, coloured: bool = False) -> Hits:
+    """Make returns that are from no surface, in the order of rays and distances."""
+    order = np.lexsort((distance, ray))
+    count = len(ray)
+    return Hits(
+        ray[order],
+        distance[order],
+        np.full(count, NO_SURFACE, np.int32),
+        energy[order],
+        np.full(count, packed(GREY[0])[0]) if coloured else None,
+        np.full(count, cause, np.uint8),
+    )
+
+
+def merged(parts: list[Hits]) -> Hits:
+    """Join returns, each part in the order of rays and distances, to one in that order."""
+    hits = joined(parts)
+    return hits.take(np.lexsort((hits.distance, hits.ray)))
+
+
+class Receiver:
+    """Adds false alarms, stray light and pulses of other sensors to the returns of one sensor."""
+
+    def __init__(
+        self,
+        number: int,
+        survey: Survey,
+        world: World,
+        scene: Scene,
+        surfaces: Surfaces,
+        paths: Paths,
+    ) -> None:
+        self._noise = noise = survey.noise_each[number]
+        self._sensor = survey.carried[number].sensor
+        _, self._gap_m = survey.returns_each[number].of(self._sensor.optics)
+        self._world, self._surfaces, self._paths = world, surfaces, paths
+        self._alarms = noise.false_alarm_hz > 0
+        self._retros = [*_retros(scene, surfaces)] if noise.stray_light else []
+        self._others: Crosstalk | None = None
+        if noise.crosstalk:
+            self._others = Crosstalk(number, survey, world, surfaces)
+
+    @property
+    def adds(self) -> bool:
+        """Whether it adds anything."""
+        return self._alarms or bool(self._retros) or self._others is not None
+
+    def added(
+        self,
+        returns: Hits,
+        keys: Keys,
+        rays: Whole,
+        beams: Pattern,
+        poses: Poses,
+        rows: Whole,
+        start: int,
+    ) -> Hits:
+        """Return the detected returns of consecutive rays (n,), and what else is detected.
+
+        `rows` are the rays of `beams` in their middles, from `start` on, as `Poses.rays` takes
+        them.
+        """
+        parts = [returns]
+        coloured = returns.colour is not None
+
+        def add(ray: Whole, distance: Real, energy: Real, cause: int) -> None:
+            parts.append(unreal(ray, distance, energy, cause, coloured=coloured))
+
+        if self._alarms:
+            row, since, energy = self._noise.false_alarms(self._sensor.gate_s, *keys.of(rays))
+            distance = self._sensor.min_range_m + since * (LIGHT_M_NS * 1e9 / 2)
+            add(rays[row], distance, energy, FALSE_ALARM)
+        if self._retros or self._others is not None:
+            origins, directions = poses.rays(beams, rows, start)
+            origins = np.broadcast_to(origins, directions.shape)
+            if self._retros:
+                times = poses.times(rows)
+                found = self._stray(returns, rays, origins, directions, times, poses, keys)
+                row, distance, energy = found
+                add(rays[row], distance, energy, BLOOMING)
+            if self._others is not None:
+                own = origins, directions, poses
+                row, distance, energy = self._others.received(keys.scan, rays, *own)
+                order = np.lexsort((distance, row))
+                row, distance, energy = row[order], distance[order], energy[order]
+                seen = self._noise.detected_other(energy, *keys.of(rays[row]), numbers(row))
+                add(rays[row[seen]], distance[seen], energy[seen], CROSSTALK)
+        if sum(len(part.ray) for part in parts) == len(returns.ray):
+            return returns
+        return merged(parts)
+
+    def _stray(
+        self,
+        returns: Hits,
+        rays: Whole,
+        origins: Real,
+        directions: Real,
+        times: Real,
+        poses: Poses,
+        keys: Keys,
+    ) -> tuple[NDArray[np.intp], Real, Real]:
+        """Stray light of retro-reflectors that is detected: rows of rays, distances, energies."""
+        best = np.zeros(len(rays))
+        ends = np.zeros((len(rays), 3))  # seen from the origins
+        cells: _Cells | None = None
+        actor, turns = None, None
+        for retro in self._retros:  # those of an actor follow each other
+            if cells is None or retro.actor != actor:
+                actor, turns, places = retro.actor, None, np.zeros(3)
+                if actor is not None:
+                    places, turns = poses.ways[actor].poses(0, times)
+                cells = _Cells(into_axes(origins - places, turns), into_axes(directions, turns))
+            near = self._near(retro, cells)
+            if not len(near):
+                continue
+            energy, towards = self._leaks(retro, cells.starts[near], cells.ahead[near])
+            if turns is not None:  # back to the axes of the scene
+                towards = into_axes(towards, turns[near].transpose(0, 2, 1))
+            more = energy > best[near]
+            best[near[more]], ends[near[more]] = energy[more], towards[more]
+        row = np.flatnonzero(best > FAINTEST * self._noise.threshold)
+        row = row[self._noise.detected_stray(best[row], *keys.of(rays[row]))]
+        distance = np.sqrt(products(ends[row].T, ends[row].T))
+        low, high = self._sensor.min_range_m, self._sensor.max_range_m
+        within = (distance >= low) & (distance <= high)
+        row, distance = row[within], distance[within]
+        seen = self._seen(origins[row], ends[row], distance, times[row], poses)
+        seen &= ~self._beside(returns, rays[row], distance)
+        row = row[seen]
+        return row, distance[seen], best[row]
+
+    def _near(self, retro: _Retro, cells: _Cells) -> NDArray[np.intp]:
+        """Rays that may receive enough of the light of a retro-reflector, and perhaps others."""
+        centre = retro.middle - cells.begins
+        far = np.sqrt(products(centre.T, centre.T))
+        radius = retro.radius + cells.moved
+        with np.errstate(invalid="ignore", divide="ignore"):
+            wide = np.where(far > radius, np.arcsin(radius / far), np.pi)
+            off = np.arccos(np.clip(products(cells.axes.T, centre.T) / far, -1, 1))
+        least = np.maximum(far - radius, max(self._sensor.min_range_m, 1e-3))
+        reach = np.minimum(self._reach(retro, least), STRAY_MOST) + wide
+        near = np.flatnonzero(~(off > cells.opening + reach)[cells.number])
+        # Of those cells, the rays themselves.
+        which = cells.number[near]
+        centre = retro.middle - cells.starts[near]
+        off = products(cells.ahead[near].T, centre.T) / np.sqrt(products(centre.T, centre.T))
+        inside = ~(off < np.cos(np.minimum(reach[which], np.pi)))
+        return near[inside]
+
+    def _reach(self, retro: _Retro, distance: Real) -> Real:
+        """Angles at which the light of a retro-reflector becomes too faint, radians: (n,)."""
+        whole = self._whole(np.repeat(retro.triangles[:1], len(distance)), distance)
+        share = FAINTEST * self._noise.threshold / np.maximum(whole, 1e-300)
+        return np.radians(np.sqrt(self._noise.stray_light / share))
+
+    def _whole(self, triangle: NDArray[np.int32], distance: Real) -> Real:
+        """Energies of beams that hit a retro-reflector: (n,)."""
+        white = np.full(len(distance), 0xFFFFFFFF, np.uint32)
+        return self._paths.energy(triangle, np.ones(len(distance)), distance, white)
+
+    def _leaks(self, retro: _Retro, starts: Real, ahead: Real) -> tuple[Real, Real]:
+        """Energies of stray light in rays (n,), and where it is from, seen from there: (n, 3).
+
+        The light comes from the point of the triangles that is nearest to the ray by angle.
+        """
+        across, up = _axes_across(ahead)
+        best, ends = np.zeros(len(starts)), np.zeros((len(starts), 3))
+        nearest = _first_few(retro, starts, ahead)
+        for which in nearest.T:
+            towards = retro.corners[which] - starts[:, None]  # (n, 3 corners, 3)
+            depth = (towards * ahead[:, None]).sum(axis=2)
+            front = (depth > 0).all(axis=1)
+            with np.errstate(invalid="ignore", divide="ignore"):
+                # On a plane across the ray, at a distance of 1, angles from it are lengths.
+                x = (towards * across[:, None]).sum(axis=2) / depth
+                y = (towards * up[:, None]).sum(axis=2) / depth
+                off, point = _nearest(x, y, towards, depth)
+            middle = towards.mean(axis=1)
+            point = point + INWARDS * (middle - point)
+            distance = np.sqrt(products(point.T, point.T))
+            angle = np.degrees(np.arctan(off))
+            some = np.flatnonzero(front & (angle > 0) & (angle < np.degrees(STRAY_MOST)))
+            share = np.minimum(self._noise.stray_light / angle[some] ** 2, 1)
+            energy = share * self._whole(retro.triangles[which[some]], distance[some])
+            more = energy > best[some]
+            best[some[more]], ends[some[more]] = energy[more], point[some[more]]
+        return best, ends
+
+    def _seen(
+        self, origins: Real, towards: Real, distance: Real, times: Real, poses: Poses
+    ) -> NDArray[np.bool_]:
+        """Whether nothing stands before points (n, 3) that are seen from origins."""
+        free = np.ones(len(distance), np.bool_)
+        if len(distance):
+            light = Pattern(towards / distance[:, None], origins)
+            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), poses.ways))
+            found = self._world.scan(light, now)
+            free[found.ray] = found.distance > distance[found.ray] * (1 - SHORT)
+        return free
+
+    def _beside(self, returns: Hits, ray: Whole, distance: Real) -> NDArray[np.bool_]:
+        """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""
+        first = np.searchsorted(returns.ray, ray, side="left")
+        last = np.searchsorted(returns.ray, ray, side="right")
+        beside = np.zeros(len(ray), np.bool_)
+        for number in range(int((last - first).max(initial=0))):
+            some = np.flatnonzero(first + number < last)
+            own = returns.distance[first[some] + number]
+            beside[some] |= np.abs(own - distance[some]) <= self._gap_m
+        return beside
+
+
+class _Cells:
+    """Rays that are fired one after the other, with a cone around those of each cell."""
+
+    def __init__(self, starts: Real, ahead: Real) -> None:
+        self.starts, self.ahead = starts, ahead
+        first = np.arange(0, len(starts), CELL_RAYS)
+        self.number = np.arange(len(starts)) // CELL_RAYS  # cells of the rays
+        sums = np.add.reduceat(ahead, first, axis=0)
+        self.axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
+        cosine = np.minimum.reduceat(products(self.axes[self.number].T, ahead.T), first)
+        self.opening = np.arccos(np.clip(cosine, -1, 1))
+        self.begins = starts[first]
+        away = np.linalg.norm(starts - self.begins[self.number], axis=1)
+        self.moved = np.maximum.reduceat(away, first)
+
+
+@dataclass(frozen=True)
+class _Retro:
+    """Triangles of retro-reflectors that are near to each other."""
+
+    triangles: NDArray[np.int32]  # (k,): their numbers
+    corners: Real  # (k, 3, 3): in the scene's axes, or those of an actor
+    actor: int | None = None
+
+    @cached_property
+    def middle(self) -> Real:
+        return np.asarray(self.corners.reshape(-1, 3).mean(axis=0))
+
+    @cached_property
+    def radius(self) -> float:
+        return float(np.linalg.norm(self.corners.reshape(-1, 3) - self.middle, axis=1).max())
+
+
+def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
+    """Retro-reflectors of a scene, its instances and actors."""
+    retro = surfaces.materials.retro
+    own = np.flatnonzero(retro[scene.face_object]) if len(scene.faces) else np.zeros(0, np.intp)
+    yield from _clusters(own, scene.vertices[scene.faces[own]])
+    begin = len(scene.faces)
+    shared = scene.instances
+    if shared is not None:
+        for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
+            mesh = shared.parts[part]
+            if retro[owner]:
+                vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
+                yield from _clusters(begin + np.arange(len(mesh.faces)), vertices[mesh.faces])
+            begin += len(mesh.faces)
+    for number, actor in enumerate(scene.actors):
+        faces = actor.mesh.faces
+        if retro[len(scene.names) + number]:
+            corners = actor.mesh.vertices[faces]
+            yield from _clusters(begin + np.arange(len(faces)), corners, number)
+        begin += len(faces)
+
+
+def _clusters(
+    triangles: NDArray[np.integer[Any]], corners: Real, actor: int | None = None
+) -> Iterator[_Retro]:
+    """Divide triangles into some that are near to each other."""
+    if not len(triangles):
+        return
+    cells = np.floor(corners.mean(axis=1) / CLUSTER_M).astype(np.int64)
+    which = np.unique(cells, axis=0, return_inverse=True)[1].reshape(-1)
+    for number in range(int(which.max()) + 1):
+        some = np.flatnonzero(which == number)
+        yield _Retro(triangles[some].astype(np.int32), corners[some], actor)
+
+
+def _first_few(retro: _Retro, starts: Real, ahead: Real) -> NDArray[np.intp]:
+    """Find some triangles whose middles are nearest to rays (n,) by angle: (n, k)."""
+    count = len(retro.triangles)
+    if count <= TRIANGLES_NEAR:
+        return np.broadcast_to(np.arange(count), (len(starts), count))
+    middles = retro.corners.mean(axis=1)
+    towards = middles[:, None] - starts  # (triangles, n, 3)
+    towards = towards.transpose(2, 0, 1)
+    cosine = products(towards, ahead.T[:, None]) / np.sqrt(products(towards, towards))
+    return np.argsort(-cosine, axis=0, kind="stable")[:TRIANGLES_NEAR].T
+
+
+def _axes_across(ahead: Real) -> tuple[Real, Real]:
+    """Two unit vectors across each direction (n, 3), see `spread`."""
+    x, y, z = ahead.T
+    sign = np.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    across = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
+    return across, np.stack([b, sign + y * y * a, -y], axis=1)
+
+
+def _nearest(x: Real, y: Real, corners: Real, depth: Real) -> tuple[Real, Real]:
+    """Distances from 0 of triangles with corners x, y (n, 3) in a plane, and the points there.
+
+    The points are between the `corners` (n, 3, 3), which are seen at x and y, at depths (n, 3). A
+    distance is 0 if the triangle lies around 0.
+    """
+    best = np.full(len(x), np.inf)
+    points = np.zeros((len(x), 3))
+    inside = np.ones((2, len(x)), np.bool_)
+    for one, other in ((0, 1), (1, 2), (2, 0)):
+        dx, dy = x[:, other] - x[:, one], y[:, other] - y[:, one]
+        turn = x[:, one] * dy - y[:, one] * dx
+        inside &= np.stack([turn >= 0, turn <= 0])
+        along = -(x[:, one] * dx + y[:, one] * dy) / np.maximum(dx * dx + dy * dy, 1e-300)
+        along = np.clip(along, 0, 1)
+        off = np.hypot(x[:, one] + along * dx, y[:, one] + along * dy)
+        # A step on the plane is not the same share of the way between the corners.
+        far = along * depth[:, one]
+        share = far / (far + (1 - along) * depth[:, other])
+        point = corners[:, one] + share[:, None] * (corners[:, other] - corners[:, one])
+        less = off < best
+        best[less], points[less] = off[less], point[less]
+    best[inside.any(axis=0)] = 0.0
+    return best, points
