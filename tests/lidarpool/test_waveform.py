@@ -13,7 +13,7 @@ from tests.lidarpool.test_echoes import beam_along_x, cast, wall
 
 from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarpool.columns.parts import pack, unpack
-from lidarpool.columns.table import AXES, SCAN
+from lidarpool.columns.table import AXES, CAUSES, SCAN
 from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
@@ -197,7 +197,7 @@ def fence():
 
 def survey(**given):
     beams = Beams(np.radians([-30, -15, -8, 0]))
-    sensor = Sensor(beams, Spin(1800, 10), optics=Optics(divergence_mrad=30))
+    sensor = Sensor(beams, Spin(1800, 10), 0, 100, optics=Optics(divergence_mrad=30))
     returns = given.pop("returns", Returns("all", subrays=19, waveform="gaussian", pulse_ns=4))
     options = {"poses": [(0, 0, 1)], "steps": 8, "columns": COLUMNS, "returns": returns}
     return Survey(sensor, **options | given)
@@ -287,6 +287,23 @@ def test_recording_changes_no_point_and_no_batch_changes_a_record():
     bare, _ = cast_between(Rig(fence(), without, "numpy"), without, [0, 8])
     assert whole.keys() - bare.keys() == {WAVEFORM}
     assert all(whole[name] == values for name, values in bare.items())
+
+
+def test_fog_and_false_alarms_have_waveforms_too():
+    noise = Noise(detection_range_m=60, false_alarm_hz=3e6)
+    fog = {"visibility_km": 0.05, "fog_lidar_ratio_sr": 65}
+    made = survey(noise=noise, **fog, waveform_samples=64, columns=(*COLUMNS, "cause"))
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 8])
+    assert cast_between(rig, made, range(9)) == (whole, tally)
+    cloud = cloud_of(made)
+    alarms = cloud["cause"] == CAUSES.index("false alarm")
+    assert alarms.sum() > 20
+    assert (cloud["cause"] == CAUSES.index("air")).sum() > 5
+    assert (cloud["pulse_width"][alarms] == 0).all(), "no echo"
+    assert (cloud["pulse_width"][~alarms] > 3.99).all()
+    assert np.array_equal(cloud["amplitude"][alarms], cloud["intensity"][alarms])
+    assert np.abs(cloud.waveforms.samples[alarms, :5]).max() < 2 * noise.threshold
 
 
 def read_packets(path):

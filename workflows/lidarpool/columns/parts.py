@@ -353,7 +353,8 @@ class StoredCloud(Savable):
         parts = list(self.chunks())
         if parts:
             return Cloud.joined(parts)
-        columns = {c.name: np.zeros(0, c.dtype) for c in self.table}
+        rest = (column for column in self.columns if column not in AXES)
+        columns = {column.name: np.zeros(0, column.dtype) for column in (SCAN, *rest)}
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)
 
 

@@ -164,7 +164,7 @@ OPTIONAL = (
         "pulse_width",
         "float32",
         "ns",
-        "full width at half maximum of the echo in the waveform; without waveforms the pulse's",
+        "full width at half maximum of the echo; without waveforms the pulse's, 0 for no echo",
         "pulse_width",
     ),
     Column(

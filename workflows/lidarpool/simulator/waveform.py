@@ -120,8 +120,8 @@ def returns_in(
         gap_m = MEET * digitizer.sigma_m
         if planes is not None and each > 1 and broad.any():
             on = wide[np.repeat(broad, counts)]
-            alone = np.ones(len(on), np.bool_)
-            inside = continued(hits.take(on), alone, gap_m, each, *planes(rows[on]))
+            every = np.ones(len(on), np.bool_)
+            inside = continued(hits.take(on), every, gap_m, each, *planes(rows[on]))
             starts = np.cumsum(counts[broad]) - counts[broad]
             inside[starts] = True
             broad[broad] = ~np.logical_and.reduceat(inside, starts)
@@ -479,10 +479,10 @@ def recorded(
             number = begins[block, None] + np.arange(count)
             samples += sigma * normal(seed, _SAMPLE, stream, number >> 8, number & 255)
         steps, exponents = digitised(samples)
-        rows = slice(*np.searchsorted(window, [start, start + size]))
-        out["samples"][rows], out["exponent"][rows] = (
-            made[window[rows] - start] for made in (steps, exponents)
-        )
+        low_row, high_row = np.searchsorted(window, [start, start + size])
+        mine = window[low_row:high_row] - start
+        out["samples"][low_row:high_row] = steps[mine]
+        out["exponent"][low_row:high_row] = exponents[mine]
     return out
 
 
