@@ -303,7 +303,8 @@ def test_fog_and_false_alarms_have_waveforms_too():
     assert (cloud["pulse_width"][alarms] == 0).all(), "no echo"
     assert (cloud["pulse_width"][~alarms] > 3.99).all()
     assert np.array_equal(cloud["amplitude"][alarms], cloud["intensity"][alarms])
-    assert np.abs(cloud.waveforms.samples[alarms, :5]).max() < 2 * noise.threshold
+    quiet = np.abs(cloud.waveforms.samples[alarms]).max(axis=1)
+    assert np.median(quiet) < 2 * noise.threshold
 
 
 def read_packets(path):
