@@ -271,6 +271,21 @@ def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
     assert of.scan_count == 20 and of.begins_ns(10) == pytest.approx(2.002e9)
 
 
+def test_waveform_settings_become_those_of_returns(imported):
+    """HELIOS++ counts the time of one way."""
+    device = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10, pulseLength_ns=4)
+    legs = "".join(
+        f'<leg><platformSettings x="{x}" y="0" z="20" movePerSec_m="10"/>'
+        '<scannerSettings pulseFreq_hz="1000" scanAngle_deg="20" active="1"/></leg>'
+        for x in (0, 10)
+    )
+    settings = '<FWFSettings binSize_ns="0.3" winSize_ns="1" maxFullwaveRange_ns="100"/>'
+    made, _, of = imported(device, settings + legs)
+    assert (made.scenario.returns.waveform, made.scenario.returns.sample_ns) == ("peaks", 0.6)
+    assert made.left_out == ["maxFullwaveRange_ns: waveforms are as long as their echoes"]
+    assert of.returns_each[0].system_ns(of.carried[0].sensor.optics) == pytest.approx(4 / 2.35482)
+
+
 def test_parts_turn_grow_move_and_fall_as_in_helios(imported):
     scene = GROUND.replace(
         "</scene>",

@@ -18,6 +18,7 @@ from ..base.arguments import as_array, checked, checked_fields
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from .table import TABLE, Column
+from .waveforms import WAVEFORM, Waveforms
 
 CHUNK_POINTS = 1_000_000  # points in memory at a time while a cloud is read in order
 
@@ -170,7 +171,21 @@ class Cloud(Savable):
         return tuple(
             known.get(name) or Column(name, array.dtype.str, "", "")
             for name, array in self.columns.items()
+            if name != WAVEFORM
         )
+
+    @property
+    def waveforms(self) -> Waveforms:
+        """Recorded waveforms of the points.
+
+        LidarpoolError if the survey recorded none: it needs `waveform_samples`.
+        """
+        if WAVEFORM not in self.columns:
+            raise LidarpoolError(
+                "The cloud has no waveforms: give the survey cloud.waveform_samples, and take the "
+                "cloud of its result; of files only LAS and LAZ hold them."
+            )
+        return Waveforms.of(self.columns[WAVEFORM])
 
     @property
     def bounds(self) -> NDArray[np.floating]:

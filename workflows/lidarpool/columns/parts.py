@@ -25,6 +25,7 @@ from ..base.errors import LidarpoolError
 from ..base.storage import Storage, target_of
 from .cloud import CHUNK_POINTS, Cloud, Savable, described, need_packages
 from .table import AXES, SCAN, Column
+from .waveforms import WAVEFORM
 
 # Files of a run in the folder of its parts: its mark, then what it is.
 _OWN = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8}|\d{8,}-\d{8,}\.npz)", re.ASCII)
@@ -32,7 +33,7 @@ _AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans aga
 # Head of an array: format 1.0 of NumPy, and what it says of one row of numbers.
 _MAGIC = b"\x93NUMPY\x01\x00"
 _HEADER = re.compile(
-    rb"\{'descr': '([<>|][a-z]\d+)', 'fortran_order': False, 'shape': \((\d+),\), \} *\n"
+    rb"\{'descr': '([<>|][a-zV]\d+)', 'fortran_order': False, 'shape': \((\d+),\), \} *\n"
 )
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
@@ -134,6 +135,8 @@ class PartColumns:
             c.name: self.scan_column()[rows] if c is SCAN else self.columns[c.name][rows]
             for c in table
         }
+        if WAVEFORM in self.columns:
+            columns[WAVEFORM] = self.columns[WAVEFORM][rows]
         return Cloud(positions(cells, precision_m, origin), columns, tuple(table), sweeps)
 
 
@@ -268,7 +271,7 @@ class StoredCloud(Savable):
     @property
     def table(self) -> tuple[Column, ...]:
         """The columns beside the positions, in the order of files."""
-        rest = [column for column in self.columns if column not in AXES]
+        rest = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
         return (SCAN, *rest)
 
     def cloud_of(self, part: PartColumns, rows: NDArray[np.integer] | slice = slice(None)) -> Cloud:
@@ -350,7 +353,8 @@ class StoredCloud(Savable):
         parts = list(self.chunks())
         if parts:
             return Cloud.joined(parts)
-        columns = {c.name: np.zeros(0, c.dtype) for c in self.table}
+        rest = (column for column in self.columns if column not in AXES)
+        columns = {column.name: np.zeros(0, column.dtype) for column in (SCAN, *rest)}
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)
 
 

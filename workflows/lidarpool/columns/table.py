@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
+from .waveforms import WAVEFORM, column_type
 
 Kind = Literal["number", "label"]  # a colour scale, or one colour for each value
 
@@ -71,7 +72,8 @@ class Column:
         if not self.name.isidentifier():
             raise LidarpoolError(f"A column cannot have the name {self.name!r}: use an identifier.")
         try:
-            known = np.dtype(self.dtype).kind in "iuf"
+            kind = np.dtype(self.dtype).kind
+            known = kind in "iuf" or (kind == "V" and self.name == WAVEFORM)
         except TypeError:
             known = False
         if not known:
@@ -160,6 +162,20 @@ OPTIONAL = (
         "radial_velocity",
     ),
     Column(
+        "amplitude",
+        "float32",
+        "",
+        "height of the echo in the waveform; of one as narrow as the pulse its intensity",
+        "amplitude",
+    ),
+    Column(
+        "pulse_width",
+        "float32",
+        "ns",
+        "full width at half maximum of the echo; without waveforms the pulse's, 0 for no echo",
+        "pulse_width",
+    ),
+    Column(
         "return_number",
         "uint8",
         "",
@@ -240,6 +256,11 @@ def check_names(columns: Iterable[Column]) -> None:
         if name in taken:
             raise LidarpoolError(f"Two columns have the name {name!r} in files: rename one.")
         taken.add(name)
+
+
+def waveform_column(samples: int) -> Column:
+    """Column of recorded waveforms of so many samples, which only parts and clouds hold."""
+    return Column(WAVEFORM, column_type(samples), "", "waveform of the pulse", "waveform")
 
 
 def stored(optional: Sequence[Column]) -> tuple[Column, ...]:

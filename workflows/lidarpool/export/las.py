@@ -1,4 +1,4 @@
-"""LAS and LAZ 1.4, point formats 6 and 7, through laspy."""
+"""LAS and LAZ 1.4, point formats 6 and 7, with waveforms 9 and 10, through laspy."""
 
 from __future__ import annotations
 
@@ -6,20 +6,25 @@ from datetime import UTC, date, datetime
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
+from os import SEEK_END
 from pathlib import Path
+from shutil import copyfileobj
+from struct import Struct
+from tempfile import TemporaryFile
 from textwrap import shorten
-from typing import Any
+from typing import IO, Any
 
 import laspy
 import lazrs
 import numpy as np
-from laspy.vlrs.known import WktCoordinateSystemVlr
+from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, TABLE
+from ..columns.waveforms import WAVEFORM, ZERO, records
 from .sweeps import Sweeps
 
 ANGLE_DEG = 0.006  # of one step of the format's scan angle
@@ -28,6 +33,9 @@ _OF_FORMAT = ("return_number", "returns", "azimuth")  # stored only in fields of
 _GPS_NS = 315_964_800 * 10**9  # from 1970-01-01 to 1980-01-06, the start of GPS time
 _LEAP_S = 18  # that GPS time is ahead of UTC since 2017, the earliest start
 _ADJUSTED_S = 1e9  # that adjusted standard GPS time is behind GPS time
+_EVLR = Struct("<H16sHQ32s")  # head of an extended variable length record
+# Of the header: where the waveform packets and the first such record begin, and their number.
+_WAVES_AT, _WAVES = 227, Struct("<QQI")
 _FAR = 2**31 - 1  # steps from the offset to the farthest point
 # Coordinate systems with UTM zones: name, datum, ellipsoid, 1 / flattening, and their EPSG codes.
 _WGS84 = ("WGS 84", "WGS_1984", "WGS 84", 298.257223563, (4326, 6326, 7030))
@@ -46,10 +54,14 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
     the column `intensity` times 65,535, at most that, and classification `class` if it is below
     256; because of these limits, both columns are in the extra bytes as well. Return numbers are
-    15 at most, and angles in steps of 0.006 degrees.
+    15 at most, and angles in steps of 0.006 degrees. Recorded waveforms make the point format 9, or
+    10 with colours; see `_Packets`.
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
-    header = laspy.LasHeader(version="1.4", point_format=7 if coloured else 6)
+    packets = _Packets.of(cloud)
+    header = laspy.LasHeader(
+        version="1.4", point_format=(6 if packets is None else 9) + (1 if coloured else 0)
+    )
     header.generating_software = "lidarpool"
     header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys without a date begin
     begins_s = 0.0
@@ -62,6 +74,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     # LAS 1.4 wants it of formats 6 and above, with a coordinate system or without; PDAL before
     # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
     header.global_encoding.wkt = True
+    if packets is not None:
+        header.vlrs.extend(packets.descriptors)
+        header.global_encoding.waveform_data_packets_internal = True
     low, high = np.asarray(cloud.bounds, np.float64)
     header.scales = np.full(3, sweeps.precision_m)
     header.offsets = np.floor((low + high) / 2)
@@ -84,20 +99,89 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     try:
         with (
             path.open("wb+") as file,  # laspy leaves a file open that it cannot finish
-            laspy.open(file, "w", header=header, do_compress=compress, closefd=False) as writer,
+            TemporaryFile(dir=path.parent) as beside,
         ):
-            for chunk in cloud.chunks():
-                points = _points(chunk, header, names, begins_s)
-                with deferred_interrupts():  # lazrs replaces errors raised within it
-                    writer.write_points(points)
-            with deferred_interrupts():
-                writer.close()
+            with laspy.open(
+                file, "w", header=header, do_compress=compress, closefd=False
+            ) as writer:
+                for chunk in cloud.chunks():
+                    points = _points(chunk, header, names, begins_s)
+                    if packets is not None:
+                        packets.put(points, chunk, beside)
+                    with deferred_interrupts():  # lazrs replaces errors raised within it
+                        writer.write_points(points)
+                with deferred_interrupts():
+                    writer.close()
+            if packets is not None:
+                packets.append(file, beside)
     except lazrs.LazrsError as error:
         raise OSError(f"{error}; the disk may be full") from error
 
 
 write_las = partial(_write, compress=False)
 write_laz = partial(_write, compress=True)
+
+
+class _Packets:
+    """Waveform packets of a LAS file, which stand behind its points in the same file.
+
+    Samples have 16 bits. There is a descriptor for each distance of samples and each power of two
+    that samples are multiples of; the digitizer's gain is that power. Returns of a pulse whose
+    windows are the same share a packet. The vector of a point is the way towards the sensor in a
+    picosecond, so that the sample at time t is at the point plus (L - t) times the vector, where L
+    is the return point's location.
+    """
+
+    def __init__(self, samples: int, kinds: list[tuple[int, int]]) -> None:
+        self._bytes = 2 * samples
+        self._index = {kind: number for number, kind in enumerate(kinds, 1)}
+        self._end = _EVLR.size  # of the packets, from the head of their record
+        self.descriptors = []
+        for number, (step_ps, exponent) in enumerate(kinds, 1):
+            gain = 2.0**exponent
+            told = WaveformPacketVlr(99 + number, "lidarpool")
+            told.parsed_record = WaveformPacketStruct(16, 0, samples, step_ps, gain, -ZERO * gain)
+            self.descriptors.append(told)
+
+    @classmethod
+    def of(cls, cloud: CloudLike) -> _Packets | None:
+        """Look for all kinds of waveforms of a cloud; None if it has no waveforms."""
+        kinds: set[tuple[int, int]] = set()
+        samples = 0
+        for chunk in cloud.chunks():
+            if WAVEFORM not in chunk.columns:
+                return None
+            rows = records(chunk.columns[WAVEFORM])
+            samples = rows["samples"].shape[1]
+            pairs = np.stack([rows["sample_ps"].astype(np.int64), rows["exponent"]], axis=1)
+            kinds |= {(step, power) for step, power in np.unique(pairs, axis=0).tolist()}
+        return cls(samples, sorted(kinds)) if kinds else None
+
+    def put(self, points: Any, chunk: Cloud, file: IO[bytes]) -> None:
+        """Write the packets of some points, and where they are into the points."""
+        rows = records(chunk.columns[WAVEFORM])
+        new = np.ones(len(rows), np.bool_)
+        new[1:] = (rows["samples"][1:] != rows["samples"][:-1]).any(axis=1)
+        for name in ("begin", "sample_ps", "exponent"):
+            new[1:] |= rows[name][1:] != rows[name][:-1]
+        file.write(rows["samples"][new].tobytes())
+        points.wavepacket_offset = self._end + (np.cumsum(new) - 1) * self._bytes
+        self._end += int(new.sum()) * self._bytes
+        points.wavepacket_size = np.full(len(rows), self._bytes, np.uint32)
+        kinds = zip(rows["sample_ps"].tolist(), rows["exponent"].tolist(), strict=True)
+        points.wavepacket_index = np.array([self._index[kind] for kind in kinds], np.uint8)
+        points.return_point_wave_location = rows["location_ps"]
+        points.x_t, points.y_t, points.z_t = rows["toward"].T
+
+    def append(self, file: IO[bytes], packets: IO[bytes]) -> None:
+        """Append the packets to a finished file of points, and say in its header where they are."""
+        begin = file.seek(0, SEEK_END)
+        size = self._end - _EVLR.size
+        file.write(_EVLR.pack(0, b"LASF_Spec", 65_535, size, b"lidarpool"))
+        packets.seek(0)
+        copyfileobj(packets, file, 1 << 20)
+        file.seek(_WAVES_AT)
+        file.write(_WAVES.pack(begin, begin, 1))
 
 
 def _points(chunk: Cloud, header: laspy.LasHeader, extra: list[str], begins_s: float) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from math import log, pi, sqrt
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -15,7 +16,12 @@ from ..base.errors import LidarpoolError
 from .disc import SUBRAYS, Beam, Profile
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
+FWHM = sqrt(8 * log(2))  # full width at half maximum of a Gaussian, in standard deviations
+WINDOW_SIGMAS = 10  # that an echo takes in a waveform, to both sides together
+# Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
+_RESPONSE = sqrt(log(2)) / (2 * pi)
 
+Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "all"]
 
 
@@ -102,8 +108,8 @@ class Returns:
     pulse_ns: Annotated[
         Pulse | None,
         Field(
-            description="length of the pulse: surfaces less than half of it apart are "
-            "one return; by default the sensor's, or 5",
+            description="length of the pulse, in waveforms at half of its maximum: surfaces less "
+            "than half of it apart are one return; by default the sensor's, or 5",
             examples=[5.0],
         ),
     ] = None
@@ -122,6 +128,25 @@ class Returns:
             examples=[0.01],
         ),
     ] = None
+    waveform: Annotated[
+        Processing,
+        Field(
+            description="how returns are found in the waveform: peaks, or gaussian decomposition; "
+            "none: hits within half of the pulse are one return"
+        ),
+    ] = "none"
+    sample_ns: Annotated[
+        float, Field(ge=0.001, le=1000, description="time between two samples of the waveform")
+    ] = 1.0
+    bandwidth_mhz: Annotated[
+        float | None,
+        Field(
+            ge=0.1,
+            le=1e6,
+            description="of the receiver of waveforms, at -3 dB; by default without limit",
+            examples=[300.0],
+        ),
+    ] = None
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, Sequence):
@@ -138,9 +163,8 @@ class Returns:
             If there are sub-rays, and the divergence is unknown.
         """
         across, up = self._divergence(optics)
-        pulse_ns = optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
         wide = across if across == up else float(np.sqrt(across * up))
-        return wide, LIGHT_M_NS * pulse_ns / 2
+        return wide, LIGHT_M_NS * self.length_ns(optics) / 2
 
     def beam(self, optics: Optics) -> Beam:
         """Sub-rays of a sensor's beam; raises as `of`."""
@@ -158,6 +182,30 @@ class Returns:
             )
         across, up = _pair(wide) if isinstance(wide, Sequence) else (wide or 0.0, wide or 0.0)
         return across / 1000, up / 1000
+
+    def length_ns(self, optics: Optics) -> float:
+        """Length of the pulse."""
+        return optics.pulse_ns if self.pulse_ns is None else self.pulse_ns
+
+    def system_ns(self, optics: Optics) -> float:
+        """Return the standard deviation of the system waveform, ns.
+
+        That is the pulse as the receiver sees it: both are Gaussian, and convolved.
+
+        Raises
+        ------
+        LidarpoolError
+            If the samples are too far apart for it.
+        """
+        response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
+        sigma = sqrt((self.length_ns(optics) / FWHM) ** 2 + response**2)
+        if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
+            raise LidarpoolError(
+                f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "
+                f"wide in the waveform: sample it twice at least, every {FWHM * sigma / 2:.3g} ns, "
+                "or give a longer pulse_ns."
+            )
+        return sigma
 
 
 def _pair(divergence: Sequence[float]) -> tuple[float, float]:

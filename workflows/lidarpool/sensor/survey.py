@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from functools import cached_property, partial
 from itertools import accumulate
+from math import ceil
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -16,11 +17,18 @@ from pydantic import AwareDatetime, Field, Strict
 from ..base.arguments import checked_fields, shown
 from ..base.declared import FILLED_IN, written_as
 from ..base.errors import LidarpoolError
-from ..columns.table import COORDINATES, OPTIONAL, Column, chosen, stored
+from ..columns.table import (
+    COORDINATES,
+    OPTIONAL,
+    Column,
+    chosen,
+    stored,
+    waveform_column,
+)
 from .materials import Material
 from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
-from .optics import Precision, Returns
+from .optics import WINDOW_SIGMAS, Precision, Returns
 from .sensor import Sensor
 from .trajectory import CENTRE, Pose, Stations, Trajectory, pose_of
 from .weather import EXIT_M, FAINTEST, Air, Weather, reach
@@ -141,6 +149,16 @@ class CloudOptions:
             examples=[["time", "range", "intensity"]],
         ),
     ] = ()
+    waveform_samples: Annotated[
+        int,
+        Field(
+            ge=0,
+            le=4096,
+            description="samples of the waveform that are recorded around each return, for LAS and "
+            "LAZ; 0 for none",
+            examples=[80],
+        ),
+    ] = 0
     epsg: Annotated[
         int | None,
         Field(
@@ -268,6 +286,14 @@ class Survey(CloudOptions, Weather):
             )
         for carried, returns in zip(self.carried, self.returns_each, strict=True):
             returns.of(carried.sensor.optics)  # LidarpoolError if they do not fit together
+            if returns.waveform != "none" or self.waveform_samples:
+                sigma_ns = returns.system_ns(carried.sensor.optics)
+                least = ceil(WINDOW_SIGMAS * sigma_ns / returns.sample_ns) + 2
+                if 0 < self.waveform_samples < least:
+                    raise LidarpoolError(
+                        f"waveform_samples is {self.waveform_samples}, and one echo takes {least} "
+                        f"samples of {returns.sample_ns:g} ns: record as many at least."
+                    )
         for number, noise in enumerate(self.noise_each):
             _check_alarms(noise, self.carried[number].sensor)
             if noise.crosstalk:
@@ -361,7 +387,10 @@ class Survey(CloudOptions, Weather):
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:
         """All columns of a part."""
-        return stored(chosen(self.columns))
+        columns = stored(chosen(self.columns))
+        if self.waveform_samples:
+            columns = (*columns, waveform_column(self.waveform_samples))
+        return columns
 
     def extinction(self, sensor: Sensor) -> float:
         """Extinction of the air for a sensor's light, 1/m."""

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 from raybeam import Pattern, ScanReturns
 
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Returns, Sensor, Survey
 from ..sensor.disc import Beam
+from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import Mode, any_axes, axes_about, spread
 from .air import AirCaster
 from .doppler import radial_velocities
@@ -24,6 +25,7 @@ from .paths import Paths
 from .receiver import Receiver
 from .separation import separated
 from .surfaces import Surfaces
+from .waveform import Digitizer, recorded, returns_in
 from .world import World
 
 PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
@@ -45,6 +47,10 @@ class Echoes(ScanReturns):
     cause: NDArray[np.uint8] | None = None  # (k,): why they are there; None if all are surfaces
     # (k,): radial velocities, m/s; None if they are those of the rays' ends, or not needed.
     velocity: Real | None = None
+    # (k,): full width at half maximum in the waveform, ns, and height; None without waveforms.
+    width: Real | None = None
+    amplitude: Real | None = None
+    waveform: NDArray[np.void] | None = None  # (k,): recorded, but for the location
 
 
 class EchoCaster:
@@ -60,7 +66,11 @@ class EchoCaster:
         self._paths = Paths(caster, scene, survey, self._sensor, surfaces, seed)
         self._air = AirCaster(number, survey, surfaces) if survey.returns_light else None
         # Whether each ray that hits something has one return.
-        several = self._returns.subrays > 1 or self._noise.loses
+        self._finds = self._returns.waveform != "none"  # returns in waveforms
+        self._records = survey.waveform_samples  # of each return
+        waves = self._finds or self._records > 0
+        self._digitizer = digitizer_of(self._returns, self._sensor) if waves else None
+        several = self._returns.subrays > 1 or self._noise.loses or waves
         self._one_each = surfaces.materials.plain and not several
         # Whether its returns are the caster's hits.
         self.plain = self._one_each and not self._noise.displaces
@@ -129,16 +139,24 @@ class EchoCaster:
                 if self._air is not None:
                     hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
                 hits = self._paths.with_velocities(hits, beams, here, window)
-                returns = separated(hits, self._gap_m, len(beam), planes)
+                if self._finds:
+                    assert self._digitizer is not None
+                    returns = returns_in(hits, self._digitizer, len(beam), planes)
+                else:
+                    returns = separated(hits, self._gap_m, len(beam), planes)
                 returns = self._detected(returns._replace(ray=start + returns.ray), keys)
                 if self._receiver.adds:
                     every = np.arange(start, stop)
                     middles = (every - start) * len(beam)
                     returns = self._receiver.added(returns, keys, every, beams, here, middles, row)
-                chunks.append(returns.take(chosen(returns, self._returns.mode)))
+                returns = returns.take(chosen(self._heights(returns), self._returns.mode))
+                if self._records:
+                    returns = self._with_waveforms(returns, hits, start, keys)
+                chunks.append(returns)
             found = self._kept(joined(chunks), groups, tally)
         if noise.moves_ranges:
-            reported = noise.ranges(found.distance, found.energy, *keys.of(found.ray), found.number)
+            height = found.energy if found.amplitude is None else found.amplitude
+            reported = noise.ranges(found.distance, height, *keys.of(found.ray), found.number)
             found = replace(found, reported=reported)
         return found
 
@@ -232,8 +250,28 @@ class EchoCaster:
         """Select the returns that are detected."""
         if not self._noise.loses:
             return returns
-        seen = self._noise.detected(returns.energy, *keys.of(returns.ray), numbers(returns.ray))
+        height = self._heights(returns).energy
+        seen = self._noise.detected(height, *keys.of(returns.ray), numbers(returns.ray))
         return returns.take(seen)
+
+    def _heights(self, returns: Hits) -> Hits:
+        """Return returns with the heights of their echoes in place of energies."""
+        if returns.width is None or self._digitizer is None:
+            return returns
+        return returns._replace(energy=self._digitizer.amplitude(returns.energy, returns.width))
+
+    def _with_waveforms(self, returns: Hits, hits: Hits, start: int, keys: Keys) -> Hits:
+        """Record the waveforms of returns; `start` is the beam of the first sub-rays."""
+        assert self._digitizer is not None
+        noise = None
+        if self._noise.threshold:
+            sigma = self._noise.threshold / THRESHOLD_SIGMAS
+            here = Keys(keys.scan, keys.begins - start)
+            noise = sigma, self._noise.seed, here
+        given = returns._replace(ray=returns.ray - start)
+        each = len(self._beam)
+        waveform = recorded(hits, given, self._digitizer, each, self._records, noise)
+        return returns._replace(waveform=waveform)
 
     def _kept(self, returns: Hits, groups: Whole, tally: bool) -> Echoes:
         """Count the returns of each scan and thin them out."""
@@ -244,6 +282,7 @@ class EchoCaster:
         place = np.arange(len(ray)) - np.repeat(cuts[:-1], np.diff(cuts))
         kept = place % self._survey.keep_every == 0
         thinned = returns.take(kept)
+        amplitude = None if thinned.width is None else self._heights(thinned).energy
         return Echoes(
             ray=thinned.ray.astype(np.uint32),
             distance=thinned.distance,
@@ -258,7 +297,16 @@ class EchoCaster:
             colour=thinned.colour,
             cause=thinned.cause,
             velocity=thinned.velocity,
+            width=thinned.width,
+            amplitude=amplitude,
+            waveform=thinned.waveform,
         )
+
+
+def digitizer_of(returns: Returns, sensor: Sensor) -> Digitizer:
+    """Return what samples the waveforms of a sensor."""
+    system_ns = returns.system_ns(sensor.optics)
+    return Digitizer(system_ns, returns.sample_ns, returns.waveform == "gaussian")
 
 
 def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:

@@ -32,14 +32,19 @@ class Hits(NamedTuple):
     colour: NDArray[np.uint32] | None = None  # packed, see `Surfaces.colours`
     cause: NDArray[np.uint8] | None = None  # None if all are surfaces
     velocity: Real | None = None  # radial, m/s, if a column has it; NaN if unknown
+    # Full width at half maximum in the waveform, ns; None if returns are made without.
+    width: Real | None = None
+    waveform: NDArray[np.void] | None = None  # of returns: recorded, see `recorded`
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
         colour = None if self.colour is None else self.colour[rows]
         cause = None if self.cause is None else self.cause[rows]
         velocity = None if self.velocity is None else self.velocity[rows]
+        width = None if self.width is None else self.width[rows]
+        waveform = None if self.waveform is None else self.waveform[rows]
         own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
-        return Hits(*own, colour, cause, velocity)
+        return Hits(*own, colour, cause, velocity, width, waveform)
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
@@ -51,14 +56,15 @@ def joined(parts: list[Hits]) -> Hits:
     """Concatenate hits; all have colours, or none.
 
     If some have a cause, those without are surfaces; if some have a velocity, that of those without
-    is unknown.
+    is unknown; those without a width have the width 0.
     """
-    *own, colours, causes, velocities = zip(*parts, strict=True)
-    colour = None if parts[0].colour is None else np.concatenate(colours)
+    *own, colours, causes, velocities, widths, waveforms = zip(*parts, strict=True)
     return Hits(*map(np.concatenate, own))._replace(
-        colour=colour,
+        colour=None if parts[0].colour is None else np.concatenate(colours),
         cause=_filled(parts, causes, np.uint8(SURFACE)),
         velocity=_filled(parts, velocities, np.float64(np.nan)),
+        width=_filled(parts, widths, np.float64(0)),
+        waveform=None if parts[0].waveform is None else np.concatenate(waveforms),
     )
 
 

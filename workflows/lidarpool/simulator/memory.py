@@ -8,11 +8,13 @@ from functools import partial
 import numpy as np
 
 from ..columns.table import VELOCITY
+from ..columns.waveforms import record
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from .device import needs_hits
 from .echoes import CHUNK_RAYS
 from .rig import rays_repeat
+from .waveform import BLOCK_HITS, BLOCK_SAMPLES
 
 MB = 1_000_000
 
@@ -40,6 +42,11 @@ RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3
 AIR, AIR_HIT = 110, 200  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
+# A hit of those whose waveforms are searched at a time, by how returns are found; up to twice the
+# whole where no beam is.
+SEARCHED = {"none": 0, "peaks": 850, "gaussian": 2400}
+# A byte of recorded waveforms, of all returns, and a sample of those made at a time.
+RECORDED, SAMPLED = 2.3, 40
 # Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns
 # of several runs of scans, by station and sensor, are joined.
 PAGE_LOCKED, JOINED = 2, 1
@@ -62,11 +69,12 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     moving = any(column.name == VELOCITY for column in survey.stored_columns)
     bodies = bool(scene.actors or scene.instances)
     columns = sum(np.dtype(column.dtype).itemsize for column in survey.stored_columns)
+    recorded = record(survey.waveform_samples).itemsize if survey.waveform_samples else 0
     plain = all(
-        returns.subrays == 1 and not (noise.loses or noise.displaces)
+        returns.subrays == 1 and returns.waveform == "none" and not (noise.loses or noise.displaces)
         for returns, noise in zip(survey.returns_each, survey.noise_each, strict=True)
     )
-    made_there = on_device and plain and not (passing or dark)
+    made_there = on_device and plain and not (passing or dark or recorded)
     by_numpy = not made_there or needs_hits(survey)
     most = 0.0
     each = zip(
@@ -74,7 +82,8 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     )
     for number, (carried, steps, reported, noise) in enumerate(each):
         sensor, subrays = carried.sensor, reported.subrays
-        echoes = subrays > 1 or noise.loses or passing or dark
+        waves = survey.waveform_samples > 0 or reported.waveform != "none"
+        echoes = subrays > 1 or noise.loses or passing or dark or waves
         several = reported.mode in ("all", "dual") and (subrays > 1 or passing)
         first, stop = sensor.firings(0)
         firings = (stop - first) * scans
@@ -112,7 +121,13 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
                 found += CROSSED * _others(survey, sensor) * chunk / subrays
             if survey.returns_light:
                 found += AIR * chunk + AIR_HIT * in_air * chunk / subrays
-            casting += max(found, RETURN_ALL * returns + RETURN_KEPT * points)
+            found += SEARCHED[reported.waveform] * min(chunk, BLOCK_HITS) * (subrays > 1)
+            every = RETURN_ALL * returns + RETURN_KEPT * points
+            if recorded:
+                found += SAMPLED * min(chunk * survey.waveform_samples, BLOCK_SAMPLES)
+                found += recorded * returns
+                every += RECORDED * recorded * returns
+            casting += max(found, every)
         if by_numpy:  # as if it made all columns, and once more those of the device
             point = POINT + POINT_BYTE * columns + columns * made_there
         else:

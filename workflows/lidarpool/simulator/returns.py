@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..columns.table import Column
+from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
+from ..sensor.optics import LIGHT_M_NS
 from .doppler import radial_velocities
 from .echoes import Echoes
 from .hits import FALSE_ALARM, NO_SURFACE
@@ -314,6 +316,32 @@ class BatchReturns:
         if noise.velocity_m_s:
             velocity = noise.velocities(velocity, self.scan, self.ray, self.return_number)
         return velocity
+
+    @property
+    def amplitude(self) -> NDArray[np.float64]:
+        """Height of the echo in the waveform; without waveforms its energy."""
+        return self.intensity if self.found.amplitude is None else self.found.amplitude
+
+    @property
+    def pulse_width(self) -> NDArray[np.float64]:
+        """Full width at half maximum of the echo in the waveform, nanoseconds."""
+        if self.found.width is None:
+            returns = self.survey.returns_each[self.specs[0].sensor]
+            return np.full(len(self), returns.length_ns(self.sensor.optics))
+        return self.found.width
+
+    @property
+    def waveform(self) -> NDArray[np.void]:
+        """Recorded waveform, see `lidarpool.columns.waveforms.record`."""
+        made = self.found.waveform
+        assert made is not None  # or there would be no such column
+        made = made.copy()
+        begin_ps = made["begin"] * made["sample_ps"].astype(np.float64)
+        made["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
+        world = self.survey.coordinates == "world"
+        ahead = self.directions if world else self._sensor_directions
+        made["toward"] = -ahead * (LIGHT_M_NS / 2000)
+        return made.view(column_type(made.dtype["samples"].shape[0]))
 
     @property
     def return_number(self) -> NDArray[np.uint8]:

@@ -49,7 +49,7 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
             if len(falls):
                 part, marks = hits.take(falls), new[falls]
                 normal, direction = planes(rows[falls])
-                new[falls] &= ~_continued(part, marks, gap_m, each, normal, direction)
+                new[falls] &= ~continued(part, marks, gap_m, each, normal, direction)
     begins = np.flatnonzero(new)
     which = np.cumsum(new) - 1
     energy = np.bincount(which, hits.energy).astype(np.float64)
@@ -65,7 +65,7 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     return Hits(*own, colour, cause, velocity)
 
 
-def _continued(
+def continued(
     hits: Hits, new: NDArray[np.bool_], gap_m: float, each: int, normal: Real, direction: Real
 ) -> NDArray[np.bool_]:
     """Whether a surface continues from before each hit to behind it: no return begins, (n,).

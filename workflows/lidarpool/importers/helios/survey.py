@@ -117,6 +117,8 @@ class _Import:
             self._notes.append("legRandomOffset: legs are where they say")
         if number(element, "numRuns", 1) > 1:
             self._notes.append("numRuns: it is one run")
+        if number(self._full_waveform(), "maxFullwaveRange_ns", 0) > 0:
+            self._notes.append("maxFullwaveRange_ns: waveforms are as long as their echoes")
         unsupported = (line for scanner in self._scanners.values() for line in unread(scanner))
         self.left_out = list(dict.fromkeys([*self._notes, *unsupported, *self._scene.left_out()]))
 
@@ -226,24 +228,40 @@ class _Import:
         sensors = {name: _dumped(sensor) for name, sensor in self._files.items()}
         return {**files, **sensors, SCENARIO_FILE: text}
 
+    def _full_waveform(self) -> dict[str, str]:
+        """FWFSettings of the scanner, and over these those of the survey."""
+        given = self._first.child("FWFSettings"), self._element.find("FWFSettings")
+        return {name: v for one in given if one is not None for name, v in one.attrib.items()}
+
     def _light(self) -> tuple[dict[str, Any], dict[str, float]]:
         """Return sections on light, and ranges that the survey sets for its scanner."""
         scanner, detector = self._first, self._element.find("detectorSettings")
         own = {} if detector is None else detector.attrib
-        quality = 3.0
-        for settings in (scanner.child("FWFSettings"), self._element.find("FWFSettings")):
-            if settings is not None:
-                quality = number(settings, "beamSampleQuality", quality)
+        fwf = self._full_waveform()
+        quality = number(fwf, "beamSampleQuality", 3.0)
         sections = {
             "returns": {
                 "mode": "first" if scanner.number("maxNOR") == 1 else "all",
                 "subrays": SUBRAYS[int(np.clip(quality - 1, 0, len(SUBRAYS) - 1))],
+                **waveform(fwf, scanner.number("pulseLength_ns", 4)),
             },
             "noise": {"range_m": clean(number(own, "accuracy_m", scanner.number("accuracy_m")))},
             "weather": {"visibility_km": clean(scanner.number("atmosphericVisibility_km", 23))},
         }
         ranges = {"min_range_m": "rangeMin_m", "max_range_m": "rangeMax_m"}
         return sections, {ours: number(own, n, 0) for ours, n in ranges.items() if n in own}
+
+
+def waveform(settings: dict[str, str], pulse_ns: float) -> dict[str, Any]:
+    """Return the fields of `returns` that FWFSettings say, where they say anything of waveforms.
+
+    HELIOS++ has range over the speed of light for the time, which is half of the time that light
+    takes there and back.
+    """
+    if "binSize_ns" not in settings and "winSize_ns" not in settings:
+        return {}
+    sample_ns = 2 * number(settings, "binSize_ns", 0.25)
+    return {"waveform": "peaks", "sample_ns": clean(min(sample_ns, pulse_ns / 2))}
 
 
 def _dumped(data: dict[str, Any]) -> str:

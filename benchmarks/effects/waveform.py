@@ -1,0 +1,123 @@
+"""Waveforms at an edge and in a tree, and the returns that three receivers find in them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import matplotlib.pyplot as plt
+import numpy as np
+
+from lidarpool import Beams, Material, Mesh, Optics, Pose, Returns, Scene, Sensor, Spin, Survey
+from lidarpool.columns.cloud import Cloud
+from lidarpool.columns.table import AXES, SCAN
+from lidarpool.columns.waveforms import WAVEFORM
+from lidarpool.scene.plants import SPECIES, tree
+from lidarpool.sensor.optics import FWHM, LIGHT_M_NS
+from lidarpool.simulator.batch import columns_of
+from lidarpool.simulator.rig import Rig
+
+DRAWS = "effect-waveform.png"
+
+_HEIGHT_M = 300.0
+_PULSE_NS = 5.0
+_COLUMNS = ["range", "intensity", "amplitude", "pulse_width"]
+_LANES = {
+    "none": ("half a pulse, c τ / 2", "#7f7f7f", "s"),
+    "peaks": ("peaks", "#d95f02", "^"),
+    "gaussian": ("gaussian", "#1b6ca8", "o"),
+}
+
+
+def on(survey: Survey) -> Survey:
+    """Return the survey with a Gaussian decomposition of beams of 19 sub-rays."""
+    returns = Returns("all", subrays=19, waveform="gaussian")
+    return replace(survey, returns=returns)
+
+
+def _seen(scene: Scene, at: tuple[float, float], samples: int = 0, **returns: Any) -> Cloud:
+    """Points of one pulse that looks straight down."""
+    sensor = Sensor(Beams(np.zeros(1)), Spin(1, 360), optics=Optics(divergence_mrad=2.5))
+    given = {"subrays": 217, "pulse_ns": _PULSE_NS, "mode": "all", **returns}
+    survey = Survey(
+        sensor,
+        poses=[Pose((*at, _HEIGHT_M), pitch_deg=90)],
+        steps=1,
+        columns=_COLUMNS,
+        materials=[Material("*", 0.4)],
+        returns=Returns(**given),
+        precision_m=1e-3,
+        waveform_samples=samples,
+    )
+    part = columns_of(list(Rig(scene, survey).cast(0, 1)))
+    table = (SCAN, *(c for c in survey.stored_columns if c not in AXES and c.name != WAVEFORM))
+    return part.cloud(table, survey.precision_m, np.zeros(3))
+
+
+def _flat(name: str, height: float, x: tuple[float, float]) -> Mesh:
+    corners = [[x[0], -9, height], [x[1], -9, height], [x[1], 9, height], [x[0], 9, height]]
+    return Mesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, float]) -> None:
+    """Draw the waveform of a pulse over height, its parts, and what is found."""
+    hits = _seen(scene, at, pulse_ns=0.001)
+    found = {name: _seen(scene, at, 160, waveform=name) for name in _LANES}
+    waves = found["gaussian"].waveforms
+    heights = _HEIGHT_M - waves.times_ns[0] * LIGHT_M_NS / 2
+    top = waves.samples[0].max()
+    axes.vlines(
+        _HEIGHT_M - hits["range"], 0, hits["intensity"] / top, color="#9ecf9e", lw=1.2,
+        label="hits of sub-rays", zorder=1,
+    )  # fmt: skip
+    axes.plot(heights, waves.samples[0] / top, ".", color="black", ms=4, zorder=4, label="samples")
+    fine = np.linspace(*span, 800)
+    finer = _seen(scene, at, 1600, waveform="peaks", sample_ns=0.1).waveforms
+    axes.plot(
+        _HEIGHT_M - finer.times_ns[0] * LIGHT_M_NS / 2, finer.samples[0] / top, color="black", lw=1,
+        label="waveform",
+    )  # fmt: skip
+    parts = found["gaussian"]
+    for row in range(len(parts)):
+        wide = parts["pulse_width"][row] / FWHM * LIGHT_M_NS / 2
+        middle = _HEIGHT_M - parts["range"][row]
+        bell = parts["amplitude"][row] / top * np.exp(-0.5 * ((fine - middle) / wide) ** 2)
+        label = "fitted Gaussians" if row == 0 else None
+        axes.plot(fine, bell, color=_LANES["gaussian"][1], lw=1, ls="--", label=label)
+    for lane, (name, (_, colour, marker)) in enumerate(_LANES.items()):
+        where = _HEIGHT_M - found[name]["range"]
+        axes.axhline(-0.10 - 0.11 * lane, color="#dddddd", lw=0.8, zorder=0)
+        axes.plot(where, np.full(len(where), -0.10 - 0.11 * lane), marker, color=colour, ms=6)
+    axes.set(xlim=span[::-1], ylim=(-0.42, 1.08), xlabel="height above ground, m")
+    axes.set_yticks([0, 0.25, 0.5, 0.75, 1])
+    axes.spines[["top", "right"]].set_visible(False)
+
+
+def picture(path: Path) -> None:
+    """Draw the picture."""
+    figure, (left, right) = plt.subplots(
+        1, 2, figsize=(10, 4.2), layout="constrained", width_ratios=(1, 1.5), sharey=True
+    )
+    step = Scene.from_meshes([_flat("Terrace", 0.0, (-9, 9)), _flat("Roof", 0.68, (-9, 0.03))])
+    _panel(left, step, (0.0, 0.0), (-1.2, 2.0))
+    left.set_title("edge of a roof, 0.68 m above a terrace", fontsize=10)
+    left.set_ylabel("received power, of the highest sample")
+    oak = tree(SPECIES[0])
+    wood = Scene.from_meshes([_flat("Ground", 0.0, (-20, 20)), oak])
+    _panel(right, wood, (2.8, 2.0), (-1.5, 14.5))
+    right.set_title("an oak", fontsize=10)
+    for axes in (left, right):
+        for lane, (label, colour, _) in enumerate(_LANES.values()):
+            place = axes.get_xlim()[0]
+            axes.annotate(
+                label, (place, -0.10 - 0.11 * lane), color=colour, fontsize=8, va="bottom",
+                xytext=(2, 1), textcoords="offset points",
+            )  # fmt: skip
+    right.legend(fontsize=8, frameon=False)
+    figure.suptitle(
+        "One pulse of 5 ns (FWHM) from 300 m, 0.75 m wide on the ground, and its returns",
+        fontsize=11,
+    )
+    figure.savefig(path, dpi=110)
+    plt.close(figure)

@@ -1,0 +1,364 @@
+"""Waveforms: returns by peaks and by decomposition, and waveforms that are recorded."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tests.lidarpool.casting import cast_between
+from tests.lidarpool.test_echoes import beam_along_x, cast, wall
+
+from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
+from lidarpool.columns.parts import pack, unpack
+from lidarpool.columns.table import AXES, CAUSES, SCAN
+from lidarpool.columns.waveforms import WAVEFORM
+from lidarpool.scene.mesh import Mesh
+from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
+from lidarpool.simulator.batch import columns_of
+from lidarpool.simulator.hits import Hits
+from lidarpool.simulator.rig import Rig
+from lidarpool.simulator.waveform import Digitizer, returns_in
+from raybeam import available_backends
+
+SIGMA_NS = 5 / FWHM
+SIGMA_M = SIGMA_NS * LIGHT_M_NS / 2
+COLUMNS = ("ray", "range", "intensity", "amplitude", "pulse_width", "return_number", "returns")
+
+
+def found(apart, decomposes, energies=(2.0, 1.4), sample_ns=1.0):
+    """Ranges behind the first hit, in σ, energies and widths of two hits so many σ apart."""
+    distance = 100 + np.array([0, apart]) * SIGMA_M
+    hits = Hits(np.arange(2), distance, np.zeros(2, np.int32), np.array(energies))
+    made = returns_in(hits, Digitizer(SIGMA_NS, sample_ns, decomposes), each=2)
+    return (made.distance - 100) / SIGMA_M, 2 * made.energy, made.width
+
+
+# -- closed form ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("apart", "peaks"), [(0.5, 1), (1.9, 1), (1.99, 1), (2.05, 2), (3, 2)])
+def test_two_equal_echoes_are_two_peaks_beyond_two_standard_deviations(apart, peaks):
+    place, energy, width = found(apart, decomposes=False, energies=(1, 1), sample_ns=0.1)
+    assert len(place) == peaks
+    assert energy.sum() == pytest.approx(2, rel=1e-4)
+    assert place.mean() == pytest.approx(apart / 2, abs=1e-3)
+    if peaks == 1:  # the peak is in the middle, and so high
+        height = 2 * math.exp(-((apart / 2) ** 2) / 2)
+        assert width == pytest.approx([5 * 2 / height], rel=1e-3)
+
+
+@pytest.mark.parametrize("apart", [1.9, 2.5, 3.0, 5.0, 8.0, 20.0])
+def test_decomposition_gives_both_echoes_back(apart):
+    place, energy, width = found(apart, decomposes=True)
+    assert place == pytest.approx([0, apart], abs=2e-5)
+    assert energy == pytest.approx([2.0, 1.4], rel=1e-4)
+    assert width == pytest.approx([5, 5], rel=1e-4)
+
+
+def test_hits_close_together_are_one_echo_in_closed_form():
+    for decomposes in (False, True):
+        place, energy, width = found(0.2, decomposes)
+        mean, share = 0.2 * 1.4 / 3.4, 2 * 1.4 / 3.4**2
+        assert place == pytest.approx([mean])
+        assert energy == pytest.approx([3.4])
+        assert width == pytest.approx([5 * math.sqrt(1 + share * 0.2**2)])
+
+
+def test_the_closed_form_goes_over_into_the_samples():
+    """Just below and just above the width of what is one echo in closed form."""
+    for decomposes in (False, True):
+        below, above = (np.concatenate(found(d, decomposes)) for d in (0.2499, 0.2501))
+        assert above == pytest.approx(below, rel=2e-3, abs=1e-3)
+
+
+@pytest.mark.parametrize("decomposes", [False, True])
+def test_any_batch_gives_the_same_bits(decomposes):
+    random = np.random.default_rng(1)
+    pulses, each = 200, 19
+    distance = 100 + np.sort(random.uniform(0, 1, (pulses, each)), axis=1) * 10
+    distance *= random.uniform(0.01, 1, (pulses, 1))
+    energy = random.uniform(0.1, 1, (pulses, each))
+    rays, receiver = np.arange(each), Digitizer(SIGMA_NS, 1.0, decomposes)
+
+    def made(some):
+        ray = (rays + each * np.arange(len(some))[:, None]).ravel()
+        surface = np.zeros(len(ray), np.int32)
+        hits = Hits(ray, distance[some].ravel(), surface, energy[some].ravel())
+        out = returns_in(hits, receiver, each)
+        assert np.bincount(out.ray, out.energy) == pytest.approx(energy[some].mean(axis=1), rel=0.3)
+        return out
+
+    whole = made(np.arange(pulses))
+    alone = [made(np.array([pulse])) for pulse in range(pulses)]
+    for name in ("distance", "energy", "width"):
+        joined = np.concatenate([getattr(one, name) for one in alone])
+        assert np.array_equal(getattr(whole, name), joined)
+
+
+# -- surfaces ------------------------------------------------------------------------------------
+
+
+def tilted(degrees):
+    """A wall across x, 20 m away, turned about z."""
+    a = math.radians(degrees)
+    across, up = np.array([-math.sin(a), math.cos(a), 0]), np.array([0, 0, 1.0])
+    middle = np.array([20.0, 0, 0])
+    corners = [
+        middle + s * 30 * across + t * 30 * up for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
+    ]
+    return Mesh("W", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
+@pytest.mark.parametrize("degrees", [0, 45, 65, 75])
+def test_a_slanted_wall_stretches_the_echo(waveform, degrees):
+    """By the standard deviation of ranges in a disc, R tan θ · divergence / 4."""
+    returns = Returns(
+        "all", subrays=61, divergence_mrad=20, pulse_ns=5, waveform=waveform, sample_ns=0.5
+    )
+    given = {"returns": returns, "columns": COLUMNS, "materials": [Material("*", 1.0)]}
+    echo = cast([tilted(degrees)], **given)
+    spread_ns = 20 * math.tan(math.radians(degrees)) * 0.020 / 4 * 2 / LIGHT_M_NS
+    width = FWHM * math.hypot(SIGMA_NS, spread_ns)
+    assert len(echo["range"]) == 1
+    # The near side returns more, which moves the peak by some centimetres.
+    assert echo["range"] == pytest.approx([20], abs=0.06 if degrees == 75 else 0.01)
+    assert echo["pulse_width"] == pytest.approx([width], rel=0.02)
+    energy = math.cos(math.radians(degrees)) / 4
+    assert echo["intensity"] == pytest.approx([energy], rel=0.03)
+    assert echo["amplitude"] == pytest.approx(echo["intensity"] * 5 / echo["pulse_width"], rel=1e-5)
+
+
+@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
+def test_a_road_that_the_beam_grazes_is_one_echo(waveform):
+    returns = Returns("all", subrays=19, divergence_mrad=20, pulse_ns=2, waveform=waveform)
+    echo = cast([tilted(85)], returns=returns, columns=COLUMNS)
+    assert len(echo["range"]) == 1
+    assert echo["pulse_width"] > 10
+
+
+@pytest.mark.parametrize(
+    ("waveform", "apart_m", "echoes"),
+    [("none", 0.7, 1), ("peaks", 0.7, 2), ("peaks", 0.6, 1), ("gaussian", 0.6, 2)],
+)
+def test_what_is_told_apart_at_an_edge(waveform, apart_m, echoes):
+    """By c τ / 2, 0.75 m for 5 ns; by peaks 2 σ, 0.64 m; by decomposition less."""
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 20 + apart_m)]
+    returns = Returns("all", subrays=217, divergence_mrad=1, pulse_ns=5, waveform=waveform)
+    echo = cast(meshes, returns=returns, columns=COLUMNS)
+    assert len(echo["range"]) == echoes
+    if echoes == 2:
+        assert echo["object"].tolist() == [0, 1]
+        near = 0.001 if waveform == "gaussian" else 0.25  # peaks attract each other
+        assert echo["range"] == pytest.approx([20, 20 + apart_m], abs=near)
+
+
+def test_the_receiver_widens_the_echo():
+    """A Gaussian receiver of bandwidth B responds with 0.3120 / B (full width at half maximum)."""
+    returns = Returns("all", pulse_ns=3, waveform="peaks", bandwidth_mhz=100)
+    echo = cast([wall("W", 10)], returns=returns, columns=COLUMNS)
+    assert echo["pulse_width"] == pytest.approx([math.hypot(3, 3.120)], rel=1e-3)
+
+
+def test_heights_decide_which_echoes_are_detected_and_strongest():
+    """A slanted wall returns as much light as one at right angles, and half of the height."""
+    returns = Returns("all", subrays=61, divergence_mrad=20, pulse_ns=5, waveform="peaks")
+    columns = COLUMNS
+    seen = cast([tilted(75)], returns=returns, columns=columns)
+    assert seen["amplitude"] < 0.7 * seen["intensity"]
+    energy = float(seen["intensity"][0])
+    # A threshold just below the energy, five standard deviations above the height.
+    limit = 10 * math.sqrt(0.1 / (0.95 * energy))
+    noise = Noise(detection_range_m=limit)
+    lost = [
+        len(
+            cast([tilted(75)], returns=returns, columns=columns, noise=replace(noise, seed=k))[
+                "ray"
+            ]
+        )
+        for k in range(20)
+    ]
+    assert sum(lost) <= 2, "by energy, more than half of them would be there"
+
+
+# -- surveys -------------------------------------------------------------------------------------
+
+
+def fence():
+    """Pales at several distances, which beams hit two or three of."""
+    pales = range(60)
+    return Scene.from_meshes(
+        [wall(f"P{k}", 5 + 0.3 * (7 * k % 10), y=(0.2 * k, 0.2 * k + 0.25)) for k in pales]
+    )
+
+
+def survey(**given):
+    beams = Beams(np.radians([-30, -15, -8, 0]))
+    sensor = Sensor(beams, Spin(1800, 10), 0, 100, optics=Optics(divergence_mrad=30))
+    returns = given.pop("returns", Returns("all", subrays=19, waveform="gaussian", pulse_ns=4))
+    options = {"poses": [(0, 0, 1)], "steps": 8, "columns": COLUMNS, "returns": returns}
+    return Survey(sensor, **options | given)
+
+
+@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
+def test_scans_in_one_cast_or_each_by_itself_are_the_same(waveform):
+    noise = Noise(range_m=0.02, angle_deg=0.1, detection_range_m=60)
+    made = survey(noise=noise, returns=Returns("all", subrays=19, waveform=waveform, pulse_ns=4))
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 8])
+    assert len(whole["x"]) > 4 * 400
+    assert cast_between(rig, made, range(9)) == (whole, tally)
+
+
+@pytest.mark.skipif("embree" not in available_backends(), reason="needs Embree")
+def test_embree_and_numpy_agree():
+    rigs = [Rig(fence(), survey(), backend) for backend in ("numpy", "embree")]
+    first, second = (cast_between(rig, rig.survey, [0, 8]) for rig in rigs)
+    assert first == second
+
+
+def test_what_does_not_fit_together_is_refused():
+    with pytest.raises(LidarpoolError, match=r"sample_ns is 1, and the pulse is 1 ns wide"):
+        survey(returns=Returns(waveform="peaks", pulse_ns=1))
+    assert Returns(pulse_ns=5).system_ns(Optics()) == pytest.approx(SIGMA_NS)
+
+
+# -- recorded ------------------------------------------------------------------------------------
+
+
+def cloud_of(made, scene=None):
+    """Cloud of all scans of a survey, as its part has it."""
+    rig = Rig(scene or fence(), made, "numpy")
+    part = unpack(bytes(pack(columns_of(list(rig.cast(0, made.scan_count))))))
+    table = (SCAN, *(c for c in made.stored_columns if c not in AXES and c.name != WAVEFORM))
+    return part.cloud(table, made.precision_m, np.zeros(3))
+
+
+def test_a_recorded_waveform_is_the_sum_of_the_echoes():
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 22)]
+    beam = beam_along_x(divergence_mrad=1)
+    returns = Returns("all", subrays=217, pulse_ns=5, waveform="gaussian")
+    options = {"returns": returns, "columns": COLUMNS, "waveform_samples": 60}
+    made = Survey(beam, poses=[(0, 0, 0)], steps=1, precision_m=1e-6, **options)
+    cloud = cloud_of(made, Scene.from_meshes(meshes))
+    waves = cloud.waveforms
+    assert len(cloud) == 2
+    assert waves.samples.shape == (2, 60)
+    assert np.array_equal(waves.samples[0], waves.samples[1]), "one pulse, one window"
+    assert waves.location_ns == pytest.approx(cloud["range"] * 2 / LIGHT_M_NS, abs=1e-5)
+    model = sum(
+        height * np.exp(-0.5 * ((waves.times_ns[0] - at) / SIGMA_NS) ** 2)
+        for height, at in zip(cloud["amplitude"], waves.location_ns, strict=True)
+    )
+    step = 2.0 ** np.ceil(np.log2(model.max() / 63_487))
+    assert waves.samples[0] == pytest.approx(model, abs=step + 2e-3 * model.max())
+
+
+def test_returns_that_are_far_apart_have_windows_of_their_own():
+    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 60)]
+    returns = Returns("all", subrays=61, pulse_ns=5, divergence_mrad=1)
+    made = Survey(beam_along_x(), poses=[(0, 0, 0)], steps=1, returns=returns, waveform_samples=40)
+    waves = cloud_of(made, Scene.from_meshes(meshes)).waveforms
+    assert waves.times_ns[1, 0] - waves.times_ns[0, 0] == pytest.approx(40 * 2 / LIGHT_M_NS, abs=1)
+    peaks = waves.times_ns[[0, 1], waves.samples.argmax(axis=1)]
+    assert peaks == pytest.approx(waves.location_ns, abs=0.51)
+
+
+def test_recorded_noise_is_a_fifth_of_the_threshold():
+    noise = Noise(detection_range_m=30)
+    made = survey(noise=noise, waveform_samples=100)
+    waves = cloud_of(made).waveforms
+    tail = waves.samples[:, -20:][waves.samples.max(axis=1) < 50 * noise.threshold]
+    quiet = tail[np.abs(tail) < noise.threshold]
+    assert len(quiet) > 2000
+    assert quiet.std() == pytest.approx(noise.threshold / 5, rel=0.1)
+    assert quiet.mean() == pytest.approx(0, abs=noise.threshold / 50)
+
+
+def test_recording_changes_no_point_and_no_batch_changes_a_record():
+    made = survey(noise=Noise(range_m=0.02, detection_range_m=60), waveform_samples=64)
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 8])
+    assert cast_between(rig, made, range(9)) == (whole, tally)
+    without = replace(made, waveform_samples=0)
+    bare, _ = cast_between(Rig(fence(), without, "numpy"), without, [0, 8])
+    assert whole.keys() - bare.keys() == {WAVEFORM}
+    assert all(whole[name] == values for name, values in bare.items())
+
+
+def test_fog_and_false_alarms_have_waveforms_too():
+    noise = Noise(detection_range_m=60, false_alarm_hz=3e6)
+    fog = {"visibility_km": 0.05, "fog_lidar_ratio_sr": 65}
+    made = survey(noise=noise, **fog, waveform_samples=64, columns=(*COLUMNS, "cause"))
+    rig = Rig(fence(), made, "numpy")
+    whole, tally = cast_between(rig, made, [0, 8])
+    assert cast_between(rig, made, range(9)) == (whole, tally)
+    cloud = cloud_of(made)
+    alarms = cloud["cause"] == CAUSES.index("false alarm")
+    assert alarms.sum() > 20
+    assert (cloud["cause"] == CAUSES.index("air")).sum() > 5
+    assert (cloud["pulse_width"][alarms] == 0).all(), "no echo"
+    assert (cloud["pulse_width"][~alarms] > 3.99).all()
+    assert np.array_equal(cloud["amplitude"][alarms], cloud["intensity"][alarms])
+    quiet = np.abs(cloud.waveforms.samples[alarms]).max(axis=1)
+    assert np.median(quiet) < 2 * noise.threshold
+
+
+def read_packets(path):
+    """Waveform packets of a LAS file by the specification: head, descriptors, samples by point."""
+    data = path.read_bytes()
+    start, first, count = struct.unpack_from("<QQI", data, 227)
+    assert (first, count) == (start, 1)
+    _, user, kind, size, _ = struct.unpack_from("<H16sHQ32s", data, start)
+    assert (user.rstrip(b"\0"), kind, size) == (b"LASF_Spec", 65_535, len(data) - start - 60)
+    return data, start
+
+
+@pytest.mark.parametrize("ending", ["las", "laz"])
+def test_las_files_hold_waveforms_that_lead_to_the_points(tmp_path, ending):
+    laspy = pytest.importorskip("laspy")
+    columns = (*COLUMNS, "red", "green", "blue")
+    made = survey(waveform_samples=48, columns=columns, precision_m=1e-4)
+    cloud = cloud_of(made)
+    path = tmp_path / f"cloud.{ending}"
+    cloud.save(path, precision_m=1e-4)
+    las = laspy.read(path)
+    data, start = read_packets(path)
+    assert las.header.point_format.id == 10
+    assert las.header.global_encoding.waveform_data_packets_internal
+    told = {
+        vlr.record_id - 99: vlr.parsed_record for vlr in las.header.vlrs.get("WaveformPacketVlr")
+    }
+    waves, several = cloud.waveforms, 0
+    for row in range(0, len(cloud), 7):
+        kind = told[las.wavepacket_index[row]]
+        assert (kind.bits_per_sample, kind.number_of_samples) == (16, 48)
+        assert kind.temporal_sample_spacing == 1000
+        offset, size = las.wavepacket_offset[row], las.wavepacket_size[row]
+        raw = np.frombuffer(data, "<u2", 48, start + offset)
+        assert size == 96
+        samples = kind.digitizer_offset + kind.digitizer_gain * raw.astype(float)
+        assert np.array_equal(samples, waves.samples[row])
+        # The sensor is on the line of the waveform, as far before sample 0 as light took.
+        toward = np.array([las.x_t[row], las.y_t[row], las.z_t[row]], np.float64)
+        at = las.return_point_wave_location[row] / 1000
+        back_ps = 1000 * (waves.times_ns[row, 0] + at)
+        assert np.linalg.norm(toward) == pytest.approx(LIGHT_M_NS / 2000, rel=1e-6)
+        assert las.xyz[row] + back_ps * toward == pytest.approx([0, 0, 1], abs=1e-3)
+        several += las.number_of_returns[row] > 1
+        # The height of the waveform at the return is its amplitude, if nothing is near.
+        if las.number_of_returns[row] == 1:
+            height = np.interp(at, np.arange(48), samples)
+            assert height == pytest.approx(cloud["amplitude"][row], rel=0.1)
+    assert several > 10
+    assert len({*las.wavepacket_offset.tolist()}) < len(cloud), "returns of a pulse share packets"
+
+
+def test_a_window_that_holds_no_echo_is_refused():
+    with pytest.raises(LidarpoolError, match=r"waveform_samples is 8, and one echo takes \d+"):
+        survey(waveform_samples=8)
+    with pytest.raises(LidarpoolError, match="has no waveforms"):
+        _ = cloud_of(survey()).waveforms
