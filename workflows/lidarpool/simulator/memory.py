@@ -39,7 +39,7 @@ RECEIVED, CROSSED, RETURN_CAUSED = 120, 370, 10
 RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
-AIR, AIR_HIT = 110, 200  # of a sub-ray where the air returns light; a hit in the air
+AIR, AIR_HIT = 110, 170  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
 # A hit of those whose waveforms are searched at a time, by how returns are found; up to twice the
