@@ -35,6 +35,7 @@ from lidarpool import (
     Spin,
     Survey,
     Track,
+    compare,
     datasheet,
     load_robot,
     load_sensor,
@@ -152,6 +153,11 @@ WRONG = {
         ("Car", None, "pose is None"),
         ("Car", AT[0], "no actor or instance 'Car'"),
     ],
+    compare: [
+        (3, "a.ply", "a is 3"),
+        ("a.ply", None, "b is None; it must be text or a path or a Cloud"),
+        ("a.ply", "b.ply", "a.ply does not exist: give the folder of a result"),
+    ],
     load_robot: [(3, "path is 3"), (["a.urdf"], "text or a path"), (None, "None; it must")],
     Scene.load: [(3, "path is 3"), (["a.glb"], "text or a path"), (None, "None; it must")],
     Sensor: [
@@ -222,6 +228,7 @@ def test_options_of_a_survey_are_checked_too():
 def test_nothing_public_is_left_out():
     """But for what only runs make, or a reader of files."""
     made = {
+        "Comparison",
         "CampaignRun",
         "Frame",
         "Plan",

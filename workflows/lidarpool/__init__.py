@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from .export.ply import read_cloud
     from .pipeline import Frame
     from .plan import Plan, Planning
+    from .report.comparison import Comparison, compare
     from .run.campaign import CampaignRun
     from .run.store import remove_run
     from .scenario.campaign import CampaignJob
@@ -55,6 +56,7 @@ __all__ = [
     "CampaignRun",
     "Cloud",
     "Column",
+    "Comparison",
     "Frame",
     "Gnss",
     "Imu",
@@ -81,6 +83,7 @@ __all__ = [
     "Sweep",
     "Track",
     "__version__",
+    "compare",
     "datasheet",
     "load_robot",
     "load_sensor",
@@ -104,6 +107,7 @@ _MODULES = {
     "export.ply": ("read_cloud",),
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
+    "report.comparison": ("Comparison", "compare"),
     "run.campaign": ("CampaignRun",),
     "run.store": ("remove_run",),
     "scenario.campaign": ("CampaignJob",),

@@ -28,6 +28,7 @@ from ..base.interrupts import (
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from . import options
 from .check_command import check
+from .compare_command import compare
 from .export_command import export
 from .import_command import import_
 from .logs import set_logs
@@ -90,7 +91,19 @@ def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (init, import_, check, schema, scene, sensors, stations, view, plot, export):
+for _command in (
+    init,
+    import_,
+    check,
+    schema,
+    scene,
+    sensors,
+    stations,
+    view,
+    plot,
+    export,
+    compare,
+):
     cli.add_command(_command)
 
 

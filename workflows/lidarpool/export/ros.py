@@ -229,9 +229,27 @@ class Reader(reading.Reader):
         super().close()
 
 
+def columns_of(data: bytes) -> dict[str, NDArray[Any]]:
+    """Take the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree."""
+    message: Any = _types().deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
+    kinds = {number: kind for kind, number in _KINDS.items()}
+    order = ">" if message.is_bigendian else "<"
+    fields = [field for field in message.fields if field.count == 1]
+    row = np.dtype({
+        "names": [field.name for field in fields],
+        "formats": [order + kinds[field.datatype] for field in fields],
+        "offsets": [field.offset for field in fields],
+        "itemsize": message.point_step,
+    })  # fmt: skip
+    lines = message.data.reshape(message.height, message.row_step)
+    used = np.ascontiguousarray(lines[:, : message.width * message.point_step])
+    rows = used.reshape(-1).view(row)
+    return {name: rows[name] for name in row.names or ()}
+
+
 @cache
 def _types() -> Typestore:
-    """Return the types of messages in bags of ours."""
+    """Return the types of messages of ROS 2."""
     return get_typestore(Stores.ROS2_HUMBLE)
 
 

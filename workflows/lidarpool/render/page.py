@@ -239,9 +239,15 @@ class Page:
             text.set_parse_math(False)
             text.set_text(str(handle.get_label()))
 
-    def colour_bar(self, colours: Floats, norm: Normalize, title: str) -> None:
+    def colour_bar(
+        self,
+        colours: Floats,
+        norm: Normalize,
+        title: str,
+        frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
+    ) -> None:
         """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
-        axes = self.figure.add_axes((0.862, 0.27, 0.014, 0.46))
+        axes = self.figure.add_axes(frame)
         bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
         bar.outline.set_visible(False)
         bar.set_label(

@@ -401,6 +401,12 @@ def read_ply_points(data: bytes) -> Float:
     return _ply_vertices(_ply_rows(*_ply_header(data)))
 
 
+def read_ply_columns(data: bytes) -> dict[str, NDArray[Any]]:
+    """Read the properties of vertices of a Stanford polygon file, but lists: {name: (n,)}."""
+    rows = _ply_rows(*_ply_header(data)).get("vertex", {})
+    return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
+
+
 def _ply_vertices(rows: _Rows) -> Float:
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")

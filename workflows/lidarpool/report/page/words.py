@@ -74,3 +74,15 @@ def metres(value: float | None) -> str:
 def numbers(values: Sequence[float]) -> str:
     """Coordinates, short."""
     return ", ".join(f"{value:,.10g}" for value in values).replace("-", MINUS)
+
+
+def millimetres(value: float | None) -> str:
+    """Length in the unit that suits it, or words for none."""
+    if value is None:
+        return "unknown"
+    return f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
+
+
+def ratio(value: float | None) -> str:
+    """Return a share from 0 to 1, or words for none."""
+    return "undefined" if value is None else f"{value:.3f}"

@@ -1,0 +1,491 @@
+"""Two clouds or recordings compared: figures against closed forms, formats, and what is wrong."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import laspy
+import numpy as np
+import pytest
+from pypcd4 import PointCloud
+from tests.lidarpool.drives import points_of, the_scene, the_sweeps, write_set
+
+import lidarpool
+from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey, compare
+from lidarpool.export.formats import Format
+from lidarpool.export.recordings import open_recording
+from lidarpool.export.sweeps import Sweeps
+from lidarpool.report import comparison
+from lidarpool.report.comparison import chosen, nearest, rank_correlation
+
+RINGS, COLUMNS = 16, 720
+ELEVATION = np.linspace(-15, 15, RINGS)
+CELLS = RINGS * COLUMNS
+
+
+def directions(azimuth_deg, elevation_deg):
+    azimuth, elevation = np.radians(azimuth_deg), np.radians(elevation_deg)
+    return np.stack(
+        [np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth),
+         np.sin(elevation) + 0 * azimuth], axis=-1,
+    )  # fmt: skip
+
+
+def room(azimuth_deg):
+    """Ranges of a smooth room, (rings, columns)."""
+    return 12 + 4 * np.cos(2 * np.radians(azimuth_deg)) + 0.1 * ELEVATION[:, None]
+
+
+def cloud(
+    ranges=None, *, azimuth=None, there=None, rings=None, light=None, names=("channel", "intensity")
+):
+    """A sweep of a spinning sensor, as a cloud in its axes."""
+    azimuth = np.arange(COLUMNS) * 360 / COLUMNS + 0.1 if azimuth is None else azimuth
+    azimuth = np.broadcast_to(azimuth, (RINGS, COLUMNS))
+    ranges = room(azimuth) if ranges is None else ranges
+    there = np.ones((RINGS, COLUMNS), bool) if there is None else there
+    points = (ranges[..., None] * directions(azimuth, ELEVATION[:, None]))[there]
+    rings = np.arange(RINGS) if rings is None else rings
+    columns = {names[0]: np.broadcast_to(rings[:, None], there.shape)[there]}
+    if light is not None:
+        columns[names[1]] = light[there]
+    return Cloud(points, columns)
+
+
+AZIMUTH = np.arange(COLUMNS) * 360 / COLUMNS + 0.1
+RANGES = room(AZIMUTH)
+
+
+def of_image(a, b, **options):
+    found = compare(a, b, **options)
+    return found.figures["range_image"]
+
+
+# -- closed forms ---------------------------------------------------------------------------------
+
+
+def test_an_offset_is_the_residual_of_each_ring():
+    found = compare(cloud(RANGES + 0.05), cloud())
+    image = found.figures["range_image"]
+    assert (len(image["rings"]), image["columns"]) == (RINGS, COLUMNS)
+    assert image["azimuth_step_deg"] == pytest.approx(0.5, abs=1e-6)
+    for told in (image["residual"], *image["rings"]):
+        for name in ("bias_m", "median_m", "rmse_m", "p05_m", "p95_m"):
+            assert told[name] == pytest.approx(0.05, abs=2e-6)
+        assert told["mad_m"] < 2e-6
+    assert [ring["ring"] for ring in image["rings"]] == list(range(RINGS))[::-1]
+    assert [r["elevation_deg"] for r in image["rings"]] == pytest.approx(ELEVATION[::-1])
+    assert image["no_return"]["returns_in_both"] == image["residual"]["cells"] == CELLS
+    assert image["no_return"]["precision"] is None  # there is none to find
+
+
+def test_noise_is_found_as_it_was_put_in():
+    sigma, rng = 0.02, np.random.default_rng(5)
+    noisy = cloud(RANGES + rng.normal(0, sigma, RANGES.shape))
+    told = of_image(noisy, cloud())["residual"]
+    # Four standard deviations of each estimate.
+    assert abs(told["bias_m"]) < 4 * sigma / np.sqrt(CELLS)
+    assert told["rmse_m"] == pytest.approx(sigma, abs=4 * sigma / np.sqrt(2 * CELLS))
+    assert told["mad_m"] == pytest.approx(0.67449 * sigma, abs=4 * 0.79 * sigma / np.sqrt(CELLS))
+    assert told["p95_m"] == pytest.approx(1.64485 * sigma, abs=4 * 2.11 * sigma / np.sqrt(CELLS))
+    again = cloud(RANGES + rng.normal(0, sigma, RANGES.shape))
+    both = of_image(noisy, again)["residual"]
+    assert both["rmse_m"] == pytest.approx(np.sqrt(2) * sigma, rel=4 / np.sqrt(2 * CELLS))
+
+
+def test_lost_returns_are_counted_in_each_cell():
+    rng = np.random.default_rng(7)
+    sky = np.zeros((RINGS, COLUMNS), bool)
+    sky[12:, 100:400] = True
+    in_a, in_b = (~sky & (rng.uniform(size=sky.shape) >= share) for share in (0.2, 0.1))
+    told = of_image(cloud(there=in_a), cloud(there=in_b))["no_return"]
+    both, only_a, only_b = ((~in_a & ~in_b).sum(), (~in_a & in_b).sum(), (in_a & ~in_b).sum())
+    assert (told["in_both"], told["in_a_only"], told["in_b_only"]) == (both, only_a, only_b)
+    precision, recall = both / (~in_a).sum(), both / (~in_b).sum()
+    assert told["precision"] == precision and told["recall"] == recall
+    assert told["f1"] == pytest.approx(2 * precision * recall / (precision + recall))
+    # With sky alone in B, and a share p lost of the other cells in A: sky / (sky + p (all - sky)).
+    told = of_image(cloud(there=in_a), cloud(there=~sky))["no_return"]
+    expected = sky.sum() / (sky.sum() + 0.2 * (~sky).sum())
+    assert told["recall"] == 1 and told["precision"] == pytest.approx(expected, rel=0.05)
+
+
+def test_rank_correlation_asks_for_the_order_alone():
+    rng = np.random.default_rng(3)
+    light = rng.uniform(0.1, 1, RANGES.shape)
+    for other, expected in ((light**3 * 255, 1), (1 / light, -1)):
+        found = compare(cloud(light=light), cloud(light=other))
+        assert found.figures["intensity"]["rank_correlation"] == pytest.approx(expected)
+        assert found.figures["intensity"]["of"] == "cells"
+    # Ties have their mean rank: 1, 2.5, 2.5, 4 and 1.5, 1.5, 3, 4.
+    assert rank_correlation(np.array([1, 2, 2, 3]), np.array([0, 0, 5, 9])) == pytest.approx(
+        np.corrcoef([1, 2.5, 2.5, 4], [1.5, 1.5, 3, 4])[0, 1]
+    )
+    assert rank_correlation(np.ones(3), np.arange(3)) is None
+    unlike = compare(cloud(light=light), cloud(light=rng.uniform(size=RANGES.shape)))
+    assert abs(unlike.figures["intensity"]["rank_correlation"]) < 4 / np.sqrt(CELLS)
+    assert compare(cloud(light=light), cloud()).figures["intensity"] is None
+
+
+def test_distances_between_parallel_planes():
+    x, y = np.meshgrid(np.arange(60) * 0.5, np.arange(50) * 0.5)
+    plane = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    far = np.array([650_000.0, 5_600_000.0, 100.0])  # of UTM
+    a, b = Cloud(plane + far, {}), Cloud(plane + far + [0, 0, 0.03], {})
+    told = compare(a, b, distances_m=(0.05, 0.02)).figures
+    for way in ("a_to_b", "b_to_a"):
+        assert told["distances"][way]["points"] == 3000
+        for name in ("mean_m", "median_m", "p99_m", "max_m"):
+            assert told["distances"][way][name] == pytest.approx(0.03, abs=1e-6)
+    assert told["distances"]["chamfer_m"] == pytest.approx(0.06, abs=1e-6)
+    assert [(f["distance_m"], f["f1"]) for f in told["distances"]["f_scores"]] == [
+        (0.02, 0.0), (0.05, 1.0),
+    ]  # fmt: skip
+    # Half of A has no B beside it: all that B has is found, half of what A has is right.
+    half = b.part(np.flatnonzero(plane[:, 0] < 15))
+    score = compare(a, half, distances_m=[0.05]).figures["distances"]["f_scores"][0]
+    assert (score["precision"], score["recall"]) == (0.5, 1.0)
+    assert score["f1"] == pytest.approx(2 / 3)
+    assert told["range_image"] is None and "no rings" in told["notes"][0]
+
+
+def test_the_nearest_is_that_of_all_pairs():
+    rng = np.random.default_rng(1)
+    a, b = rng.normal(size=(300, 3)), rng.normal(size=(200, 3))
+    apart = np.linalg.norm(a[:, None] - b, axis=2)
+    distance, index = nearest(a, b)
+    np.testing.assert_allclose(distance, apart.min(axis=1), atol=1e-12)
+    np.testing.assert_array_equal(index, apart.argmin(axis=1))
+
+
+# -- cells ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("shift", [0.04, 0.21, 0.25, 0.49])
+def test_no_pulse_falls_between_cells(shift):
+    """Pulses at other azimuths, with jitter, and offsets of rings, are in one cell each."""
+    rng = np.random.default_rng(2)
+    offsets = rng.uniform(-2, 2, RINGS)[:, None]
+    turned = AZIMUTH + offsets + shift + rng.normal(0, 0.02, RANGES.shape)
+    image = of_image(cloud(azimuth=turned), cloud(azimuth=AZIMUTH + offsets))
+    told = image["no_return"]
+    assert (told["returns_in_both"], told["in_both"]) == (CELLS, 0)
+    assert image["hidden_points"] == {"a": 0.0, "b": 0.0}
+
+
+def test_the_step_is_found_where_most_returns_are_lost():
+    rng = np.random.default_rng(0)
+    in_a, in_b = (rng.uniform(size=RANGES.shape) > share for share in (0.9, 0.3))
+    image = of_image(cloud(RANGES + 0.01, there=in_a), cloud(there=in_b))
+    assert image["azimuth_step_deg"] == pytest.approx(0.5, abs=1e-6)
+    assert image["residual"]["rmse_m"] == pytest.approx(0.01, abs=1e-5)
+    assert image["no_return"]["returns_in_both"] == (in_a & in_b).sum()
+    # Every second azimuth is not a loss: the cells are those of the coarser one.
+    even = np.arange(COLUMNS) % 2 == 0
+    image = of_image(cloud(), cloud(there=np.broadcast_to(even, RANGES.shape)))
+    assert image["azimuth_step_deg"] == pytest.approx(1, abs=1e-6)
+    assert image["no_return"]["returns_in_both"] == CELLS / 2
+
+
+def test_a_step_that_does_not_divide_the_turn():
+    """As of a Velodyne: 1808.449 firings a turn."""
+    azimuth = np.arange(COLUMNS) * 0.199066 + 3  # not all around: a sector of 143 degrees
+    ranges = room(azimuth)
+    image = of_image(cloud(ranges + 0.01, azimuth=azimuth), cloud(ranges, azimuth=azimuth))
+    assert image["azimuth_step_deg"] == pytest.approx(0.199066, rel=1e-6)
+    assert image["columns"] == COLUMNS and image["no_return"]["in_both"] == 0
+    assert image["residual"]["median_m"] == pytest.approx(0.01, abs=1e-6)
+
+
+def test_the_first_of_several_returns_counts():
+    first, second = cloud(), cloud(RANGES + 3)
+    dual = Cloud.joined([second, first])
+    image = of_image(dual, first)
+    assert image["residual"]["rmse_m"] < 1e-6
+    assert image["hidden_points"] == {"a": 0.5, "b": 0.0}
+
+
+@pytest.mark.parametrize(
+    ("numbers", "note"),
+    [
+        (np.arange(RINGS) + 1, "ring n of A is ring n - 1 of B"),
+        (RINGS - 1 - np.arange(RINGS), "ring n of A is ring 15 - n of B"),
+        (np.arange(RINGS) * 7 % RINGS, "the rings are numbered in other orders"),
+    ],
+)
+def test_rings_are_matched_whatever_their_numbers(numbers, note):
+    found = compare(cloud(RANGES + 0.05, rings=numbers), cloud())
+    image = found.figures["range_image"]
+    assert [ring["ring"] for ring in image["rings"]] == list(range(RINGS))[::-1]
+    assert image["residual"]["mad_m"] < 2e-6 and image["residual"]["cells"] == CELLS
+    assert [text for text in found.figures["notes"] if text.startswith(note)]
+
+
+def test_a_ring_that_only_one_sees_is_lost_in_the_other():
+    there = np.ones((RINGS, COLUMNS), bool)
+    there[3] = False
+    for a, b, name in ((there, None, "in_a_only"), (None, there, "in_b_only")):
+        found = compare(cloud(there=a), cloud(there=b)).figures
+        assert found["range_image"]["no_return"][name] == COLUMNS
+        assert "only one of the two has returns of 1 ring" in found["notes"]
+
+
+def test_what_has_no_range_image_says_why():
+    plain = Cloud(cloud().positions, {})
+    for a, b, says in (
+        (plain, cloud(), "cloud A has no rings: the range image needs a column ring or channel"),
+        (cloud(), Cloud(cloud().positions + 30, cloud().columns), "no cones around zero"),
+        (cloud(), Cloud(cloud().positions * [1, 1, 9], cloud().columns), "not of the same sensor"),
+    ):
+        found = compare(a, b).figures
+        assert found["range_image"] is None and found["distances"]["a_to_b"]["points"] == CELLS
+        assert any(says in note for note in found["notes"]), found["notes"]
+
+
+def test_a_choice_by_hash_is_even_and_the_same(monkeypatch):
+    some = chosen(100_000, 20_000, 4)
+    assert abs(len(some) - 20_000) < 4 * np.sqrt(20_000)
+    np.testing.assert_array_equal(some, chosen(100_000, 20_000, 4))
+    assert abs(some.mean() - 50_000) < 4 * 28_900 / np.sqrt(20_000)
+    monkeypatch.setattr(comparison, "MOST_VALUES", 2000)
+    rng = np.random.default_rng(5)
+    found = compare(cloud(RANGES + rng.normal(0, 0.02, RANGES.shape)), cloud()).figures
+    assert 1800 < found["range_image"]["residual"]["cells"] < 2200
+    assert found["range_image"]["no_return"]["returns_in_both"] == CELLS
+    assert found["range_image"]["residual"]["rmse_m"] == pytest.approx(0.02, rel=0.07)
+    assert "2,000 points and cells" in found["notes"][0]
+    thin = compare(cloud(), cloud(), most_points=3000).figures
+    assert thin["a"]["points"] < 3300 and "11,520 points, of which 26 %" in thin["notes"][0]
+
+
+# -- formats --------------------------------------------------------------------------------------
+
+LAYERS = 16
+SENSOR = Sensor.grid(360, LAYERS)
+SURVEY = Survey(SENSOR, poses=[(0, 0, 1), (5, 2, 1.5), (9, 9, 1)], steps=36, precision_m=1e-4)
+
+
+@pytest.fixture(scope="module")
+def written(tmp_path_factory):
+    """A survey of three sweeps in all formats: a result's folder, and what is exported of it."""
+    folder = tmp_path_factory.mktemp("result")
+    sweeps = Sweeps.of(SURVEY, Scene.seed())
+    azimuth = np.arange(360)[:, None]
+    elevation = np.linspace(-30, 30, LAYERS)
+    ranges = 10 + 2 * np.sin(np.radians(azimuth)) + 0 * elevation
+    inside = ranges[..., None] * directions(azimuth + 0 * elevation, elevation)
+    clouds = []
+    for pose, begin in zip(sweeps.pose.positions, sweeps.begins_ns, strict=True):
+        channel = np.broadcast_to(np.arange(LAYERS), ranges.shape).ravel()
+        light = (0.2 + 0.1 * np.cos(np.radians(azimuth)) + 0.01 * np.arange(LAYERS)).ravel()
+        scan = (
+            np.repeat(np.arange(36), 10)[:, None]
+            + 36 * len(clouds)
+            + 0 * channel.reshape(-1, LAYERS)
+        )
+        columns = {
+            "scan": scan.ravel(),
+            "channel": channel,
+            "object": 0 * channel,
+            "intensity": light,
+            "time": (begin + 1000 * scan.ravel()).astype(np.int64),
+        }
+        clouds.append(Cloud(inside.reshape(-1, 3) + pose, columns))  # fmt: skip
+    made = Cloud.joined(clouds)
+    for name in ("ply", "laz", "las", "pcd", "mcap", "rosbag2"):
+        one = Format(name)
+        one.write(folder / one.file, made, sweeps)
+    sweeps.save(folder / "sweeps.npz")
+    (folder / "bare.ply").write_bytes((folder / "cloud.ply").read_bytes())
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(made)}"]
+    lines += [f"property float {name}" for name in ("x", "y", "z", "intensity")] + ["end_header"]
+    rows = np.column_stack([made.positions, made.intensity])
+    lines += [" ".join(f"{value:.6f}" for value in row) for row in rows]
+    (folder / "text").mkdir()
+    (folder / "text/text.ply").write_text("\n".join(lines) + "\n")
+    return folder, made, sweeps
+
+
+@pytest.mark.parametrize("name", ["pcd", "cloud.mcap", "rosbag2", "cloud.ply"])
+def test_sweeps_of_each_format_are_those_of_the_result(written, name):
+    folder, made, _ = written
+    found = compare(folder / name, folder).figures
+    image = found["range_image"]
+    assert found["pairs"] == 3 and found["a"]["sweeps"] == 3 and not found["notes"]
+    assert image["no_return"]["returns_in_both"] == found["b"]["points"] == len(made)
+    assert image["no_return"]["in_both"] == 0
+    assert image["residual"]["rmse_m"] < 1e-4
+    assert found["intensity"]["rank_correlation"] == pytest.approx(1, abs=1e-6)
+    assert found["distances"]["a_to_b"]["max_m"] < 3e-4
+    one = compare(folder / name, folder, sweeps=[1]).figures
+    assert one["pairs"] == 1 and one["a"]["points"] == len(made) // 3
+
+
+@pytest.mark.parametrize("name", ["cloud.las", "cloud.laz", "text/text.ply", "pcd/000000.pcd"])
+def test_clouds_of_each_format_lie_on_the_result(written, name):
+    folder, made, _ = written
+    found = compare(folder / name, made).figures
+    count = len(made) // 3 if name.endswith("pcd") else len(made)
+    assert found["a"]["points"] == found["distances"]["a_to_b"]["points"] == count
+    assert found["distances"]["a_to_b"]["max_m"] < 1e-3
+    assert found["intensity"]["rank_correlation"] > 0.98
+    assert found["intensity"]["of"] == "nearest points"
+
+
+def test_a_survey_that_moved_is_compared_with_a_map(written):
+    """Whole clouds are in the world: each sweep is brought there by its pose."""
+    folder, made, sweeps = written
+    inside = [sweeps.in_sensor(k, points.positions) for k, points in enumerate(sweeps.points(made))]
+    own = replace(sweeps, coordinates="sensor")
+    carried = Cloud(np.concatenate(inside), made.columns, sweeps=lambda: own)
+    for a in (folder, folder / "pcd", carried):
+        found = compare(a, folder / "cloud.laz").figures
+        assert found["distances"]["b_to_a"]["points"] == len(made)
+        assert max(found["distances"][way]["max_m"] for way in ("a_to_b", "b_to_a")) < 1e-3
+        assert "cloud.laz has no sweeps" in found["notes"][0]
+    with pytest.raises(LidarpoolError, match="does not say where that was"):
+        compare(folder / "cloud.mcap", folder / "cloud.laz")
+
+
+def test_sweeps_are_matched_by_time(written, tmp_path):
+    folder, _, sweeps = written
+    later = replace(sweeps, begins_ns=sweeps.begins_ns + 1e8)  # by one turn
+    (tmp_path / "cloud.ply").write_bytes((folder / "cloud.ply").read_bytes())
+    later.save(tmp_path / "sweeps.npz")
+    found = compare(tmp_path, folder, match="time").figures
+    assert found["pairs"] == 2
+    assert found["notes"][0] == "A has 3 sweeps, B 3: 2 pairs by time"
+    assert found["distances"]["a_to_b"]["max_m"] < 20  # one turn on: in the sensors' own axes
+    with pytest.raises(LidarpoolError, match="has no times of sweeps: leave out --match time"):
+        compare(folder / "pcd", folder, match="time")
+    for name in ("0.pcd", "1.pcd"):
+        (tmp_path / name).write_bytes((folder / "pcd/000000.pcd").read_bytes())
+    (tmp_path / "cloud.ply").unlink()
+    assert compare(tmp_path, folder).figures["notes"][0] == "A has 2 sweeps, B 3: 2 pairs by order"
+
+
+def test_one_of_several_sensors_is_chosen(tmp_path):
+    scene = the_scene()
+    of, made = the_sweeps(scene), points_of(scene, 0)
+    for name in ("ply", "mcap"):
+        Format(name).write(tmp_path / Format(name).file, made, of)
+    of.save(tmp_path / "sweeps.npz")
+    bag = tmp_path / "cloud.mcap"
+    for place, names in ((tmp_path, "sensors front, rear/left"), (bag, "/front/points, /rear")):
+        with pytest.raises(LidarpoolError, match=rf"{names}.*: choose one \(--sensor-a"):
+            compare(place, tmp_path, sensor_b="front")
+    found = compare(bag, tmp_path, sensor_a="/rear_left/points", sensor_b="rear/left").figures
+    assert found["pairs"] == 3 and found["distances"]["a_to_b"]["max_m"] < 2e-3
+
+
+@pytest.mark.parametrize("kind", ["kitti", "folder"])
+def test_sweeps_of_data_sets(tmp_path, kind):
+    scene = the_scene()
+    write_set(tmp_path, kind, scene, the_sweeps(scene))
+    found = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="front").figures
+    assert found["pairs"] == found["a"]["sweeps"] == 15  # of five jobs
+    assert found["distances"]["a_to_b"]["max_m"] == 0
+    assert "pairs of which one has no points are left out" in found["notes"]
+    other = compare(tmp_path, tmp_path, sensor_a="front", sensor_b="rear/left", sweeps=[3]).figures
+    assert other["pairs"] == 1 and other["distances"]["a_to_b"]["median_m"] > 1
+
+
+def test_names_and_places_of_other_programs(tmp_path):
+    """Numbers of beams by other names, no-returns as zeros and NaN, and any column as intensity."""
+    made = cloud(light=np.broadcast_to(AZIMUTH, RANGES.shape))
+    rows = np.vstack([made.positions, np.zeros((5, 3)), np.full((5, 3), np.nan)]).astype("f4")
+    ring = np.append(made["channel"], np.zeros(10)).astype("u2")
+    signal = np.append(made["intensity"], np.zeros(10)).astype("f4")
+    arrays = [*rows.T, ring, signal]
+    fields = ("x", "y", "z", "laser_id", "signal")
+    file = PointCloud.from_points(arrays, fields, [one.dtype for one in arrays])
+    file.save(tmp_path / "turn.pcd")
+    found = compare(tmp_path / "turn.pcd", tmp_path, intensity_a="signal", intensity_b="signal")
+    assert found.figures["range_image"]["no_return"]["returns_in_both"] == CELLS
+    assert found.figures["intensity"]["rank_correlation"] == pytest.approx(1)
+    with pytest.raises(LidarpoolError, match=r"no column 'signl'.* Did you mean 'signal'\?"):
+        compare(tmp_path, tmp_path, intensity_a="signl")
+
+
+def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
+    folder, *_ = written
+    for name in ("cloud.ply", "sweeps.npz"):
+        (tmp_path / name).write_bytes((folder / name).read_bytes())
+    (tmp_path / "report.json").write_text(json.dumps({"parameters": {"keep_every": 5}}))
+    found = compare(tmp_path, folder).figures
+    assert found["range_image"]["no_return"] is None and "one of 5 hits" in found["notes"][0]
+    assert "one of 5 hits" in repr(compare(tmp_path, folder))
+
+
+# -- what is wrong --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name", ["cloud.ply", "cloud.las", "cloud.laz", "cloud.mcap", "pcd/000000.pcd", "text/text.ply"]
+)
+def test_cut_and_garbled_files_are_a_line(written, tmp_path, name):
+    folder, *_ = written
+    path, whole = tmp_path / Path(name).name, (folder / name).read_bytes()
+    rng = np.random.default_rng(0)
+    garbled = bytearray(whole)
+    for place in rng.integers(0, min(len(whole), 400), 60):
+        garbled[place] = rng.integers(256)
+    for content in (b"", b"x", whole[:40], whole[: len(whole) // 2], whole[:-40], bytes(garbled)):
+        path.write_bytes(content)
+        with pytest.raises(LidarpoolError) as raised:
+            compare(path, folder)
+        assert path.name in str(raised.value)
+        assert len(str(raised.value).splitlines()) == 1 and len(str(raised.value)) < 400
+
+
+def test_what_cannot_be_compared_says_what_to_give(written, tmp_path):
+    folder, made, _ = written
+    (tmp_path / "notes.txt").touch()
+    (tmp_path / "empty").mkdir()
+    header = laspy.LasHeader(point_format=6, version="1.4")
+    laspy.LasData(header).write(tmp_path / "none.las")
+    for path, says in (
+        ("nowhere.pcd", "does not exist: give the folder of a result"),
+        ("notes.txt", "cannot be compared: give the folder of a result"),
+        ("empty", "cannot be compared"),
+        ("none.las", "has no points: there is nothing to compare"),
+    ):
+        with pytest.raises(LidarpoolError, match=says):
+            compare(tmp_path / path, made)
+    for options, says in (
+        ({"sweeps": [3]}, r"there is no sweep 3: 3 pairs of sweeps, from 0"),
+        ({"sensor_a": "roof"}, r"has the sensors , not 'roof'"),
+        ({"sensor_b": "/points"}, "has the sensors"),
+        ({"distances_m": [0.0]}, "it must be lengths in metres"),
+    ):
+        with pytest.raises(LidarpoolError, match=says):
+            compare(folder, folder, **options)
+    with pytest.raises(LidarpoolError, match="has no sweeps: leave out --sweep and --match"):
+        compare(made, folder, sweeps=[0])
+    with pytest.raises(LidarpoolError, match="topics of PointCloud2 /points, not '/point'"):
+        open_recording(folder / "cloud.mcap", "/point")
+
+
+# -- the page -------------------------------------------------------------------------------------
+
+
+def test_a_page_by_itself_with_all_figures(tmp_path):
+    rng = np.random.default_rng(5)
+    light = rng.uniform(size=RANGES.shape)
+    there = rng.uniform(size=RANGES.shape) > 0.1
+    noisy = cloud(RANGES + rng.normal(0, 0.02, RANGES.shape), there=there, light=light)
+    noisy.save(tmp_path / "<b>A & B.ply")
+    found = lidarpool.compare(tmp_path / "<b>A & B.ply", cloud(light=light))
+    names = [path.name for path in found.save(tmp_path / "out")]
+    assert sorted(names) == sorted(path.name for path in (tmp_path / "out").iterdir())
+    assert {"compare.json", "compare.html", "compare-ranges.png", "compare-above.png"} <= {*names}
+    assert json.loads((tmp_path / "out/compare.json").read_text()) == found.figures
+    page = (tmp_path / "out/compare.html").read_text()
+    assert "<b>A &" not in page and "&lt;b&gt;A &amp; B.ply" in page
+    assert "<script" not in page and 'src="http' not in page and page.count("<svg") == 4
+    assert page.count("data-ring=") == RINGS
+    plain = compare(Cloud(cloud().positions, {}), Cloud(cloud().positions, {}))
+    assert len(plain.save(tmp_path / "plain")) == 4  # no pictures of ranges and rings
+    assert "No range image" in (tmp_path / "plain/compare.html").read_text()

@@ -1,0 +1,79 @@
+"""The command `lidarpool compare`."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+SCENARIO = """
+cloud: {keep_every: 1, precision_m: 0.0001, columns: [intensity]}
+planning: {enabled: false}
+"""
+
+
+@pytest.fixture(scope="module")
+def surveys(tmp_path_factory, cluster):
+    """The default survey without noise and with."""
+    from lidarpool.cli.commands import main
+
+    folder = tmp_path_factory.mktemp("surveys")
+    for name, more in (("clean", ""), ("noisy", "noise: {range_m: 0.02, dropout: 0.1}\n")):
+        (folder / f"{name}.yaml").write_text(SCENARIO + more)
+        arguments = ["run", str(folder / f"{name}.yaml"), "--out", str(folder / name)]
+        with pytest.raises(SystemExit) as ended:
+            main([*arguments, "--scheduler", cluster, "--only", "cloud", "-q"])
+        assert ended.value.code == 0
+    return folder
+
+
+def test_the_residual_is_the_noise_that_was_put_in(surveys, lidarpool):
+    out = surveys / "out"
+    done = lidarpool("compare", surveys / "noisy", surveys / "clean", "--out", out)
+    assert (done.code, done.err) == (0, "")
+    figures = json.loads((out / "compare.json").read_text())
+    image = figures["range_image"]
+    hits, told = figures["b"]["points"], image["residual"]
+    assert told["cells"] == figures["a"]["points"]  # each return is in its cell
+    assert told["rmse_m"] == pytest.approx(0.02, abs=4 * 0.02 / (2 * hits) ** 0.5)
+    assert abs(told["bias_m"]) < 4 * 0.02 / hits**0.5
+    lost = image["no_return"]
+    assert lost["in_b_only"] == 0 and lost["recall"] == 1
+    assert lost["in_a_only"] == hits - told["cells"]
+    assert lost["in_a_only"] / hits == pytest.approx(0.1, abs=4 * (0.09 / hits) ** 0.5)
+    assert figures["intensity"]["rank_correlation"] > 0.999
+    lines = done.out.splitlines()
+    assert lines[0].endswith(f"noisy: {figures['a']['points']:,} points, 3 sweeps")
+    assert "RMSE" in lines[2] and "precision" in lines[3]
+    assert lines[-1] == f"page     {out}/compare.html"
+    rings = image["rings"]
+    assert (out / "compare.html").read_text().count("data-ring=") == len(rings) == 28
+
+    printed = lidarpool(
+        *("compare", surveys / "clean", surveys / "clean", "--sweep", "2", "--json"),
+        *("--distance", "0.3", "--out", out),
+    )
+    again = json.loads(printed.out)
+    assert printed.code == 0 and again == json.loads((out / "compare.json").read_text())
+    assert again["pairs"] == 1 and again["range_image"]["residual"]["rmse_m"] == 0
+    assert [one["distance_m"] for one in again["distances"]["f_scores"]] == [0.3]
+
+
+@pytest.mark.parametrize(
+    ("arguments", "says"),
+    [
+        (["clean", "nowhere"], "nowhere does not exist: give the folder of a result"),
+        (["clean", "clean.yaml"], "clean.yaml cannot be compared: give the folder of a result"),
+        (["clean", "clean", "--sweep", "3"], "there is no sweep 3: 3 pairs of sweeps, from 0"),
+        (["clean", "clean", "--sensor-a", "roof"], "not 'roof'"),
+        (["clean", "clean", "--intensity-b", "signal"], "it has no column 'signal'"),
+        (["clean", "clean", "--distance", "0"], "0.0 is not in the range x>0"),
+        (["clean", "clean", "--out", "clean.yaml"], "clean.yaml' is a file"),
+        (["clean"], "Missing argument 'B'"),
+    ],
+)
+def test_what_cannot_be_done_is_told_in_a_line(surveys, lidarpool, monkeypatch, arguments, says):
+    monkeypatch.chdir(surveys)
+    done = lidarpool("compare", *arguments)
+    assert done.code == 2 and says in done.err and done.out == ""
+    assert len(done.err.splitlines()) <= 2 and not (surveys / "lidarpool-compare").exists()
