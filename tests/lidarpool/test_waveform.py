@@ -15,6 +15,7 @@ from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Se
 from lidarpool.columns.parts import pack, unpack
 from lidarpool.columns.table import AXES, CAUSES, SCAN
 from lidarpool.columns.waveforms import WAVEFORM
+from lidarpool.report.cloud_numbers import CountedCloud
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
 from lidarpool.simulator.batch import columns_of
@@ -362,3 +363,13 @@ def test_a_window_that_holds_no_echo_is_refused():
         survey(waveform_samples=8)
     with pytest.raises(LidarpoolError, match="has no waveforms"):
         _ = cloud_of(survey()).waveforms
+
+
+def test_other_formats_leave_waveforms_out(tmp_path):
+    cloud = cloud_of(survey(waveform_samples=48))
+    cloud.save(tmp_path / "cloud.ply")
+    assert b"waveform" not in (tmp_path / "cloud.ply").read_bytes()[:2000]
+    assert "waveform" not in cloud.to_dataframe().columns
+    numbers = CountedCloud(cloud, objects=60)
+    assert sum(len(chunk) for chunk in numbers.chunks()) == len(cloud)
+    assert "range" in numbers.limits and WAVEFORM not in numbers.limits

@@ -175,12 +175,17 @@ class Cloud(Savable):
         )
 
     @property
+    def recorded(self) -> bool:
+        """Whether its points have waveforms."""
+        return WAVEFORM in self.columns
+
+    @property
     def waveforms(self) -> Waveforms:
         """Recorded waveforms of the points.
 
         LidarpoolError if the survey recorded none: it needs `waveform_samples`.
         """
-        if WAVEFORM not in self.columns:
+        if not self.recorded:
             raise LidarpoolError(
                 "The cloud has no waveforms: give the survey cloud.waveform_samples, and take the "
                 "cloud of its result; of files only LAS and LAZ hold them."

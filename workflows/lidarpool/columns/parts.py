@@ -274,6 +274,11 @@ class StoredCloud(Savable):
         rest = [c for c in self.columns if c not in AXES and c.name != WAVEFORM]
         return (SCAN, *rest)
 
+    @property
+    def recorded(self) -> bool:
+        """Whether its points have waveforms."""
+        return any(column.name == WAVEFORM for column in self.columns)
+
     def cloud_of(self, part: PartColumns, rows: NDArray[np.integer] | slice = slice(None)) -> Cloud:
         """Points of a part, or some of them."""
         return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)

@@ -146,11 +146,11 @@ class _Packets:
     @classmethod
     def of(cls, cloud: CloudLike) -> _Packets | None:
         """Look for all kinds of waveforms of a cloud; None if it has no waveforms."""
+        if not getattr(cloud, "recorded", False):  # clouds in files never have any
+            return None
         kinds: set[tuple[int, int]] = set()
         samples = 0
         for chunk in cloud.chunks():
-            if WAVEFORM not in chunk.columns:
-                return None
             rows = records(chunk.columns[WAVEFORM])
             samples = rows["samples"].shape[1]
             pairs = np.stack([rows["sample_ps"].astype(np.int64), rows["exponent"]], axis=1)

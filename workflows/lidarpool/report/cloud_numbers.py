@@ -44,7 +44,8 @@ class CountedCloud:
                 owners = owners[owners >= 0]
                 self.no_surface += len(chunk) - len(owners)
             self.by_object += np.bincount(owners, minlength=len(self.by_object))
-            for name, values in chunk.columns.items():
+            for name in (column.name for column in chunk.table):
+                values = chunk[name]
                 low, high = self.limits.get(name, (np.inf, -np.inf))
                 self.limits[name] = (
                     min(low, np.fmin.reduce(values).item()),
