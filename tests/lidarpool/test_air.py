@@ -1,6 +1,7 @@
 """Rain, snow, fog and dust: what they take, and what they send back, against closed forms."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 from statistics import NormalDist
 
@@ -279,6 +280,75 @@ def test_fog_without_a_lidar_ratio_returns_nothing():
     some = {"visibility_km": 0.04, "returns": Returns("all", pulse_ns=5)}
     assert len(cast(**some)["range"]) == 0
     assert same(cast([wall("W", 9)], **some), cast([wall("W", 9)], rain_mm_h=0.0, **some))
+
+
+def sheet(name, x):
+    """A surface of water across the x axis, seen from its front."""
+    corners = [[x, -50, -50], [x, -50, 50], [x, 50, 50], [x, 50, -50]]
+    return Mesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+@pytest.mark.parametrize("weather", [{"snow_mm_h": 1.0}, {"dust_mg_m3": 40.0}])
+def test_nothing_falls_within_water(weather):
+    water = [
+        Material("*", reflectance=0.2),
+        Material("Water", transparent="pass", refractive_index=1.33),
+    ]
+    pulse_ns = 5 if "dust_mg_m3" in weather else 0
+    some = {"materials": water, "returns": replace(ALL, pulse_ns=pulse_ns), **weather}
+    found = cast([sheet("Water", 3), wall("Floor", 9)], **some)
+    ranges = found["range"][found["cause"] == AIR]
+    assert len(ranges) > 1000
+    assert ranges.max() < 3
+    open_air = cast([wall("Floor", 9)], **some | {"materials": [water[0]]})
+    alone = open_air["range"][open_air["cause"] == AIR]
+    assert alone.max() > 6
+    if "snow_mm_h" in weather:
+        assert np.array_equal(ranges, alone[alone < 3])
+
+
+def test_flakes_behind_a_thick_pane_return():
+    back = sheet("Pane", 3.02)
+    front = sheet("Pane", 3)
+    pane = Mesh(
+        "Pane",
+        np.concatenate([front.vertices, back.vertices]),
+        np.concatenate([front.faces, 4 + back.faces[:, ::-1]]),
+    )
+    glass = [
+        Material("*", reflectance=0.2),
+        Material("Pane", transparent="pass", refractive_index=1.5),
+    ]
+    for weather in ({"snow_mm_h": 1.0}, {"dust_mg_m3": 40.0}):
+        some = {"materials": glass, "returns": replace(ALL, pulse_ns=5), **weather}
+        found = cast([pane, wall("Floor", 9)], **some)
+        assert found["range"][found["cause"] == AIR].max() > 6
+
+
+def test_beams_that_are_wide_at_their_start_meet_more_flakes():
+    wide = beams(exit_diameter_m=0.03)
+    narrow = beams(exit_diameter_m=0.01)
+    some = {"snow_mm_h": 1.0, "returns": ALL}
+    assert len(cast(sensor=wide, **some)["range"]) != len(cast(sensor=narrow, **some)["range"])
+    assert same(cast(sensor=narrow, **some), cast(**some)), "10 mm by default"
+    survey = survey_of(wide)
+    assert survey.air(0).width(0.0) == 0.03
+    assert survey.air(0).width(10.0) == pytest.approx(math.hypot(0.03, 10 * DIVERGENCE))
+
+
+@pytest.mark.parametrize("kind", [rain(300.0), snow(1.0), snow(50.0)])
+def test_extinction_is_that_of_particles_up_to_the_largest(kind):
+    diameter = np.linspace(0, kind.largest, 20_001)
+    squares = kind.number * diameter**2 * np.exp(-kind.slope * diameter)
+    assert kind.extinction == pytest.approx(np.trapezoid(squares, diameter) * math.pi / 2 * 1e-6)
+
+
+def test_reflectivities_in_the_thickest_dust_are_finite():
+    noise = Noise(detection_range_m=100, false_alarm_hz=1e6)
+    with np.errstate(all="raise", under="ignore"):
+        found = cast([wall("W", 9)], beams(200), dust_mg_m3=1e5, noise=noise)
+    assert len(found["range"]) > 100
+    assert np.isfinite(found["reflectivity"]).all()
 
 
 # -- bytes -----------------------------------------------------------------------------------------

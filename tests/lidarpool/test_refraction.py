@@ -238,3 +238,25 @@ def test_water_may_touch_its_basin(nadir_deg, backend):
     side = 3 - 3 * math.tan(angle)
     path = min(2 / math.cos(below), side / max(math.sin(below), 1e-9))
     assert found["range"] == pytest.approx([3 / math.cos(angle) + 1.33 * path], abs=4e-4)
+
+
+@pytest.mark.parametrize(("max_range_m", "count"), [(2.6, 0), (2.7, 1)])
+def test_greatest_ranges_are_optical(max_range_m, count):
+    """Two metres of water take as long as 2.66 m of air."""
+    sensor = ray(max_range_m=max_range_m)
+    water = box("Water", (-9, -9, -9), (9, 9, 9))
+    floor = box("Floor", (-5, -5, -3), (5, 5, -2))
+    materials = [Material("*"), Material("Water", **WATER)]
+    down = Pose((0, 0, 0), pitch_deg=90.0)
+    found = cast([water, floor], sensor, down, materials=materials)
+    assert len(found["range"]) == count
+
+
+def test_water_in_the_thickest_fog_has_no_energy_that_is_no_number():
+    water = box("Water", (-900, -90, -90), (-5, 90, 90))
+    floor = box("Floor", (-902, -90, -90), (-899, 90, 90))
+    materials = [Material("*"), Material("Water", **WATER)]
+    behind = Pose((0, 0, 0), yaw_deg=180.0)
+    with np.errstate(over="raise", invalid="raise"):
+        found = cast([water, floor], ray(), behind, materials=materials, visibility_km=0.001)
+    assert np.isfinite(found["intensity"]).all()

@@ -365,6 +365,15 @@ def test_a_window_that_holds_no_echo_is_refused():
         _ = cloud_of(survey()).waveforms
 
 
+def test_samples_that_are_no_whole_picoseconds_apart_are_refused():
+    sensor = beam_along_x()
+    with pytest.raises(LidarpoolError, match=r"whole picoseconds: .*give 0\.333"):
+        Survey(sensor, poses=[(0, 0, 0)], returns=Returns(sample_ns=1 / 3), waveform_samples=160)
+    for sample_ns in (0.333, 1.25, 0.1, 0.007):
+        returns = Returns(sample_ns=sample_ns)
+        Survey(sensor, poses=[(0, 0, 0)], returns=returns, waveform_samples=4096)
+
+
 def test_other_formats_leave_waveforms_out(tmp_path):
     cloud = cloud_of(survey(waveform_samples=48))
     cloud.save(tmp_path / "cloud.ply")

@@ -169,8 +169,11 @@ class Returns:
     def beam(self, optics: Optics) -> Beam:
         """Sub-rays of a sensor's beam; raises as `of`."""
         profile = optics.beam_profile if self.beam_profile is None else self.beam_profile
-        wide_m = optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
-        return Beam.of(self.subrays, self._divergence(optics), profile, wide_m)
+        return Beam.of(self.subrays, self._divergence(optics), profile, self.exit_m(optics))
+
+    def exit_m(self, optics: Optics) -> float:
+        """Width of the beam where it leaves the sensor, metres; 0 if it is unknown."""
+        return optics.exit_diameter_m if self.exit_diameter_m is None else self.exit_diameter_m
 
     def _divergence(self, optics: Optics) -> tuple[float, float]:
         """Across and up, radians."""

@@ -294,6 +294,11 @@ class Survey(CloudOptions, Weather):
                         f"waveform_samples is {self.waveform_samples}, and one echo takes {least} "
                         f"samples of {returns.sample_ns:g} ns: record as many at least."
                     )
+            if self.waveform_samples and abs(returns.sample_ns * 1000 % 1 - 0.5) < 0.5 - 1e-6:
+                raise LidarpoolError(
+                    f"returns.sample_ns is {returns.sample_ns:g}, and LAS records whole "
+                    f"picoseconds: with waveform_samples, give {round(returns.sample_ns, 3):g}."
+                )
         for number, noise in enumerate(self.noise_each):
             _check_alarms(noise, self.carried[number].sensor)
             if noise.crosstalk:
@@ -401,7 +406,8 @@ class Survey(CloudOptions, Weather):
         optics = self.carried[number].sensor.optics
         divergence, _ = self.returns_each[number].of(optics)
         overlap_m = self.noise_each[number].overlap_m
-        return Air(self.takes(optics.wavelength_nm), EXIT_M, divergence, overlap_m)
+        exit_m = self.returns_each[number].exit_m(optics) or EXIT_M
+        return Air(self.takes(optics.wavelength_nm), exit_m, divergence, overlap_m)
 
     def met(self, number: int) -> float:
         """Count drops and flakes that a pulse of a sensor may return from, on the average."""

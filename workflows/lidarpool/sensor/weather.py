@@ -24,8 +24,8 @@ SNOW_DENSITY = 0.1  # of water's: dry snow, between 0.01 and 0.2 (Hahner et al. 
 SNOW_LARGEST_MM = 20.0  # Hahner et al. 2022
 SNOW_LIDAR_RATIO_SR = 25.0  # of ice clouds (Young and Vaughan 2009)
 DUST_M2_G = 0.6  # mass extinction of mineral dust (Ansmann et al. 2019: 0.57 to 0.63)
-DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 47 to 50 at 532 nm, 61 to 63 at 1064 nm
-EXIT_M = 0.01  # the beam's diameter at the sensor: 5 to 13 mm
+DUST_LIDAR_RATIO_SR = 60.0  # Haarig et al. 2022: 46 to 50 at 532 nm, 57 to 69 at 1064 nm
+EXIT_M = 0.01  # the beam's diameter at the sensor, if it is unknown: 5 to 13 mm
 NODES = 4096  # ranges at which tables and integrals are made
 # Share of the detection threshold below which particles are left out: 0.6 % of those that return
 # half of it are detected. That misses 2 % of the returns from rain, and 0.3 % of those from snow.
@@ -119,7 +119,9 @@ class Particles(NamedTuple):
     @property
     def extinction(self) -> float:
         """Extinction, 1/m: all take light in proportion to their cross-sections."""
-        return LARGE * math.pi / 4 * self.number * 2 / self.slope**3 * 1e-6
+        x = self.slope * self.largest
+        squares = 2 / self.slope**3 * (1 - math.exp(-x) * (1 + x + x * x / 2))
+        return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
     def above(self, diameter_mm: Real) -> Real:
         """Particles above diameters (n,), 1/m³: (n,)."""

@@ -90,10 +90,13 @@ class AirCaster:
             if seen is not None
         ]
         if self._fog is not None:
-            parts.append(self._in_fog(self._fog, scan, ray, reach, each))
+            parts.append(self._in_fog(self._fog, scan, ray, self._clouded(hits, reach), each))
         if not parts:
             return hits, planes
         sub, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+        if len(self._bent(hits)):
+            outside = ~self._within(hits, sub, distance)
+            sub, distance, energy = sub[outside], distance[outside], energy[outside]
         if parts[1:] or each > 1:
             order = np.argsort(sub, kind="stable")
             sub, distance, energy = sub[order], distance[order], energy[order]
@@ -108,6 +111,38 @@ class AirCaster:
             ends = np.where(on[self._surfaces.objects(hits.triangle)], np.inf, ends)
         reach = np.full(count, np.inf)
         reach[hits.ray] = ends  # of several, the last
+        return reach
+
+    def _bent(self, hits: Hits) -> NDArray[np.intp]:
+        """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
+        refracts = self._surfaces.at(self._wavelength_nm).refracts
+        if not refracts.any():
+            return np.zeros(0, np.intp)
+        return np.flatnonzero(refracts[self._surfaces.objects(hits.triangle)])
+
+    def _within(self, hits: Hits, ray: Whole, distance: Real) -> NDArray[np.bool_]:
+        """Whether places on rays are within water or glass, where nothing falls: (n,)."""
+        rows = self._bent(hits)
+        bent, where = hits.ray[rows], hits.distance[rows]
+        first, stop = (np.searchsorted(bent, ray, side=side) for side in ("left", "right"))
+        count = np.zeros(len(ray), np.int64)
+        for number in range(int((stop - first).max(initial=0))):
+            some = np.flatnonzero(first + number < stop)
+            count[some] += where[first[some] + number] < distance[some]
+        return np.asarray(count % 2 == 1)
+
+    def _clouded(self, hits: Hits, reach: Real) -> Real:
+        """How far fog goes: to surfaces, and to what light is refracted into, but for panes."""
+        rows = self._bent(hits)
+        if not len(rows):
+            return reach
+        ray, where = hits.ray[rows], hits.distance[rows]
+        out = np.full(len(rows), np.inf)
+        same = ray[1:] == ray[:-1]
+        out[:-1][same] = where[1:][same]
+        enters = (numbers(ray) % 2 == 0) & (out - where > self._gap_m)
+        reach = reach.copy()
+        np.minimum.at(reach, ray[enters], where[enters])
         return reach
 
     def _met(

@@ -132,7 +132,9 @@ class Bundle:
         area = np.abs((y * w - z * v) * a + (z * u - x * w) * b + (x * v - y * u) * c)
         area *= (self.index / self.first) ** 2
         nearer = distance**2 / np.maximum(area, 1e-12)
-        return np.asarray(nearer * np.exp(2 * (extinction * distance - self.lost)))
+        # Where the air takes so much more than the media, its own factor is 0.
+        more = np.minimum(2 * (extinction * distance - self.lost), 700.0)
+        return np.asarray(nearer * np.exp(more))
 
     def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools, index: Real) -> None:
         """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""

@@ -163,7 +163,7 @@ class Paths:
             looks = normals if turns is None else np.einsum("nji,nj->ni", turns, normals)
             rows = surfaces.objects(triangle)
             goes = materials.passes[rows] | materials.mirrors[rows]
-            if leafy:
+            if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
                 crowns[leaves] = False
                 near = distance <= farthest

@@ -24,6 +24,8 @@ from .hits import FALSE_ALARM, NO_SURFACE
 from .motion import Poses, products, turned
 from .surfaces import Surfaces, light_of
 
+LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
+
 
 class BatchReturns:
     """Kept returns of some consecutive scans of one station, in (scan, ray) order.
@@ -292,7 +294,8 @@ class BatchReturns:
     def reflectivity(self) -> NDArray[np.float64]:
         """Intensity without the loss by distance and air."""
         lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
-        return np.asarray(self.intensity / lost)
+        # In thick fog or dust nothing is left of the light from where a false alarm seems to be.
+        return np.asarray(self.intensity / np.maximum(lost, LEAST_LEFT))
 
     @cached_property
     def radial_velocity(self) -> NDArray[np.float64]:
