@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from lidarpool.columns.table import CHANNEL, OBJECT, TABLE, Z
+from lidarpool.columns.table import CHANNEL, OBJECT, TABLE, Column, Z
 from lidarpool.live.legend import as_bytes, legend_of
 from lidarpool.render.colouring import TURBO
 from lidarpool.render.colouring import colours_of as colouring_of
@@ -58,6 +58,16 @@ def test_objects_have_names_and_colours_of_their_own():
     assert "Ball" in legend
     assert "<b>Box" in legend  # the page writes it as text
     assert "object 2" in legend
+
+
+def test_what_is_no_surface_is_grey_and_has_no_object_s_colour():
+    values = np.arange(200, dtype=np.int32) % 3 - 1
+    colours, legend = colours_of(values, OBJECT, ("Ball", "Box"))
+    assert (colours[values < 0] == 128).all()
+    assert not (colours[values >= 0] == 128).all(axis=1).any()
+    assert '["no surface", [128, 128, 128], -1]' in legend
+    own = Column("zone", "int32", "", "zone", kind="label")
+    assert "no surface" not in colours_of(values, own)[1]
     many = tuple(f"thing {number}" for number in range(1100))
     assert '"thing 99"' in colours_of(np.arange(100), OBJECT, many)[1]
     assert '"more": 100' in colours_of(np.arange(1100), OBJECT, many)[1]

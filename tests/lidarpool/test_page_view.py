@@ -10,7 +10,7 @@ from tests.pages import ask
 from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, Track
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
+from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE
 from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.result_page import open_result, result_page, result_view, view_result
 from lidarpool.live.surface import Surface, colours_for
@@ -333,6 +333,22 @@ def test_what_a_column_is_filtered_by_is_told(cloud, pictured):
     assert heights["low"] >= 0 and heights["high"] == 3
     with pytest.raises(KeyError):
         told(view, "column", name="nothing")
+
+
+def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):
+    row = row_type(np.dtype(np.float64), (SCAN, CHANNEL, OBJECT, TABLE["cause"]))
+    rows = np.zeros(6, row)
+    rows["object"], rows["cause"] = np.arange(6) % 2 - 1, 1 - np.arange(6) % 2
+    (tmp_path / "air.ply").write_bytes(header(row, 6) + rows.tobytes())
+    file = CloudFile(tmp_path / "air.ply")
+    for view in (result_view(file, pictured), open_result(tmp_path / "air.ply")):
+        causes = [["surface", 0], ["air", 1]]
+        assert told(view, "column", name="cause")[0] == {"labels": causes}
+        assert told(view, "column", name="object")[0]["labels"][0] == ["no surface", -1]
+        legend = told(view, "points", colour="cause", most=ALL)[0]["legend"]
+        assert [[name, value] for name, _, value in legend["labels"]] == causes
+        words = dict(told(view, "point", row=0)[0]["columns"])
+        assert (words["object"], words["cause"]) == ("no surface", "air")
 
 
 def test_a_point_is_told_in_words_and_world_coordinates(cloud, pictured):

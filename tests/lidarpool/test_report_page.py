@@ -14,7 +14,17 @@ import yaml
 from lxml import html
 
 import lidarpool.report.page
-from lidarpool import Cloud, Planning, Result, Scene, Survey
+from lidarpool import (
+    Cloud,
+    Mounted,
+    Noise,
+    Planning,
+    Result,
+    Returns,
+    Scene,
+    Survey,
+    load_sensor,
+)
 from lidarpool.pipeline import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
@@ -181,6 +191,48 @@ def test_numbers_are_those_of_the_report(write):
     for stage, told in report["stages"].items():
         cells = [cell.text_content() for cell in rows[stage].findall("td")]
         assert cells[:3] == [told["partition"], str(len(told["workers"])), str(told["tasks"])]
+
+
+def test_what_differs_from_an_ideal_sensor_is_told_of_each(write):
+    sensor = load_sensor("velodyne/vlp16", max_range_m=60)
+    own = Noise(0.02, detection_range_m=60, false_alarm_hz=2000)
+    survey = Survey(
+        sensors=[
+            Mounted(sensor, name="left", noise=own),
+            Mounted(sensor, name="right", returns=Returns("dual", subrays=7)),
+        ],
+        poses=[(0, 0, 1)],
+        steps=60,
+        noise=Noise(detection_range_m=50),
+        rain_mm_h=10,
+    )
+    text, report = write(survey=survey)
+    left, right = report["parameters"]["sensors"].values()
+    assert (left["noise"]["false_alarm_hz"], right["noise"]["false_alarm_hz"]) == (2000, 0)
+    assert (left["returns"]["mode"], right["returns"]["mode"]) == ("strongest", "dual")
+    heads = html.fromstring(text).xpath("//h3")
+    told = {
+        head.text: {dt.text: dt.getnext().text for dt in head.getnext().iter("dt")}
+        for head in heads
+        if head.getnext().tag == "dl"
+    }
+    assert told["Noise of sensor left"] == {
+        "range_m": "0.02", "detection_range_m": "60", "false_alarm_hz": "2,000",
+    }  # fmt: skip
+    assert told["Returns of sensor right"] == {"mode": "dual", "subrays": "7"}
+    assert told["Noise of sensor right"] == {"detection_range_m": "50"}
+    assert "Returns of sensor left" not in told
+    assert "<dt>rain_mm_h</dt><dd>10</dd>" in text and "snow_mm_h" not in text
+
+
+def test_hits_on_nothing_are_told_from_those_on_surfaces(write):
+    cloud = cloud_of(500, 2, 120, 16)
+    cloud["object"][:100] = -1
+    on = np.full(len(scene_of(("Tower", "Wall")).faces), 2, np.int64)
+    text, report = write(cloud=cloud, _hit_counts=lambda: on)
+    assert report["hits_on_surfaces"] == on.sum() < report["hits"] == 2500
+    assert f"2,500 hit ({2500 - on.sum():,} of them no surface), and" in text
+    assert f"The {on.sum():,} hits on surfaces per square metre" in text
 
 
 def test_points_by_object_are_all_accounted_for(write):

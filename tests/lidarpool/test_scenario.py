@@ -279,6 +279,26 @@ def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):
     assert "m.glb scales N0 to zero: left out" in read.advice(scene)[0]
 
 
+@pytest.mark.parametrize(
+    ("idle", "used"),
+    [
+        ("cloud: {waveform_samples: 40}", "output: {write: [laz]}"),
+        ("weather: {fog_lidar_ratio_sr: 65}", "weather: {fog_lidar_ratio_sr: 9, visibility_km: 1}"),
+        (
+            "noise: {detection_range_m: 6, stray_light: 1}",
+            "materials: [{objects: '*', retro: true}]",
+        ),
+        ("noise: {velocity_m_s: 0.1}", "cloud: {columns: [radial_velocity]}"),
+    ],
+)
+def test_settings_without_effect_are_in_the_advice(scenario, idle, used):
+    read = scenario(idle)
+    (note,) = read.advice(read.build_scene())
+    assert idle.split("{")[1].split(": ")[-2].split(", ")[-1] in note
+    both = scenario(used if used[:5] == idle[:5] else f"{idle}\n{used}")
+    assert both.advice(both.build_scene()) == []
+
+
 YAML_VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: (

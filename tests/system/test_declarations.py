@@ -94,7 +94,7 @@ def test_a_scenario_with_it_is_checked_run_reported_and_not_continued_with_anoth
     done = python("-m", "lidarpool", "run", tmp_path / "2.yaml", "--out", tmp_path / "out")
     assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "out" / "report.json").read_text())
-    assert report["parameters"]["noise"]["gain_db"] == 2
+    assert report["parameters"]["sensor"]["noise"]["gain_db"] == 2
 
     begun = tmp_path / "begun"
     begun.mkdir()

@@ -254,9 +254,11 @@ def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, An
         click.echo(f"note: {note}")
     if not result.hits:
         click.echo(f"note: {no_hits(job)}")
+    on = report["hits_on_surfaces"]
     click.echo(
         f"{counted(job.survey.scan_count, 'scan')}, {counted(result.rays, 'ray')}, "
-        f"{counted(result.hits, 'hit')} on {counted(len(job.scene.all_names), 'object')}, "
+        f"{counted(on, 'hit')} on {counted(len(job.scene.all_names), 'object')}"
+        f"{f' and {result.hits - on:,} on none' if result.hits > on else ''}, "
         f"{counted(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )

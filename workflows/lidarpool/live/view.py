@@ -17,10 +17,10 @@ from raybeam import RayCaster
 
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
-from ..columns.table import Column, X, Y, Z
+from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
 from ..export.sweeps import Sweeps
 from ..render.closeup import around_ways, floor_and_cut
-from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb
+from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb, word_of
 from ..render.theme import mapped, object_colours
 from ..run.picture_file import Pictured, SensorWay, ways_of
 from ..scene.actors import Actor, samples_each, shapes_of
@@ -121,7 +121,7 @@ class View:
             return self.sweeps.sensors
         if self.sweeps is not None and column == "object":
             return (*self.sweeps.objects, *self.sweeps.actors)
-        return ()
+        return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _around(self) -> Bounds:
         """Local origin and the box of all that is shown."""
@@ -278,8 +278,7 @@ class View:
         few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
         if column.kind == "label" and len(found) and few:
             labels = [
-                [names[value] if 0 <= value < len(names) else f"{name} {value}", value]
-                for value in found.astype(np.int64).tolist()
+                [word_of(value, column, names), value] for value in found.astype(np.int64).tolist()
             ]
             return {"labels": labels}, {}
         unit = _NS if column.unit == "ns" else 1.0
@@ -303,6 +302,8 @@ class View:
 
     def _in_words(self, column: Column, value: Any) -> str:
         names = self._names(column.name)
+        if column == OBJECT and value < 0:
+            return NO_SURFACE
         if column.kind == "label" and 0 <= value < len(names):
             return names[int(value)] or str(value)
         if column.unit == "ns":

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from ..columns.table import COLOURS, NO_SURFACE, Column
+from ..columns.table import COLOURS, NO_SURFACE, OBJECT, Column
 from ..scene.colours import packed, unpacked
 from .theme import mapped, object_colours
 
@@ -57,12 +57,20 @@ def values_of(column: Column, read: Callable[[str], NDArray[Any]]) -> NDArray[An
     return read(column.name)
 
 
+def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
+    """Word for a value of a label; `names` are those of the values 0, 1, 2, …."""
+    if 0 <= value < len(names) and names[value]:
+        return names[value]
+    return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
+
+
 def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
     """Choose colours for the values (n,) of a column; `names` are those of its values 0, 1, 2, ….
 
     Labels have a colour each; labels without names and with too many values for a legend are on a
     scale like numbers. Numbers that are mostly small with a few large ones, and intensities of a
-    wide range, have a logarithmic scale. Velocities are blue below 0 and red above. NaN is grey.
+    wide range, have a logarithmic scale. Velocities are blue below 0 and red above. NaN is grey,
+    and so is what is no surface.
     """
     if column is RGB:
         return Colouring(lambda packs: unpacked(packs) / 255, column.name, "", column.meaning)
@@ -75,18 +83,15 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
             palette = object_colours(min(count, MOST_COLOURS))
             if len(found) > MOST_ENTRIES:
                 found = found[np.argsort(-counts, kind="stable")]
-            words = [
-                names[value]
-                if 0 <= value < len(names)
-                else NO_SURFACE
-                if value < 0
-                else f"{column.name} {value}"
-                for value in found.tolist()
-            ]
-            labels = tuple(zip(words, palette[found % len(palette)], strict=True))
+            palette, none = np.vstack([palette, [_GREY] * 3]), len(palette)
 
             def label(values: NDArray[Any]) -> NDArray[np.float64]:
-                return np.asarray(palette[values.astype(np.int64) % len(palette)])
+                numbers = values.astype(np.int64)
+                surface = (numbers >= 0) | (column.name != OBJECT.name)
+                return np.asarray(palette[np.where(surface, numbers % none, none)])
+
+            words = [word_of(value, column, names) for value in found.tolist()]
+            labels = tuple(zip(words, label(found), strict=True))
 
             kept = tuple(found.tolist())
             return Colouring(label, column.name, "", column.meaning, labels=labels, values=kept)

@@ -73,6 +73,8 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
         "scans": survey.scan_count,
         "rays": result.rays,
         "hits": result.hits,
+        # The counts of large scenes are large: without need they are not read.
+        "hits_on_surfaces": int(result.hit_counts.sum()) if cloud.no_surface else result.hits,
         "points": len(result.points),
         "points_by_object": {
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
@@ -111,20 +113,27 @@ def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     options = declared(survey, CloudOptions) | declared(survey, Weather)
     del options["columns"]  # which have a table of their own
+    each = zip(survey.carried, survey.returns_each, survey.noise_each, strict=True)
+    sensors = [
+        _sensor(mounted.sensor) | {"returns": asdict(returns), "noise": asdict(noise)}
+        for mounted, returns, noise in each
+    ]
     return {
         "objects": len(scene.all_names),
         "triangles": scene.triangles,
         "origin": scene.origin.tolist(),
-        "sensor": _sensor(survey.sensor),
-        "sensors": {m.name: _sensor(m.sensor) for m in survey.sensors if m.name},
+        "sensor": sensors[0],
+        "sensors": {
+            mounted.name: sensor
+            for mounted, sensor in zip(survey.carried, sensors, strict=True)
+            if mounted.name
+        },
         "actors": [actor.name for actor in scene.actors],
         "poses": survey.path.stations,
         "duration_s": survey.duration_ns / 1e9,
         "trajectory_s": survey.duration_ns / 1e9 if survey.path.moves else None,
         "steps": survey.steps_each[0],
         "materials": len(survey.materials),
-        "returns": asdict(survey.returns_each[0]),
-        "noise": asdict(survey.noise_each[0]),
         "navigation": None if survey.navigation is None else asdict(survey.navigation),
         **options,
         "start": None if survey.start is None else survey.start.isoformat(),

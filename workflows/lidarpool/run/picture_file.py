@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from ..base.archives import open_archive
 from ..base.words import counted
-from ..columns.table import TABLE, Column
+from ..columns.table import CAUSES, TABLE, Column
 from ..plan import Plan, Planning
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.colours import Colours
@@ -119,6 +119,8 @@ class Pictured:
         """Names of the values 0, 1, 2, … of a column, if any."""
         if column.name == "sensor":
             return [way.name for way in self.sensors]
+        if column == TABLE["cause"]:
+            return CAUSES
         return self.scene.all_names if column.name == "object" else ()
 
     def save(self, path: Path) -> None:

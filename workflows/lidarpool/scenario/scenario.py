@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import replace
 from fnmatch import fnmatchcase
@@ -20,7 +20,7 @@ from ..base.declared import Text, declared
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
-from ..columns.table import COLOURS
+from ..columns.table import COLOURS, VELOCITY
 from ..export.table import check_whole
 from ..plan import Planning
 from ..plan.planning import Search
@@ -352,19 +352,35 @@ class Scenario(Section):
     def advice(self, scene: Scene) -> list[str]:
         """Return notes on likely mistakes, such as a size that suggests another unit.
 
-        Also on objects that `build_scene` left out, on files whose axes it guessed, and on where
-        the sensor is.
+        Also on objects that `build_scene` left out, on files whose axes it guessed, on where the
+        sensor is, and on settings without effect.
         """
         notes = [*self._notes, *self._remarks[:1]]
         if self._remarks[1:]:
             notes[-1] += f"; {counted(len(self._remarks) - 1, 'more file')}, too"
         poses = self._of_poses(scene)  # first, because that finds out whether it is an object
-        return [*notes, *filter(None, (self._of_size(scene), poses, self._of_colours(scene)))]
+        some = filter(None, (self._of_size(scene), poses, self._of_colours(scene)))
+        return [*notes, *some, *self._idle()]
 
     @property
     def sources(self) -> dict[str, str]:
         """What `build_scene` read: {file: a line on what it gave}."""
         return dict(self._sources)
+
+    def _idle(self) -> Iterator[str]:
+        """Tell of settings that another one keeps from having an effect."""
+        written = {entry.format for entry in self.output.write}
+        if self.cloud.waveform_samples and not {"las", "laz"} & written:
+            yield (
+                "cloud.waveform_samples: only LAS and LAZ files hold waveforms, and none is "
+                "written: add output: {write: [las]}"
+            )
+        if self.weather.fog_lidar_ratio_sr is not None and self.weather.visibility_km is None:
+            yield "weather.fog_lidar_ratio_sr without weather.visibility_km is no fog"
+        if self.noise.stray_light and not any(entry.retro for entry in self.materials):
+            yield "noise.stray_light needs materials with retro: true, and there are none"
+        if self.noise.velocity_m_s and VELOCITY not in self.cloud.columns:
+            yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
 
     def _of_colours(self, scene: Scene) -> str:
         if not self.coloured:

@@ -14,12 +14,15 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from ...base.declared import declared
 from ...base.words import counted
 from ...pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ...render.page import shortened, without_common_prefix
 from ...run.result import RunResult
 from ...run.trials import TRIAL
 from ...scenario.scenario import Scenario
+from ...sensor import Noise, Returns
+from ...sensor.weather import Weather
 from ..cloud_numbers import CountedCloud
 from . import words
 from .timeline import make_timeline
@@ -79,6 +82,8 @@ def write_page(
         summary=_summary(report),
         facts=list(_facts(report, cloud)),
         pictures=list(_pictures(report, pictures)),
+        changed=_changed,
+        kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         stages=ordered,
         names=STAGES,
         timeline=make_timeline(ordered, result.records, STAGES),
@@ -151,7 +156,8 @@ def _summary(report: Report) -> str:
     text = (
         f"{counted(report['scans'], 'scan')} {where} sent "
         f"{counted(report['rays'], 'ray')} at {counted(parameters['objects'], 'object')}; "
-        f"{report['hits']:,} hit, and {counted(report['points'], 'point')} of them "
+        f"{report['hits']:,} hit{_on_none(report)}, and "
+        f"{counted(report['points'], 'point')} of them "
         f"{'is' if report['points'] == 1 else 'are'} in the cloud"
     )
     if planning is None:
@@ -163,6 +169,26 @@ def _summary(report: Report) -> str:
     if planning["excess"] is None:
         return f"{text}."
     return f"{text}, {excess(planning['excess']).removeprefix('+')} above the shortest possible."
+
+
+def _on_none(report: Report) -> str:
+    """Say how many returns are from no surface, such as rain."""
+    none = report["hits"] - report["hits_on_surfaces"]
+    return f" ({none:,} of them no surface)" if none > 0 else ""
+
+
+def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
+    """Name and value of each field of a dataclass that differs from its default."""
+    usual = declared(kind(), kind)
+    return [(name, _told(values[name])) for name in usual if values[name] != usual[name]]
+
+
+def _told(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, (list, tuple)):
+        return " × ".join(map(_told, value))
+    return f"{value:,.6g}" if isinstance(value, (int, float)) else str(value)
 
 
 def _title(parameters: Mapping[str, Any]) -> str:
@@ -208,7 +234,8 @@ def _pictures(report: Report, images: Mapping[str, str]) -> Iterator[tuple[Marku
     captions = {
         "scene": f"The scene: {objects} of {counted(parameters['triangles'], 'triangle')}, "
         f"{poses} in red{halfway}.",
-        "hits": f"The {counted(report['hits'], 'hit')} per square metre, and some rays.",
+        "hits": f"The {counted(report['hits_on_surfaces'], 'hit')} on surfaces per square metre, "
+        "and some rays.",
         "intensity": "The light that came back, of each point; gaps between points are closed.",
         "cloud": f"The cloud: {counted(report['points'], 'point')}, {kept}, rounded to "
         f"{parameters['precision_m']:g} m.",
