@@ -99,7 +99,7 @@ def sabotage(client: Client, tmp_path: Path) -> Iterator[Callable[..., Path]]:
 def same_cloud() -> Callable[[Cloud, Cloud], bool]:
     def same(one: Cloud, two: Cloud) -> bool:
         return np.array_equal(one.positions, two.positions) and all(
-            np.array_equal(one.columns[name], two.columns[name])
+            one.columns[name].tobytes() == two.columns[name].tobytes()  # NaN equals NaN
             for name in one.columns.keys() | two.columns.keys()
         )
 
