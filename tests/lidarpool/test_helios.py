@@ -377,6 +377,46 @@ LASER = scanner("conic", "", scanAngleMax_deg=20, scanFreqMax_Hz=10)
 FLY = legs('pulseFreq_hz="1000"')
 
 
+VOX = """VOXEL SPACE
+#min_corner: 0 0 0
+#max_corner: 1 1 2
+#split: 1 1 2
+#res: 1
+i j k PadBVTotal angleMean
+0 0 0 0.5 45
+0 0 1 1.5 45
+"""
+CROWN = """<part><filter type="detailedvoxels">
+  <param type="string" key="filepath" value="parts/crown.vox"/>
+  <param type="string" key="matfile" value="parts/leaf.mtl"/>
+  <param type="string" key="matname" value="leaf"/>{more}</filter>
+  <filter type="translate"><param type="vec3" key="offset" value="3;4;5"/></filter>
+</part></scene>"""
+
+
+def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
+    mode = '<param type="string" key="intersectionMode" value="{}"/>'.format
+    ladlut = '<param type="string" key="ladlut" value="l.txt"/>'
+    scene = GROUND.replace("</scene>", CROWN.format(more=mode("Transmittive") + ladlut))
+    scene = scene.replace("</scene>", CROWN.format(more=mode("scaled")))
+    leaf = "newmtl wood\nhelios_reflectance 10\nnewmtl leaf\nhelios_reflectance 50\n"
+    parts = {"crown.vox": VOX, "leaf.mtl": leaf}
+    device = scanner("rotating", scanAngleMax_deg=60, scanAngleEffectiveMax_deg=60)
+    made = import_survey(
+        survey(device, legs('pulseFreq_hz="1000" scanFreq_hz="30"'), scene, parts=parts),
+        tmp_path / "out",
+    )
+    built = made.scenario.build_scene()
+    assert built.has_voxels.tolist() == [False, True]
+    assert built.object_bounds[1] == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
+    table = MaterialTable.of(made.scenario.survey(built).materials, built.names)
+    assert table.reflectance.tolist() == [0.3, 0.5]
+    assert made.left_out[-2:] == [
+        "part 1, ladlut: leaf angles are spherical",
+        "part 2, detailedvoxels of parts/crown.vox: intersectionMode scaled, left out",
+    ]
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

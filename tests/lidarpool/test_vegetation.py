@@ -228,7 +228,6 @@ def test_a_surface_with_gaps_is_refused():
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"leaf_angle": "planophile"}, "leaf_angle needs a leaf_area_density"),
         ({"leaf_area_density": 1.0, "transparent": "pass"}, "leave out transparent"),
         ({"leaf_area_density": 1.0, "leaf_angle": "flat"}, "leaf_angle is 'flat'; it must be one"),
         ({"leaf_area_density": 0.0}, "leaf_area_density is 0.0; it must be above 0"),
@@ -237,6 +236,11 @@ def test_a_surface_with_gaps_is_refused():
 def test_materials_that_mean_nothing_are_refused(fields, says):
     with pytest.raises(LidarpoolError, match=says):
         Material("*", **fields)
+
+
+def test_a_leaf_angle_without_leaves_is_refused():
+    with pytest.raises(LidarpoolError, match="'Crown' has a leaf_angle, which needs a leaf_area"):
+        cast([ball("Crown", 1.0)], rays(1), materials=[Material("*", leaf_angle="planophile")])
 
 
 # -- the same bits -------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ class Job(TaskOptions):
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
 
     def __post_init__(self) -> None:
-        MaterialTable.of(self.survey.materials, self.scene.all_names)  # that they fit
+        _check_materials(self.scene, self.survey)
         for actor in self.scene.actors:
             actor.check(0.0, self.survey.duration_ns)
         _check_precision(self.scene, self.survey)
@@ -48,6 +48,11 @@ class Job(TaskOptions):
     def trials(self) -> int:
         """Number of planning trials."""
         return self.planning.trials if self.planning else 0
+
+
+def _check_materials(scene: Scene, survey: Survey) -> None:
+    """Check that materials fit the objects."""
+    MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
 
 
 def make_job(
@@ -69,7 +74,7 @@ def make_job(
     mistakes = Mistakes()
     with mistakes.noted():
         survey = scenario.survey(scene)
-        MaterialTable.of(survey.materials, scene.all_names)
+        _check_materials(scene, survey)
     with mistakes.noted():
         planning = None if no_plan else scenario.plan(scene)
     mistakes.tell()

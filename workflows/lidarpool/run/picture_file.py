@@ -230,7 +230,8 @@ class Pictured:
 def reflectances_of(scene: Scene, survey: Survey) -> NDArray[np.float64]:
     """Share of light that each object reflects, at the wavelength of the first sensor."""
     light = survey.carried[0].sensor.optics
-    return MaterialTable.of(survey.materials, scene.all_names, light.wavelength_nm).reflectance
+    names, voxels = scene.all_names, scene.has_voxels
+    return MaterialTable.of(survey.materials, names, light.wavelength_nm, voxels).reflectance
 
 
 def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:

@@ -391,7 +391,8 @@ class Scenario(Section):
                 "so that all is grey"
             )
         names = scene.all_names
-        textured = MaterialTable.of(self._materials(scene), names).scale > 0
+        table = MaterialTable.of(self._materials(scene), names, voxels=scene.has_voxels)
+        textured = table.scale > 0
         if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):
             return ""
         shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)

@@ -76,8 +76,9 @@ class MeshFile(Section):
     file: Annotated[
         str,
         told(
-            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), or a raster of "
-            "heights: .tif .asc .hgt .img .dem .dt2; from the scenario's folder",
+            ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), voxels of "
+            "AMAPVox (.vox), or a raster of heights: .tif .asc .hgt .img .dem .dt2; from the "
+            "scenario's folder",
             min_length=1,
             max_length=4096,
         ),

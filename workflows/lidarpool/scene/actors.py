@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,10 +32,21 @@ class Actor:
     trajectory
         Poses of its axes, in the scene's local coordinates; its only station begins with the
         survey. By default it stands at zero, until `Scanner.move` moves it.
+
+    Raises
+    ------
+    LidarpoolError
+        If the mesh has voxels.
     """
 
     mesh: Mesh
     trajectory: Trajectory = _AT_ZERO
+
+    def __post_init__(self) -> None:
+        if self.mesh.voxels is not None:
+            raise LidarpoolError(
+                f"{self.name!r} is of voxels, which cannot move: name it in scene.files or copies."
+            )
 
     @property
     def name(self) -> str:
@@ -102,6 +113,10 @@ def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], NDArray[np.intp]]:
 def one_mesh(name: str, objects: Iterable[Mesh | Instance]) -> Mesh:
     """Join objects to one; masks are kept."""
     flat = [one.flat() if isinstance(one, Instance) else one for one in objects]
+    if any(part.voxels is not None for part in flat):
+        if flat[1:]:
+            raise LidarpoolError(f"{name!r} has voxels, and cannot be joined to other objects.")
+        return replace(flat[0], name=name)
     vertices, _ = stacked((part.vertices, part.faces) for part in flat)
     first, solid, cut = 0, [], []
     cutouts: list[Cutout] = []

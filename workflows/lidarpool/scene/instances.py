@@ -15,7 +15,7 @@ from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
 from ..sensor import Pose
 from .colours import Colours
-from .mesh import Mesh
+from .mesh import Mesh, Voxels
 from .transform import Transform
 
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
@@ -110,6 +110,7 @@ class Part(NamedTuple):
     mask: NDArray[np.bool_] | None = None  # (h, w), see `Cutout`
     uv: NDArray[np.float32] | None = None  # (f, 3, 2)
     colours: Colours | None = None
+    voxels: Voxels | None = None  # leaves within
 
 
 def parts_of(mesh: Mesh) -> Iterator[Part]:
@@ -118,7 +119,7 @@ def parts_of(mesh: Mesh) -> Iterator[Part]:
     whole = mesh.colours
     if start:
         own = whole and whole.take(slice(0, start))
-        yield Part(*_used(mesh.vertices, mesh.faces[:start]), colours=own)
+        yield Part(*_used(mesh.vertices, mesh.faces[:start]), colours=own, voxels=mesh.voxels)
     for cut in mesh.cutouts:
         stop = start + len(cut.uv)
         own = whole and whole.take(slice(start, stop))

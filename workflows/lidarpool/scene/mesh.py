@@ -15,6 +15,8 @@ from ..base.errors import LidarpoolError
 from .colours import Colours
 
 UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
+VOXELS_MOST = 10_000  # along each axis: light takes as many steps
+DENSEST = 1e4  # leaf area density, m²/m³
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,6 +38,28 @@ class Cutout:
 
 
 @dataclass(frozen=True, eq=False)
+class Voxels:
+    """Leaves within a closed surface, by a grid of their densities; there are none beyond it.
+
+    Attributes
+    ----------
+    density
+        float32 (nx, ny, nz): one-sided leaf area, m²/m³, finite and not negative.
+    matrix
+        float64 (3, 4): takes places in the grid, in which voxels have the edge 1 and the first one
+        begins at zero, to coordinates of the mesh.
+    """
+
+    density: NDArray[np.float32]
+    matrix: NDArray[np.float64]
+
+    def moved(self, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Voxels:
+        """Return it at p -> linear @ p + offset; the densities are shared, and stay per m³."""
+        shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
+        return Voxels(self.density, linear @ self.matrix + shift)
+
+
+@dataclass(frozen=True, eq=False)
 @checked_fields
 class Mesh:
     """Triangles of one object, in world coordinates.
@@ -52,6 +76,8 @@ class Mesh:
         Of the last faces, one cutout after the other.
     colours
         Of the faces, see `lidarpool.scene.colours.Colours`; None if it has none.
+    voxels
+        Densities of leaves within its surface, which is closed then and has no cutouts.
 
     Raises
     ------
@@ -65,6 +91,7 @@ class Mesh:
     faces: NDArray[np.int64]
     cutouts: tuple[Cutout, ...] = ()
     colours: Colours | None = None
+    voxels: Voxels | None = None
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "vertices", points_array(self.name, self.vertices))
@@ -86,6 +113,10 @@ class Mesh:
         _check_cutouts(self.name, self.cutouts, len(faces))
         if self.colours is not None:
             self.colours.check(self.name, len(faces))
+        if self.voxels is not None:
+            _check_voxels(self.name, self.voxels)
+            if self.cutouts:
+                raise LidarpoolError(f"{self.name!r} has voxels and cutouts: leave out one.")
 
     @cached_property
     def bounds(self) -> NDArray[np.float64]:
@@ -99,7 +130,26 @@ class Mesh:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
             colours = colours and colours.mirrored()
-        return Mesh(name, self.vertices @ linear.T + offset, faces, cutouts, colours)
+        voxels = self.voxels and self.voxels.moved(linear, offset)
+        return Mesh(name, self.vertices @ linear.T + offset, faces, cutouts, colours, voxels)
+
+
+def _check_voxels(name: str, voxels: Voxels) -> None:
+    density, matrix = voxels.density, voxels.matrix
+    if density.dtype != np.float32 or density.ndim != 3 or not density.size:
+        raise LidarpoolError(
+            f"Densities of {name!r} are {density.dtype} {density.shape}; they must be float32 "
+            "(nx, ny, nz)."
+        )
+    if max(density.shape) > VOXELS_MOST or not 0 <= density.min() <= density.max() <= DENSEST:
+        raise LidarpoolError(
+            f"Densities of {name!r} must be 0 to {DENSEST:g} m²/m³, and {VOXELS_MOST:,} at most "
+            "along each axis."
+        )
+    if matrix.shape != (3, 4) or not np.isfinite(matrix).all():
+        raise LidarpoolError(f"The matrix of voxels of {name!r} must be finite and (3, 4).")
+    if np.linalg.matrix_rank(matrix[:, :3]) < 3:
+        raise LidarpoolError(f"The matrix of voxels of {name!r} flattens them: it has no inverse.")
 
 
 def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:

@@ -34,6 +34,7 @@ from .rasters import Window, read_raster
 from .threemf import read_3mf
 from .transform import UP_AXES, Transform
 from .usd import read_usd
+from .vox import read_vox
 
 CITYJSON = (".json", ".cityjson", ".jsonl")
 
@@ -49,6 +50,7 @@ _READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
     ".off": read_off,
     ".dae": read_dae,
     ".3mf": read_3mf,
+    ".vox": read_vox,
     **dict.fromkeys((".usd", ".usda", ".usdc", ".usdz"), read_usd),
     **dict.fromkeys(CITYJSON, read_cityjson),
 }
@@ -224,6 +226,11 @@ def _summary(
     if shared:
         of = counted(len({id(mesh) for mesh in shared}), "mesh", "meshes")
         words.append(f"{len(shared):,} of them instances of {of}")
+    words += [
+        " x ".join(map(str, mesh.voxels.density.shape)) + " voxels"
+        for mesh in shapes
+        if mesh.voxels is not None
+    ]
     size = UNITS_M[unit] if unit else content.unit_m or 1.0
     names = [name for name, metres in UNITS_M.items() if metres == size]
     words += [

@@ -222,12 +222,12 @@ class Scene:
                 )
         if not objects:
             raise LidarpoolError("A scene needs at least one object with triangles.")
-        plain: list[tuple[int, Mesh]] = []  # (object, mesh without masks)
+        plain: list[tuple[int, Mesh]] = []  # (object, mesh without masks and voxels)
         shared: list[tuple[int, int, NDArray[np.float64]]] = []  # (object, part, matrix)
         parts: list[Part] = []
         known: dict[Mesh, list[int]] = {}  # {mesh of instances: its parts}
         for number, one in enumerate(objects):
-            if isinstance(one, Mesh) and not one.cutouts:
+            if isinstance(one, Mesh) and not one.cutouts and one.voxels is None:
                 plain.append((number, one))
                 continue
             mesh, matrix = (one, np.eye(4)) if isinstance(one, Mesh) else (one.mesh, one.matrix)
@@ -236,7 +236,7 @@ class Scene:
                 known[mesh] = list(range(len(parts), len(parts) + len(made)))
                 parts += made
             for part in known[mesh]:
-                if isinstance(one, Mesh) and parts[part].mask is None:
+                if isinstance(one, Mesh) and parts[part].mask is None and one.voxels is None:
                     solid = parts[part]
                     corners = solid.faces.astype(np.int64)
                     mesh = Mesh(one.name, solid.vertices, corners, colours=solid.colours)
@@ -350,6 +350,15 @@ class Scene:
         return found
 
     @property
+    def has_voxels(self) -> NDArray[np.bool_]:
+        """Whether each object, actors after the others, has voxels: (objects,)."""
+        found = np.zeros(len(self.names) + len(self.actors), np.bool_)
+        if (shared := self.instances) is not None:
+            some = np.array([part.voxels is not None for part in shared.parts])
+            found[shared.owner[some[shared.part]]] = True
+        return found
+
+    @property
     def triangles(self) -> int:
         """Number of triangles, including those of instances and actors."""
         shared = self.instances.triangles if self.instances else 0
@@ -417,6 +426,7 @@ class Scene:
                     part.faces.astype(np.int64),
                     () if part.mask is None or part.uv is None else (Cutout(part.mask, part.uv),),
                     part.colours,
+                    part.voxels,
                 )
                 for number, part in enumerate(shared.parts)
             ]

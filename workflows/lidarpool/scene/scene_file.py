@@ -71,6 +71,9 @@ def check_target(path: Path) -> None:
 
 def _encoded(suffix: str, scene: Scene) -> bytes:
     """Content of a file of one of `SUFFIXES`."""
+    if scene.has_voxels.any():
+        name = scene.all_names[scene.has_voxels.argmax()]
+        raise LidarpoolError(f"{name!r} is of voxels, which cannot be written: name its .vox file.")
     if suffix == ".ply":
         if scene.origin.any():
             step = np.spacing(np.float32(np.abs(scene.origin).max()))

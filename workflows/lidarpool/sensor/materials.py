@@ -146,8 +146,9 @@ class Material:
     leaf_angle: Annotated[
         LeafAngle,
         Field(
-            description="with leaf_area_density, how leaves are inclined: spherical, planophile, "
-            "erectophile, plagiophile, extremophile, uniform, or Campbell's ratio of axes"
+            description="with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
+            "planophile, erectophile, plagiophile, extremophile, uniform, or Campbell's ratio "
+            "of axes"
         ),
     ] = "spherical"
 
@@ -186,14 +187,29 @@ class Material:
         if self.attenuation_per_m and self.refractive_index is None:
             raise LidarpoolError("attenuation_per_m needs a refractive_index, such as 1.33.")
         if self.leaf_area_density is None:
-            if self.leaf_angle != "spherical":
-                raise LidarpoolError("leaf_angle needs a leaf_area_density, m²/m³, such as 0.8.")
             return
-        other = self.transparent != "none" or self.retro or self.roughness is not None
-        if other or self.reflectance == "texture":
+        if not self._suits_leaves:
             raise LidarpoolError(
                 "leaf_area_density is for leaves that scatter light: leave out transparent, retro "
                 "and roughness, and give reflectance as a number, or a material."
+            )
+
+    @property
+    def _suits_leaves(self) -> bool:
+        other = self.transparent != "none" or self.retro or self.roughness is not None
+        return not other and self.reflectance != "texture"
+
+    def check_leaves(self, name: str, voxels: bool) -> None:
+        """Check that it suits an object, by whether that has voxels; LidarpoolError if not."""
+        if voxels and (self.leaf_area_density is not None or not self._suits_leaves):
+            raise LidarpoolError(
+                f"materials: {name!r} is of voxels, whose file has the leaf area: give it an entry "
+                "with a reflectance, or a material, and perhaps a leaf_angle, but nothing else."
+            )
+        if not voxels and self.leaf_angle != "spherical" and self.leaf_area_density is None:
+            raise LidarpoolError(
+                f"materials: {name!r} has a leaf_angle, which needs a leaf_area_density, m²/m³, "
+                "such as 0.8, if it is not of voxels (.vox)."
             )
 
     def share(self, wavelength_nm: float) -> float:
@@ -295,20 +311,27 @@ class MaterialTable:
     semantic_class: NDArray[np.uint16]
     refractive_index: NDArray[np.float64]  # within; 0 where light goes straight on
     attenuation: NDArray[np.float64]  # within, 1/m
-    leaf_area: NDArray[np.float64]  # density within, m²/m³; 0 for no leaves
+    leaf_area: NDArray[np.float64]  # density within, m²/m³; 0 for no leaves, 1 for voxels
     leaf_angle: NDArray[np.intp]  # rows of `leaf_angles`
     leaf_angles: tuple[str | float, ...]
 
     @classmethod
     def of(
-        cls, materials: Sequence[Material], names: Sequence[str], wavelength_nm: float = NEAR_NM
+        cls,
+        materials: Sequence[Material],
+        names: Sequence[str],
+        wavelength_nm: float = NEAR_NM,
+        voxels: NDArray[np.bool_] | None = None,
     ) -> MaterialTable:
         """Find the materials of objects by name: the last that names an object counts.
+
+        `voxels` (objects,) says which have voxels, and so leaves of their own; None for none.
 
         Raises
         ------
         LidarpoolError
-            If a name fits no object, or there are materials and an object has none.
+            If a name fits no object, there are materials and an object has none, or one is not for
+            leaves, and its object has some.
         """
         last = _last_for(materials, names)
         without = np.flatnonzero(last < 0)
@@ -321,6 +344,12 @@ class MaterialTable:
         found = [*materials, Material("*")]  # the last is of all, if there are no materials
         textured = [m.scale * (m.reflectance == "texture") for m in found]
         angles = tuple(dict.fromkeys(m.leaf_angle for m in found))
+        leaf_area = np.array([m.leaf_area_density or 0.0 for m in found])[last]
+        own = np.zeros(len(names), np.bool_) if voxels is None else voxels
+        angled = np.array([m.leaf_angle != "spherical" for m in found])[last]
+        for row in np.flatnonzero(own | angled).tolist():
+            found[last[row]].check_leaves(names[row], bool(own[row]))
+        leaf_area[own] = 1.0
         return cls(
             np.array([m.share(wavelength_nm) for m in found], np.float64)[last],
             np.array(textured, np.float64)[last],
@@ -332,7 +361,7 @@ class MaterialTable:
             np.array([m.semantic_class for m in found], np.uint16)[last],
             np.array([m.refractive_index or 0.0 for m in found])[last],
             np.array([m.attenuation_per_m for m in found], np.float64)[last],
-            np.array([m.leaf_area_density or 0.0 for m in found])[last],
+            leaf_area,
             np.array([angles.index(m.leaf_angle) for m in found], np.intp)[last],
             angles,
         )

@@ -159,6 +159,8 @@ class Media:
         self.filled = table.leafy | table.refracts  # whether objects hold a medium
         self.leafy = bool(table.leafy.any())
         self.bends = bool(table.refracts.any())
+        self.grids, self.instances = surfaces.grids, surfaces.instances
+        self.gridded = np.append(scene.has_voxels, False)  # objects
         self._angles = table.leaf_angles
         # Of no object, which has the number -1, nothing.
         self._area, self._index, self._attenuation = (
@@ -318,23 +320,65 @@ class Within:
         """Optical paths of so many metres (n,)."""
         return step if self.bundle is None else step * self.bundle.index
 
-    def meet(self, directions: Real, length: Real, ray: Whole, draw: Draw) -> Leaves:
-        """Find which light meets a leaf within its next metres (n,)."""
+    def meet(
+        self, origins: Real, directions: Real, span: tuple[Real, Real], ray: Whole, draw: Draw
+    ) -> Leaves:
+        """Find which light meets a leaf within a span of its way, metres from its origin (n,)."""
         if self.left is None:
             none = np.zeros(0, np.intp)
             return Leaves(none, np.zeros(0), np.zeros(0, np.int32), np.zeros(0))
         upright = np.minimum(np.abs(directions[:, 2]), 1)
-        sums = np.cumsum(self.media.density(self.around, upright), axis=1)
+        density = self.media.density(self.around, upright)
+        length = span[1] - span[0]
+        among = None
+        if self.media.grids is not None:
+            among = self._among_voxels(origins + span[0][:, None] * directions, directions, length,
+                                       density)  # fmt: skip
+        sums = np.cumsum(density, axis=1)
         total = sums[:, -1]
         depth = total * length
+        if among is not None:
+            there, far, rest = among
+            depth[there] = self.left[there] - rest
         rows = np.flatnonzero(depth > self.left)
         metres = self.left[rows] / total[rows]
+        if among is not None:
+            ends = np.full(len(depth), np.nan)
+            ends[there] = far
+            metres = np.where(np.isnan(ends[rows]), metres, ends[rows])
         self.left = self.left - depth
         # Where crowns overlap, a leaf is of one of them in proportion to its density.
         share = (draw(WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
         place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
         cosines = self.media.bright(self.around.objects[rows, place], upright[rows])
         return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
+
+    def _among_voxels(
+        self, starts: Real, directions: Real, length: Real, density: Real
+    ) -> tuple[NDArray[np.intp], Real, Real]:
+        """Take light through grids, and put their optical depths for a metre into `density`.
+
+        Those that it has are for a density of 1. Returns the rows of light in grids, how far it
+        gets, and the optical depth that is left then, as of `Grids.through`.
+        """
+        grids, around = self.media.grids, self.around
+        assert grids is not None and self.left is not None
+        gridded = self.media.gridded[around.objects]
+        rows = np.flatnonzero(gridded.any(axis=1))
+        gridded = gridded[rows]
+        place = np.argsort(~gridded, axis=1, kind="stable")
+        place = place[:, : gridded.sum(axis=1).max(initial=1)]
+        used = np.take_along_axis(gridded, place, axis=1)
+        triangles = np.take_along_axis(around.triangles[rows], place, axis=1)
+        which = np.where(used, self.media.instances(triangles), -1)
+        crossing = np.take_along_axis(density[rows], place, axis=1)
+        own = np.where(gridded, 0, density[rows])
+        even = np.cumsum(own, axis=1)[:, -1]
+        given = which, starts[rows], directions[rows], crossing, even, length[rows], self.left[rows]
+        metres, rest, found = grids.through(*given)
+        np.put_along_axis(own, place, np.where(used, found, np.take_along_axis(own, place, 1)), 1)
+        density[rows] = own
+        return rows, metres, rest
 
     def go(self, step: Real) -> None:
         """Go straight on so many metres (n,)."""

@@ -62,6 +62,7 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
     memory, some 300 MB, does not count.
     """
     leafy = any(material.leaf_area_density is not None for material in survey.materials)
+    leafy |= bool(scene.has_voxels.any())
     passing = leafy or any(material.transparent != "none" for material in survey.materials)
     refracted = any(material.refractive_index is not None for material in survey.materials)
     dark = any(material.reflectance == 0 for material in survey.materials)

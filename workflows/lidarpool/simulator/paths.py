@@ -139,7 +139,7 @@ class Paths:
             cosine = np.abs(along)
             within, leaves = light.within, np.zeros(0, np.intp)
             if within is not None:
-                met = within.meet(light.directions, step - clear, light.ray, draw)
+                met = within.meet(light.origins, light.directions, (clear, step), light.ray, draw)
                 step, triangle, leaves = step.copy(), triangle.copy(), met.rows
                 step[leaves] = clear[leaves] + met.metres
                 triangle[leaves], cosine[leaves] = met.triangles, met.cosines

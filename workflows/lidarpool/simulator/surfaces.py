@@ -18,6 +18,7 @@ from ..sensor import Sensor, Survey, Trajectory
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ..sensor.trajectory import velocities
 from .motion import carried_at, into_axes, products
+from .voxels import Grids
 
 _log = logging.getLogger(__name__)
 
@@ -74,7 +75,10 @@ class Surfaces:
         self._standing = len(scene.names)  # objects
         self.counters = scene.counters
         names = scene.all_names
-        self._tables = {nm: MaterialTable.of(materials, names, nm) for nm in wavelengths}
+        self._tables = {
+            nm: MaterialTable.of(materials, names, nm, scene.has_voxels) for nm in wavelengths
+        }
+        self.grids = Grids.of(scene.instances)
         shared = scene.instances
         plain = len(scene.faces)
         sizes = np.zeros(0, np.int64) if shared is None else shared.sizes
@@ -108,6 +112,7 @@ class Surfaces:
         made = copy(self)
         made._scene, made._turns = scene, self._turns.copy()
         made._turns[rows] = _turns(scene.instances.transforms[rows])
+        made.grids = self.grids and self.grids.moved(scene.instances)
         return made
 
     def _found(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
@@ -260,6 +265,10 @@ class Surfaces:
         objects = self.owners[rows]
         objects[on] = shared.owner[which]
         return objects
+
+    def instances(self, triangle: Triangles) -> NDArray[np.intp]:
+        """Instances that triangles (n,) belong to; each belongs to one."""
+        return np.searchsorted(self._begins, triangle, side="right") - 1
 
     def counter(self, triangle: Triangles) -> Triangles:
         """Counters of hits of triangles (n,), see `Scene.counters`."""

@@ -25,7 +25,8 @@ from ...sensor import Pose
 from .files import Assets, Float, clean, number, rotation
 
 # Loaders whose files hold no triangles.
-_UNREAD = ("geotiffloader", "xyzloader", "detailedvoxels")
+_UNREAD = ("geotiffloader", "xyzloader")
+_LOADERS = ("objloader", "detailedvoxels")
 
 
 @dataclass
@@ -38,16 +39,22 @@ class Part:
     scale: float
     offset: Float
     falls: bool  # until it stands on the ground
+    library: Path | None = None  # of the material of voxels, and its name there
+    material: str = ""
 
     @cached_property
     def materials(self) -> list[dict[str, str]]:
         """Material values that HELIOS++ reads for its faces."""
         text = _text(self.file)
-        used = set(re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE))
+        used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
         found: dict[str, dict[str, str]] = {}
-        for name in re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE):
+        named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
+        libraries = [self.file.parent / name for name in named] + [self.library] * bool(
+            self.library
+        )
+        for library in libraries:
             values: dict[str, str] = {}
-            for words in (line.split() for line in _text(self.file.parent / name).splitlines()):
+            for words in (line.split() for line in _text(library).splitlines()):
                 if words[:1] == ["newmtl"] and len(words) > 1:
                     values = found.setdefault(words[1], {})
                 elif len(words) > 1 and words[0].startswith("helios_"):
@@ -111,7 +118,7 @@ class Surroundings:
                 self.parts += self._read(part, f"part {index}", assets)
         if not self.parts:
             raise LidarpoolError(
-                f"{name} has no part that can be read: only those of the filter objloader are."
+                f"{name} has no part that can be read: only those of {' and '.join(_LOADERS)} are."
             )
         for one in self.parts:
             if one.falls:
@@ -123,6 +130,7 @@ class Surroundings:
                 moving.append(name)
         files: list[Path] = []
         up, turn, scale, offset, falls = None, np.eye(3), 1.0, np.zeros(3), False
+        library, material = None, ""
         for step in part.findall("filter"):
             kind = step.get("type", "").lower()
             given = {param.get("key", ""): param for param in step.findall("param")}
@@ -131,8 +139,18 @@ class Surroundings:
                 what = text.get("filepath") or text.get("efilepath", "")
                 self.unread.append(f"{name}, {kind} of {what}: no triangles, left out")
                 return
-            if kind == "objloader":
+            mode = text.get("intersectionMode", "transmittive").lower()
+            if kind == "detailedvoxels" and mode != "transmittive":
+                what = text.get("filepath") or text.get("efilepath", "")
+                self.unread.append(f"{name}, {kind} of {what}: intersectionMode {mode}, left out")
+                return
+            if kind in _LOADERS:
                 files, up = _files(text, assets), text.get("up")
+                if kind == "detailedvoxels":
+                    up, material = None, text.get("matname", "")
+                    library = assets.file(text["matfile"]) if "matfile" in text else None
+                    if "ladlut" in text:
+                        self.unread.append(f"{name}, ladlut: leaf angles are spherical")
             elif kind == "rotate":
                 turn = rotation(given.get("rotation")) @ turn
             elif kind == "scale":
@@ -143,13 +161,15 @@ class Surroundings:
                 falls = text.get("onGround", "0") != "0"
             else:
                 raise LidarpoolError(
-                    f"the filter {kind!r} is not known; there are objloader, rotate, scale, "
-                    f"translate, {', '.join(_UNREAD)}."
+                    f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
+                    f"scale, translate, {', '.join(_UNREAD)}."
                 )
         if not files:
             raise LidarpoolError("no filter loads a file.")
         up = up if up in ("y", "z") else None
-        yield from (Part(file, up, turn, float(scale), offset.copy(), falls) for file in files)
+        for file in files:
+            placed = up, turn, float(scale), offset.copy(), falls
+            yield Part(file, *placed, library, material)
 
     @cached_property
     def _ground(self) -> Scene | None:
