@@ -85,7 +85,8 @@ def test_rain_takes_what_was_published(mm_h):
     published = 1.45 * mm_h**0.64 * math.log(10) / 10  # 1/km
     assert 1000 * rain(mm_h).extinction == pytest.approx(published, rel=0.1)
     by_hand = math.pi * 8000e-6 / (4.1 * mm_h**-0.21) ** 3  # 2 · π/4 · N0 · 2/Λ³
-    assert rain(mm_h).extinction == pytest.approx(by_hand)
+    # By hand it is that of drops of all sizes; the largest drop has 6 mm.
+    assert rain(mm_h).extinction == pytest.approx(by_hand, rel=3e-3)
 
 
 @pytest.mark.parametrize("mm_h", [0.5, 1.0, 3.0])
