@@ -125,7 +125,7 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
         assert "no such wall" in told["failures"][0]["error"]
         assert told["points"] == run.points
         assert told["under_way"] == []
-        assert {"running", "done"} <= states | {told["state"]}
+        assert told["state"] == "done" and states  # a short campaign may not be seen running
         wait_for_charts(live, 2)
 
         number, name = told["newest"]

@@ -88,7 +88,9 @@ def _pause(client: Client, name: str, *, on: bool) -> None:
         time.sleep(0.02)
 
 
-def test_a_worker_that_dask_pauses_gets_no_more_batches(client, undisturbed, same_cloud):
+def test_a_worker_that_dask_pauses_gets_no_more_batches(
+    client, undisturbed, small_batches, same_cloud
+):
     def on_frame(frame: Frame) -> None:
         if frame.scan == 30:
             _pause(client, "GPU-0", on=True)

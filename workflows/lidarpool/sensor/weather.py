@@ -138,7 +138,7 @@ def rain(mm_h: float) -> Particles:
     Examples
     --------
     >>> f"{1000 * rain(10.0).extinction:.2f}"  # 1/km
-    '1.55'
+    '1.56'
     """
     n = WATER_INDEX
     r = ((n - 1) / (n + 1)) ** 2
