@@ -45,8 +45,18 @@ else:
     settings.load_profile(os.environ.get("HYPOTHESIS_PROFILE", "patient"))
 
 
+_HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+
+
 @pytest.fixture(autouse=True)
-def _logs() -> Iterator[None]:
-    """Undo what a command that ran in this process did: without -v it silences all libraries."""
+def _as_before() -> Iterator[None]:
+    """Undo what a command that ran in this process did.
+
+    Without -v it silences all libraries, and a second interrupt ends the process at once: that of
+    a later test.
+    """
     yield
     logging.disable(logging.NOTSET)
+    for number, handler in _HANDLERS.items():
+        if signal.getsignal(number) is not handler:
+            signal.signal(number, handler)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-import logging
 import os
 import signal
 import subprocess
@@ -230,11 +229,10 @@ class Outcome:
 @pytest.fixture(name="lidarpool")
 def run_lidarpool(
     capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[..., Outcome]]:
+) -> Callable[..., Outcome]:
     """Run the command in this process."""
     # The workers of `local_client` are forked from the same server, and end with it.
     monkeypatch.setattr(lidarpool.base.fork_server, "stop_fork_server", lambda: None)
-    handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
     def run(*arguments: object) -> Outcome:
         capfd.readouterr()
@@ -243,10 +241,7 @@ def run_lidarpool(
         out, err = capfd.readouterr()
         return Outcome(int(ended.value.code or 0), out, err)
 
-    yield run
-    for number, handler in handlers.items():
-        signal.signal(number, handler)
-    logging.disable(logging.NOTSET)
+    return run
 
 
 class BlankPage:
