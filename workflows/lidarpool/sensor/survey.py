@@ -61,7 +61,7 @@ class Mounted:
     mount
         Its pose in the carrier's axes.
     name
-        Its name, needed if there are several.
+        Its name, needed if there are several; part of all its random numbers.
     steps
         Time steps from each station; by default those of the survey.
     returns, noise
@@ -94,6 +94,8 @@ class ScanSpec:
         Number of its sensor.
     channels
         Of that.
+    ahead
+        By how many scans its random numbers are ahead of its number.
     """
 
     scan: int
@@ -102,6 +104,7 @@ class ScanSpec:
     start_ns: int = 0
     sensor: int = 0
     channels: int = 1
+    ahead: int = 0
 
     @property
     def ray_count(self) -> int:
@@ -379,6 +382,11 @@ class Survey(CloudOptions, Weather):
         """The sensors, also if there is only one."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
+    @property
+    def carrier(self) -> str:
+        """Name of the carrier, for the seeds of its instruments: that of its first sensor."""
+        return self.carried[0].name
+
     @cached_property
     def returns_each(self) -> tuple[Returns, ...]:
         """What each sensor reports of its pulses."""
@@ -386,8 +394,8 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
-        """Noise of each sensor."""
-        return tuple(carried.noise or self.noise for carried in self.carried)
+        """Noise of each sensor, whose seed its name is part of."""
+        return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:

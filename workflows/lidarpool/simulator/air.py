@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from ..scene.colours import GREY, packed
 from ..sensor import Survey
-from ..sensor.noise import THRESHOLD_SIGMAS, raw, uniform
+from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, raw, uniform
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, numbers
@@ -26,10 +26,6 @@ QUANTILES = 1 << 16
 TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
 CELLS_MOST = 255  # pulse lengths of fog
 TAIL_SIGMAS = 6.0
-# Purposes of random numbers.
-_FOG_CELL, _FOG_PLACE = 10, 11
-_COUNT, _RANGE, _DIAMETER, _PLACE = 12, 13, 14, 15  # of the first kind of particles, then 4 more
-_PURPOSES = 4
 
 
 class _Seen(NamedTuple):
@@ -72,6 +68,8 @@ class AirCaster:
         air, least = survey.air(number), FAINTEST * noise.threshold
         begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
         self._seen = [_seen(air, kind, least, begins, ends) for kind in survey.particles]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self._seen))]
+        self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.scatters(self._wavelength_nm)
         self._fog = _fog(air, scatters, noise.threshold, begins, ends, self._gap_m)
 
@@ -85,8 +83,8 @@ class AirCaster:
         scan, ray = keys.of(np.arange(*rays))
         reach = self._reach(hits, len(ray) * each)
         parts = [
-            self._met(seen, _PURPOSES * which, scan, ray, reach, each)
-            for which, seen in enumerate(self._seen)
+            self._met(seen, seed, scan, ray, reach, each)
+            for seen, seed in zip(self._seen, self._seeds, strict=True)
             if seen is not None
         ]
         if self._fog is not None:
@@ -146,21 +144,21 @@ class AirCaster:
         return reach
 
     def _met(
-        self, seen: _Seen, first: int, scan: Whole, ray: Whole, reach: Real, each: int
+        self, seen: _Seen, seed: int, scan: Whole, ray: Whole, reach: Real, each: int
     ) -> tuple[Whole, Real, Real]:
         """Sub-rays, distances and energies of particles of a kind."""
-        chance = uniform(self._seed, _COUNT + first, scan, ray)
+        chance = uniform(seed, Purpose.PARTICLES, scan, ray)
         some = np.flatnonzero(chance >= seen.counts[0])
         beam = np.repeat(some, np.searchsorted(seen.counts, chance[some], side="right"))
         key = scan[beam], ray[beam], numbers(beam)
-        place = (raw(self._seed, _RANGE + first, *key) >> np.uint64(48)).astype(np.intp)
+        place = (raw(seed, Purpose.PARTICLE_RANGE, *key) >> np.uint64(48)).astype(np.intp)
         distance = seen.distance[place]
         sub = beam * each
         if each > 1:
-            sub += (raw(self._seed, _PLACE + first, *key) % np.uint64(each)).astype(np.int64)
+            sub += (raw(seed, Purpose.PARTICLE_SUBRAY, *key) % np.uint64(each)).astype(np.int64)
         before = np.flatnonzero(distance < reach[sub])
         place, key = place[before], (key[0][before], key[1][before], key[2][before])
-        rank = uniform(self._seed, _DIAMETER + first, *key) * seen.larger[place]
+        rank = uniform(seed, Purpose.PARTICLE_DIAMETER, *key) * seen.larger[place]
         longer = seen.step * _exponential()[(rank * QUANTILES).astype(np.intp)]
         diameter = seen.smallest[place] + longer
         energy = np.minimum(seen.energy[place] * diameter * diameter, seen.most[place])
@@ -175,9 +173,9 @@ class AirCaster:
         free = np.clip(free, 0, cells).astype(np.int64)
         some = np.flatnonzero(free)
         free, scan, ray = free[some], scan[some], ray[some]
-        chance = free + uniform(self._seed, _FOG_CELL, scan, ray)
+        chance = free + uniform(self._seed, Purpose.FOG_CELL, scan, ray)
         cell = np.searchsorted(fog.peaks, chance, side="right") - free * cells
-        place = uniform(self._seed, _FOG_PLACE, scan, ray)
+        place = uniform(self._seed, Purpose.FOG_PLACE, scan, ray)
         return some * each, fog.begins + (cell + place) * fog.cell, each * fog.energy[cell]
 
 

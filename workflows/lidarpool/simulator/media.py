@@ -21,6 +21,7 @@ from ..scene.scene import Scene
 from ..sensor import Trajectory
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
+from ..sensor.noise import Purpose
 from ..sensor.optics import any_axes
 from .hits import Real, Whole
 from .motion import Clock, Poses, products
@@ -29,13 +30,12 @@ from .world import World
 
 DEPTH = 8  # media around a place that are known at most
 PROBES_MOST = 256  # surfaces that a search for media around a place passes
-LEAF, WHICH = 30, 31  # purposes of random numbers: see `Leaves`
 UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of that search; along no edge of what people model
 
 Bools = NDArray[np.bool_]
 Numbers = NDArray[np.int32]
 # Random bits of rays for a purpose: (n,).
-Draw = Callable[[int, Whole], NDArray[np.uint64]]
+Draw = Callable[[Purpose, Whole], NDArray[np.uint64]]
 
 
 class Rays(NamedTuple):
@@ -348,7 +348,7 @@ class Within:
             metres = np.where(np.isnan(ends[rows]), metres, ends[rows])
         self.left = self.left - depth
         # Where crowns overlap, a leaf is of one of them in proportion to its density.
-        share = (draw(WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        share = (draw(Purpose.WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
         place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
         cosines = self.media.bright(self.around.objects[rows, place], upright[rows])
         return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
