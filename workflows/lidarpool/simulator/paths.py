@@ -15,7 +15,7 @@ from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.noise import Purpose, raw
 from .doppler import BLOCK_HITS, approach
-from .hits import AIR, Hits, Keys, Planes, Real, Whole, joined
+from .hits import AIR, Hits, Keys, Planes, Real, Whole, joined, selected
 from .media import Media, Rays, Within, depths
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
@@ -43,17 +43,7 @@ class _Light:
 
     def on(self, rows: NDArray[np.integer[Any]]) -> _Light:
         """Select that of some sub-rays."""
-        return _Light(
-            self.ray[rows],
-            self.times[rows],
-            self.origins[rows],
-            self.directions[rows],
-            self.share[rows],
-            self.before[rows],
-            None if self.turns is None else self.turns[rows],
-            None if self.within is None else self.within.take(rows),
-            None if self.growth is None else self.growth[rows],
-        )
+        return _Light(*selected(vars(self).values(), rows))
 
 
 class Paths:
