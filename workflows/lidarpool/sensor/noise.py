@@ -285,23 +285,13 @@ class Noise:
         """
         seen = uniform(self.seed, Purpose.LOSS, scan, ray, number) >= self.dropout
         if self.detection_range_m is not None:
-            seen &= self._passes(Purpose.DETECTION, energy, scan, ray, number)
+            seen &= self.passes(Purpose.DETECTION, energy, scan, ray, number)
         return seen
 
-    def detected_stray(self, energy: Real, scan: Whole, ray: Whole) -> NDArray[np.bool_]:
-        """Whether stray light (n,) of retro-reflectors is detected, see `detected`."""
-        return self._passes(Purpose.STRAY, energy, scan, ray, np.zeros(len(ray), np.int64))
-
-    def detected_other(
-        self, energy: Real, scan: Whole, ray: Whole, number: Whole
+    def passes(
+        self, purpose: Purpose, energy: Real, scan: Whole, ray: Whole, number: ArrayLike = 0
     ) -> NDArray[np.bool_]:
-        """Whether pulses (n,) of other sensors are detected, see `detected`."""
-        return self._passes(Purpose.OTHER, energy, scan, ray, number)
-
-    def _passes(
-        self, purpose: Purpose, energy: Real, scan: Whole, ray: Whole, number: Whole
-    ) -> NDArray[np.bool_]:
-        """Whether signals with their noise pass the threshold."""
+        """Whether signals (n,) with their noise pass the threshold, see `detected`."""
         above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
         return np.asarray(above + normal(self.seed, purpose, scan, ray, number) > 0)
 
