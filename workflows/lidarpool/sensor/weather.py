@@ -210,11 +210,6 @@ class Air(NamedTuple):
         wide = 1000 * self.width(distance) * np.sqrt(share)
         return np.where(share <= 1, wide, np.inf)
 
-    def returned(self, particles: Particles, diameter_mm: Real, distance: Real) -> Real:
-        """Energies returned by particles: at most as by one that fills the beam."""
-        share = np.minimum(diameter_mm / (1000 * self.width(distance)), 1) ** 2
-        return np.asarray(particles.reflectance * self.white(distance) * share)
-
     def rate(self, particles: Particles, energy: float, distance: Real) -> Real:
         """Particles in the beam that return at least an energy, in each metre: 1/m."""
         area = math.pi / 4 * self.width(distance) ** 2
