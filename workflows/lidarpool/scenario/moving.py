@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Strict, model_validator
 
-from ..base.declared import Text, TextOrTexts, Triple, is_text, short
+from ..base.declared import Text, TextOrTexts, Triple, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
 from ..sensor import Mounted, Pose, Track, load_trajectory
@@ -25,7 +25,6 @@ from .sections import (
     Section,
     SensorSection,
     ShapeSection,
-    told,
 )
 from .standing import Standing, following
 

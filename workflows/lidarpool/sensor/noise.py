@@ -15,10 +15,9 @@ from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from ..base.arguments import checked_fields
-from ..base.declared import Seed, Share
+from ..base.declared import Seed, Share, told
 from ..base.errors import LidarpoolError
 from .materials import at_right_angles
 
@@ -86,93 +85,80 @@ class Noise:
 
     range_m: Annotated[
         float,
-        Field(ge=0, le=1000, description="standard deviation of ranges, metres", examples=[0.02]),
+        told("standard deviation of ranges, metres", 0.02, ge=0, le=1000),
     ] = 0.0
     range_per_m: Annotated[
         float,
-        Field(
-            ge=0,
-            le=1,
-            description="standard deviation added for each metre of range",
-            examples=[0.0002],
-        ),
+        told("standard deviation added for each metre of range", 0.0002, ge=0, le=1),
     ] = 0.0
     angle_deg: Annotated[
         float,
-        Field(
-            ge=0,
-            le=10,
-            description="standard deviation of beam directions, in both axes",
-            examples=[0.05],
-        ),
+        told("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10),
     ] = 0.0
-    dropout: Annotated[
-        Share, Field(description="share of returns that are lost, whatever their energy")
-    ] = 0.0
+    dropout: Annotated[Share, told("share of returns that are lost, whatever their energy")] = 0.0
     detection_range_m: Annotated[
         float | None,
-        Field(
+        told(
+            "range at which a surface of 10 % reflectance returns half the pulses; "
+            "weaker returns are lost",
+            100.0,
             ge=0.001,
             le=1e8,
-            description="range at which a surface of 10 % reflectance returns half the pulses; "
-            "weaker returns are lost",
-            examples=[100.0],
         ),
     ] = None
-    seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
+    seed: Annotated[Seed, told("the same seed gives the same noise")] = 0
     overlap_m: Annotated[
         float,
-        Field(
+        told(
+            "from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "and dust do not return more",
             ge=0,
             le=1000,
-            description="from here on the receiver sees the whole beam; nearer, rain, snow, fog "
-            "and dust do not return more",
         ),
     ] = 10.0
     range_at_threshold_m: Annotated[
         float,
-        Field(
+        told(
+            "standard deviation of the range of a return at the threshold of "
+            "detection, metres; falls as its energy grows, added in squares",
+            0.05,
             ge=0,
             le=1000,
-            description="standard deviation of the range of a return at the threshold of "
-            "detection, metres; falls as its energy grows, added in squares",
-            examples=[0.05],
         ),
     ] = 0.0
     walk_m: Annotated[
         float,
-        Field(
+        told(
+            "range walk: a return 1.65 times as strong as the threshold of detection "
+            "appears so much nearer, one 10,000 times as strong 4.3 times as much",
+            0.02,
             ge=0,
             le=10,
-            description="range walk: a return 1.65 times as strong as the threshold of detection "
-            "appears so much nearer, one 10,000 times as strong 4.3 times as much",
-            examples=[0.02],
         ),
     ] = 0.0
     false_alarm_hz: Annotated[
         float,
-        Field(
+        told(
+            "rate of false alarms, dark counts and sun, while the receiver waits for returns",
+            200.0,
             ge=0,
             le=1e9,
-            description="rate of false alarms, dark counts and sun, while the receiver waits for "
-            "returns",
-            examples=[200.0],
         ),
     ] = 0.0
     stray_light: Annotated[
         Share,
-        Field(
-            description="blooming of retro-reflectors: share of their light that a beam 1 degree "
+        told(
+            "blooming of retro-reflectors: share of their light that a beam 1 degree "
             "beside them receives; falls with the square of the angle",
-            examples=[1e-6],
+            1e-6,
         ),
     ] = 0.0
 
     crosstalk: Annotated[
-        bool, Field(description="whether it receives pulses of the other sensors of the survey")
+        bool, told("whether it receives pulses of the other sensors of the survey")
     ] = False
     velocity_m_s: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation of radial velocities, m/s")
+        float, told("standard deviation of radial velocities, m/s", ge=0, le=1000)
     ] = 0.0
 
     def __post_init__(self) -> None:
