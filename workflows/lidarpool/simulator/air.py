@@ -19,7 +19,7 @@ from ..sensor import Survey
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, raw, uniform
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, numbers
+from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, joined, numbers
 from .surfaces import Surfaces
 
 QUANTILES = 1 << 16
@@ -183,39 +183,22 @@ def _inserted(
     hits: Hits, planes: Planes, ray: Whole, distance: Real, energy: Real
 ) -> tuple[Hits, Planes]:
     """Insert hits in the air before the others of their rays."""
-    count = len(hits.ray) + len(ray)
-    new = np.searchsorted(hits.ray, ray) + np.arange(len(ray))
-    old = np.ones(count, np.bool_)
-    old[new] = False
-
-    def both(before: NDArray, added: NDArray) -> NDArray:  # type: ignore[type-arg]
-        out = np.empty(count, before.dtype)
-        out[old], out[new] = before, added
-        return out
-
-    grey = packed(GREY[0])[0]
-    triangle = np.full(len(ray), NO_SURFACE, np.int32)
-    causes = np.zeros(len(hits.ray), np.uint8) if hits.cause is None else hits.cause
-    merged = Hits(
-        both(hits.ray, ray),
-        both(hits.distance, distance),
-        both(hits.triangle, triangle),
-        both(hits.energy, energy),
-        None if hits.colour is None else both(hits.colour, np.full(len(ray), grey)),
-        both(causes, np.full(len(ray), AIR, np.uint8)),
-        # Those of the air are filled in by `Paths.with_velocities`.
-        None if hits.velocity is None else both(hits.velocity, np.full(len(ray), np.nan)),
-    )
-    row = np.cumsum(old) - 1
+    count = len(ray)
+    triangle, cause = np.full(count, NO_SURFACE, np.int32), np.full(count, AIR, np.uint8)
+    colour = None if hits.colour is None else np.full(count, packed(GREY[0])[0])
+    # Their velocities are filled in by `Paths.with_velocities`.
+    air = Hits(ray, distance, triangle, energy, colour, cause)
+    order = np.argsort(np.concatenate([ray, hits.ray]), kind="stable")
+    row = order - count  # of the others
 
     def seen(rows: NDArray[np.intp]) -> tuple[Real, Real]:
         normals, directions = np.zeros((2, len(rows), 3))
-        solid = old[rows]
+        solid = row[rows] >= 0
         if solid.any():
             normals[solid], directions[solid] = planes(row[rows[solid]])
         return normals, directions
 
-    return merged, seen
+    return joined([air, hits]).take(order), seen
 
 
 @lru_cache(TABLES_KEPT)
