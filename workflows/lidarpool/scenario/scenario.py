@@ -788,7 +788,10 @@ class Scenario(Section):
         common = self.noise, self.returns
         if self.sensors:
             return [
-                section.mounted(self._folder, self._mount(section.mount), *common, name)
+                replace(
+                    section.mounted(self._folder, self._mount(section.mount), *common, name),
+                    steps=section.steps,
+                )
                 for name, section in self.sensors.items()
             ]
         mount = MountSection() if self.mount is None else self.mount
