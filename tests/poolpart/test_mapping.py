@@ -276,7 +276,7 @@ def test_a_restart_of_the_cluster_ends_it(own_nannies):
     assert next(results) == 100
     own_nannies.restart()
     with pytest.raises(CancelledError, match="Scheduler has restarted") as caught:
-        next(results)
+        list(results)  # it may have fetched some
     assert not hasattr(caught.value, "__notes__")  # no item has killed a worker
 
 
