@@ -13,15 +13,15 @@ import inspect
 import logging
 import time
 from collections import Counter, defaultdict
-from collections.abc import Callable, Collection, Iterable
-from contextlib import AbstractContextManager
+from collections.abc import Callable, Collection, Iterable, Iterator
+from contextlib import AbstractContextManager, contextmanager, suppress
 from functools import cache, wraps
 from multiprocessing import spawn
 from typing import Any
 
 import dask
 import distributed
-from distributed import Client, Future, SpecCluster, Status, as_completed, futures_of
+from distributed import Client, Future, Nanny, SpecCluster, Status, as_completed, futures_of
 from distributed.core import clean_exception
 from distributed.protocol import to_serialize
 from distributed.protocol.pickle import dumps
@@ -417,6 +417,17 @@ async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments
 # -- what a worker declares --------------------------------------------------------------
 
 
+class _Available(dict[str, float]):
+    """Slots that a worker has available: 0, rather than an error, of what it does not declare.
+
+    The request to declare and tasks use different connections: a cancelled task may still be on
+    its way, and a worker would break down if it got a task for an unknown resource.
+    """
+
+    def __missing__(self, name: str) -> float:
+        return 0.0
+
+
 async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
     """Call a function in the event loop of a worker, passed as `dask_worker`.
 
@@ -438,9 +449,6 @@ def _unpacked(result: Any) -> Any:
 def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
     """Declare these resources, and none of any other; runs on a worker.
 
-    Other names stay with 0: this request and tasks use different connections, so a cancelled task
-    may still be on its way, and a worker breaks down if it gets a task for an unknown resource.
-
     Returns False if tasks still hold a resource that is removed. Such a task may be cancelled but
     still running, and unknown to the scheduler.
     """
@@ -450,9 +458,9 @@ def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
     held = {name for task in state.all_running_tasks for name in resources_of(task)}
     if held & (total.keys() - resources.keys()):
         return False
-    for name, quantity in {**dict.fromkeys(total, 0), **resources}.items():
-        available[name] = available.get(name, 0) + quantity - total.get(name, 0)
-        total[name] = quantity
+    left = {name: available.get(name, 0) - total.get(name, 0) for name in resources}
+    state.available_resources = _Available({n: q + left[n] for n, q in resources.items()})
+    state.total_resources = dict(resources)
     return True
 
 
@@ -501,48 +509,41 @@ def slots_here(worker: Any, name: str) -> tuple[float, float]:
     return worker.state.available_resources[name], worker.state.total_resources[name]
 
 
-class Waits:
-    """Has what waits for futures in tasks of this process do it within a context.
+@cache  # once: another library may have wrapped the same since, and goes on calling this
+def let_waits_lend(context: Callable[[], AbstractContextManager[None]]) -> None:
+    """Have what waits for futures in tasks of this process do it within a context, from now on.
 
     That is `Future.result` and `exception`, `Client.gather`, `wait`, the computing of collections,
     and `as_completed`, where they are called in the thread of a task and have to wait. All but the
     last come down to `Client.sync`, which is called for much else.
     """
+    of_future = (Future._result, Future._exception, Future._traceback)
+    waits = {*of_future, Client._gather, distributed.client._wait}
+    sync, following = Client.sync, as_completed.__next__
 
-    def __init__(self, context: Callable[[], AbstractContextManager[None]]) -> None:
-        of_future = (Future._result, Future._exception, Future._traceback)
-        waits = {*of_future, Client._gather, distributed.client._wait}
-        sync, following = Client.sync, as_completed.__next__
-
-        def sync_within(client: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
-            if getattr(function, "__func__", function) in waits and task_of_thread():
-                owner = getattr(function, "__self__", None)
-                futures = futures_of(owner if isinstance(owner, Future) else [*args])
-                if any(future.status in ("pending", "lost") for future in futures):
-                    with context():
-                        return sync(client, function, *args, **kwargs)
-            return sync(client, function, *args, **kwargs)
-
-        def following_within(done: Any) -> Any:
-            if task_of_thread() and not done.has_ready() and not done.is_empty():
+    def sync_within(client: Any, function: Any, *args: Any, **kwargs: Any) -> Any:
+        if getattr(function, "__func__", function) in waits and task_of_thread():
+            owner = getattr(function, "__self__", None)
+            futures = futures_of(owner if isinstance(owner, Future) else [*args])
+            if any(future.status in ("pending", "lost") for future in futures):
                 with context():
-                    return following(done)
-            return following(done)
+                    return sync(client, function, *args, **kwargs)
+        return sync(client, function, *args, **kwargs)
 
-        self._following = following
-        Client.sync = sync_within  # inherited until now
-        as_completed.__next__ = as_completed.next = following_within
+    def following_within(done: Any) -> Any:
+        if task_of_thread() and not done.has_ready() and not done.is_empty():
+            with context():
+                return following(done)
+        return following(done)
 
-    def take_back(self) -> None:
-        """Leave the classes as they were."""
-        del Client.sync
-        as_completed.__next__ = as_completed.next = self._following
+    Client.sync = sync_within
+    as_completed.__next__ = as_completed.next = following_within
 
 
 def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
     """Give a plugin to all workers, also later ones before they get tasks, or take it from all.
 
-    Returns the requests under way. A worker that does not answer is in the log.
+    Returns the requests under way. A worker that does not answer, at the end of a cluster, is left.
     """
 
     # Nested, so that it is sent by value. A worker that is closing takes its plugins off itself;
@@ -552,18 +553,19 @@ def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyn
         if not closing and (found := dask_worker.plugins.pop(name, None)):
             found.teardown(dask_worker)
 
+    async def tell(address: str) -> None:
+        with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print it
+            if plugin is None:
+                await call(scheduler, address, remove)
+            else:
+                await getattr(scheduler.rpc(address), "plugin-add")(name=name, plugin=plugin)
+
     if plugin is None:
         scheduler.worker_plugins.pop(name, None)
-        message: dict[str, Any] = {"op": "run", "function": dumps(remove)}
     else:
         scheduler.worker_plugins[name] = plugin
-        message = {"op": "plugin-add", "name": name, "plugin": plugin}
-    return [  # each by itself: one that is stopped keeps none of the others
-        asyncio.ensure_future(
-            scheduler.broadcast(msg=message, workers=[address], on_error="ignore")
-        )
-        for address in scheduler.workers
-    ]
+    # Each by itself: one that is stopped keeps none of the others.
+    return [asyncio.ensure_future(tell(address)) for address in scheduler.workers]
 
 
 # -- requests to a scheduler, which pipes are made of -------------------------------------
@@ -682,32 +684,53 @@ def as_bytes(data: Any) -> Any:
 # -- a cluster on this machine -----------------------------------------------------------
 
 
-def forked_workers() -> AbstractContextManager[object]:
+@contextmanager
+def forked_workers() -> Iterator[None]:
     """Let nannies fork workers from the fork server, also for a restart.
 
     Dask would make it import pandas and more; it has already imported what is needed.
     """
-    distributed.utils._forkserver_preload_set = True
-    return dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"})
+    utils, before = distributed.utils, distributed.utils._forkserver_preload_set
+    with dask.config.set({"distributed.worker.multiprocessing-method": "forkserver"}):
+        utils._forkserver_preload_set = True
+        try:
+            yield
+        finally:
+            utils._forkserver_preload_set = before
 
 
-@cache  # only once
-def spare_workers_the_script() -> None:
-    """Keep workers from importing the script that starts them.
+_starting: set[Nanny] = set()  # those of `OwnNanny` that start a worker just now
 
-    multiprocessing imports it to find functions by name, and a script without a main guard would
-    start itself again in each worker. Dask sends what a script defines by value.
-    """
+
+@cache  # once, for the same reason
+def _spare_workers_the_script() -> None:
     prepare = spawn.get_preparation_data
 
     @wraps(prepare)
     def without_script(name: str) -> dict[str, Any]:
         data = prepare(name)
-        if name.startswith("Dask Worker process"):
+        if _starting and name.startswith("Dask Worker process"):
             data = {key: data[key] for key in data if not key.startswith("init_main_from")}
         return data
 
     spawn.get_preparation_data = without_script
+
+
+class OwnNanny(Nanny):
+    """A nanny whose workers do not import the script that starts them.
+
+    multiprocessing imports it to find functions by name, and a script without a main guard would
+    start itself again in each worker. Dask sends what a script defines by value.
+    """
+
+    async def instantiate(self) -> Status:
+        """Start a worker, or start it again."""
+        _spare_workers_the_script()
+        _starting.add(self)
+        try:
+            return await super().instantiate()
+        finally:
+            _starting.discard(self)
 
 
 class FixedCluster(SpecCluster):

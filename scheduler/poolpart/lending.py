@@ -29,8 +29,8 @@ from distributed.protocol.pickle import dumps
 
 from .internals import (
     Resources,
-    Waits,
     free_slots,
+    let_waits_lend,
     resources_of,
     slots_here,
     take_slots,
@@ -41,7 +41,6 @@ _LOOK_S = 1.0  # between looks whether the worker is still there
 
 _lock = threading.Lock()
 _lenders: dict[Any, Lender] = {}  # by worker of this process
-_waits: list[Waits] = []  # one as long as there are lenders
 _thread = threading.local()
 
 
@@ -126,23 +125,20 @@ def slots_lent(waits: bool = True) -> Iterator[None]:
 def begin_lending(worker: Any, name: str) -> Lender:
     """Have the tasks of a partition lend on this worker; runs in its event loop."""
     with _lock:
-        if not _waits:
-            _waits.append(Waits(slots_lent))
+        let_waits_lend(slots_lent)
         lender = _lenders.setdefault(worker, Lender(worker))
     lender.names.add(name)
     return lender
 
 
 def end_lending(worker: Any, name: str) -> None:
-    """Have them keep their slots again; nothing is left behind after the last partition."""
+    """Have them keep their slots again."""
     with _lock:
         lender = _lenders[worker]
         lender.names.discard(name)
         if not lender.names:
             del _lenders[worker]
             lender.serve()
-        if not _lenders:
-            _waits.pop().take_back()
 
 
 def lending_plugin(name: str) -> bytes:

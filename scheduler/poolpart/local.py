@@ -7,10 +7,10 @@ from collections.abc import Mapping
 from typing import Any
 
 import dask
-from distributed import Nanny, Scheduler, Security, SpecCluster
+from distributed import Scheduler, Security, SpecCluster
 
 from .errors import PoolError
-from .internals import FixedCluster, spare_workers_the_script
+from .internals import FixedCluster, OwnNanny
 from .rules import check_count, check_name
 
 LOOPBACK = "127.0.0.1"
@@ -88,7 +88,6 @@ def local_cluster(
             "dashboard_address": f"{LOOPBACK}:{dashboard_port or 0}",
         },
     }
-    spare_workers_the_script()
     try:
         with dask.config.set(_PRE_SPAWN):
             return FixedCluster(
@@ -115,7 +114,7 @@ def _worker_spec(partition: str, slots: int, security: Security) -> dict[str, An
         "silence_logs": logging.ERROR,
         "preload": [__name__],  # calls `dask_setup`
     }
-    return {"cls": Nanny, "options": options}
+    return {"cls": OwnNanny, "options": options}
 
 
 def dask_setup(worker: Any) -> None:

@@ -28,6 +28,7 @@ from distributed.protocol.pickle import dumps, loads
 from .adapting import running_most
 from .internals import when_done
 from .lending import slots_lent
+from .membership import check_slots
 
 logger = logging.getLogger(__name__)
 
@@ -176,6 +177,7 @@ class Stage:
     return_exceptions: bool = False
     keywords: dict[str, Any] = field(default_factory=dict)
     at: int = 0  # number of the argument that is the result of the stage before
+    by_rule: bool = False  # the partition can be dissolved
 
     def __post_init__(self) -> None:
         for name, least in (("window", 1), ("chunk", 1), ("retries", 0)):
@@ -184,8 +186,14 @@ class Stage:
                 raise ValueError(f"{name} is {value!r}; give a whole number, {least} or more.")
 
     def running(self) -> int:
-        """Tasks of this stage that run at a time, with all workers that may be started."""
-        return running_most(self.client, self.partition, self.slots)
+        """Tasks of this stage that run at a time, with all workers that may be started.
+
+        PoolError if the partition was dissolved: the tasks would wait for ever.
+        """
+        running = running_most(self.client, self.partition, self.slots)
+        if not running:
+            check_slots(self.client, self.partition, self.slots, self.by_rule)
+        return running
 
     def send(
         self,
@@ -398,7 +406,8 @@ class Results(Iterator[Any]):
                 raise CancelledError(
                     f"The client of partition {self._stages[-1].partition!r} was closed."
                 )
-            if time.monotonic() > self._next_look:
+            # Not while there are results: those of a partition that was dissolved are read first.
+            if self._done.empty() and time.monotonic() > self._next_look:
                 self._look()
             with suppress(queue.Empty), slots_lent(self._done.empty()):
                 done.append(self._done.get(timeout=1))
@@ -448,7 +457,7 @@ class Results(Iterator[Any]):
         try:
             future.result()
         except Exception as error:
-            if not _of_item(error):
+            if not _of_item(error) and not future.cancelled():
                 last = chunk.first + len(chunk.rows) - 1
                 error.add_note(
                     f"{NOTE}the task was for items {chunk.first} to {last} of a map; unless "

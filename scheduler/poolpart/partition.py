@@ -215,9 +215,11 @@ class Partition:
         -------
         Results
             An iterator. It raises an error of `function` after the results before it; a note
-            names the item. To stop early, close or delete the iterator: waiting tasks are
-            cancelled. ``len`` is the number of items if each iterable has one, so that progress
-            bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts those read.
+            names the item. It raises PoolError if the partition is dissolved meanwhile, and
+            CancelledError after `Client.restart`. To stop early, close or delete the iterator:
+            waiting tasks are cancelled. ``len`` is the number of items if each iterable has one, so
+            that progress bars such as ``tqdm(partition.map(…))`` work, and `Results.done` counts
+            those read.
 
         Raises
         ------
@@ -226,7 +228,8 @@ class Partition:
         """
         self._taking(slots)
         options = (ordered, window, chunk, priority, retries, slots, return_exceptions, kwargs)
-        return Results(Stage(self.client, self.name, function, *options), iterables)
+        stage = Stage(self.client, self.name, function, *options, by_rule=self._by_rule)
+        return Results(stage, iterables)
 
     # -- collections and data ----------------------------------------------------------
 

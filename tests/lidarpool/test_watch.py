@@ -50,14 +50,13 @@ def test_a_partition_may_be_empty_for_a_while(look):
         look(124, *ALL[1:])
 
 
-def test_jobs_in_the_queue_are_waited_for(look):
+def test_jobs_in_the_queue_are_told_of_but_may_have_died(look):
     look.coming = 2
-    look(200, *ALL[1:])
-    words = "waiting for workers of partition GPU: 2 jobs in the queue, or starting"
-    assert look.told == [words]
-    look.coming = 0
+    look(50, *ALL[1:])
+    words = "waiting for workers of partition GPU, for another 10 s: 2 jobs in the queue"
+    assert look.told == [f"{words}, or starting"]
     with pytest.raises(LidarpoolError, match="'GPU' has had no workers"):
-        look(202, *ALL[1:])
+        look(62, *ALL[1:])
 
 
 def test_workers_that_are_paused_take_no_tasks(look):

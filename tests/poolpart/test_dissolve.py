@@ -55,8 +55,8 @@ def _on_worker(dask_worker):
     state = dask_worker.state
     return (
         str(dask_worker.name),
-        {name: slots for name, slots in state.total_resources.items() if slots},
-        {name: slots for name, slots in state.available_resources.items() if slots},
+        dict(state.total_resources),
+        dict(state.available_resources),
         sorted(dask_worker.plugins),
     )
 

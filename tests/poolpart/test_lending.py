@@ -1,5 +1,8 @@
 """Tasks take slots of their partition at any depth, and lend their own while they wait."""
 
+import logging
+import os
+import signal
 import subprocess
 import sys
 import threading
@@ -10,7 +13,7 @@ import pytest
 from distributed import Client, Event, as_completed, get_client, wait, worker_client
 from tests.poolpart.helpers import LONG_S, addresses, declared, here, join, kill, wait_for
 
-from poolpart import Partition, Pool, PoolError, rest
+from poolpart import Partition, Pool, PoolError, inherit, rest
 from poolpart.lending import lending_plugin
 
 
@@ -217,7 +220,7 @@ def test_what_holds_a_resource_that_is_no_partition_lends_nothing(start):
 def test_a_partition_that_workers_were_started_with(start, wait_until):
     client = start({"a": {"resources": {"A": 1}}})
     scheduler = client.cluster.scheduler
-    before, untouched = set(scheduler.plugins), "sync" not in vars(Client)
+    before = set(scheduler.plugins)
     with Client(client.cluster) as other:
         part = Partition("A", other)
         assert part.submit(submit_into, part, 5).result(LONG_S) == 5
@@ -226,10 +229,28 @@ def test_a_partition_that_workers_were_started_with(start, wait_until):
         assert part.submit(descend, 3, workers="b").result(LONG_S) == 27
     # What a client that is still there has begun ends with it.
     wait_until(lambda: set(scheduler.plugins) == before and not _lends(client))
-    if untouched:  # no other cluster of this process has partitions
-        assert "sync" not in vars(Client)
-        assert as_completed.next is as_completed.__next__
-        assert as_completed.__next__.__module__ == "distributed.client"
+
+
+def test_what_another_library_has_wrapped_meanwhile_stays(start, monkeypatch):
+    part = one_worker(start, slots=1)
+    called, wrapped = [], {Client: "sync", as_completed: "__next__"}
+
+    def wrap(inner):
+        def theirs(*args, **kwargs):
+            called.append(inner)
+            return inner(*args, **kwargs)
+
+        return theirs
+
+    for owner, name in wrapped.items():
+        monkeypatch.setattr(owner, name, wrap(vars(owner)[name]))
+    before = [vars(owner)[name] for owner, name in wrapped.items()]
+    Pool(part.client, []).dissolve()
+    assert [vars(owner)[name] for owner, name in wrapped.items()] == before
+    part, _ = Pool.from_client(part.client).partition("A", n_workers=1, slots=1)
+    assert [vars(owner)[name] for owner, name in wrapped.items()] == before
+    assert part.submit(parent, "as_completed").result(LONG_S) == 28
+    assert len({*called}) == 2 and slots_there(part) == [1]
 
 
 def _lends(client):
@@ -274,6 +295,24 @@ def test_whoever_dies_while_the_parent_waits(nannies, wait_until, who):
     assert parent.result(LONG_S) == 1
     wait_until(lambda: declared(nannies) == {"0": {"A": 1}, "1": {"A": 1}})
     wait_until(lambda: slots_there(part) == [1, 1])
+
+
+def test_workers_that_end_before_they_keep_their_slots_again_print_nothing(
+    own_nannies, caplog, wait_until
+):
+    """As when a cluster is closed right after its last client."""
+    caplog.set_level(logging.ERROR)
+    with Client(own_nannies.cluster) as client:
+        Partition("A", client).submit(here)
+        pids = client.run(os.getpid).values()
+        for pid in pids:
+            os.kill(pid, signal.SIGSTOP)  # before they answer
+    wait_until(lambda: inherit.NAME not in own_nannies.cluster.scheduler.plugins)
+    assert inherit._told
+    for pid in pids:
+        os.kill(pid, signal.SIGKILL)
+    wait_until(lambda: not inherit._told)
+    assert caplog.text == ""
 
 
 def across(part, gate):

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+from multiprocessing import spawn
 
 import dask
 import psutil
@@ -152,6 +153,13 @@ def test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers(tm
     assert driver.returncode == 0
     assert "42" in errors.splitlines()  # Dask may log the end of a busy machine's workers beside it
     assert len(output.splitlines()) == 1  # that of the driver: no worker has run the script
+
+
+def test_processes_of_the_user_are_started_as_ever(processes):
+    """Also one of the name that Dask gives to its workers; once they have started."""
+    for name in ("Process-1", "Dask Worker process (from Nanny)"):
+        data = spawn.get_preparation_data(name)
+        assert data["name"] == name and data.keys() & {"init_main_from_name", "init_main_from_path"}
 
 
 def test_a_worker_that_is_slow_to_come_back_is_not_given_up():

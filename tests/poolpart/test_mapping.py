@@ -13,7 +13,7 @@ import pytest
 from distributed import CancelledError, Client, Event, get_worker
 from tests.poolpart.helpers import twice, wait_for
 
-from poolpart import Partition, Pool
+from poolpart import Partition, Pool, PoolError, rest
 
 
 def add(x, y):
@@ -244,6 +244,40 @@ def test_a_client_that_is_closed_ends_it(client, gate):
         results = Partition("B", own).map(wait_for, [gate.name])
     with pytest.raises(CancelledError):
         next(results)
+
+
+@pytest.mark.parametrize("ordered", [True, False])
+@pytest.mark.parametrize("by_another", [False, True])
+def test_a_partition_that_is_dissolved_ends_it(start, monkeypatch, by_another, ordered):
+    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.05)
+    client = start({"a": {}})
+    part = Pool.from_client(client).divide({"A": rest()})["A"]
+    results = part.map(twice, itertools.count(), ordered=ordered, chunk=1, window=4)
+    assert next(results) == 0
+    with Client(client.cluster) as other:
+        Pool(other if by_another else client, []).dissolve()
+    with pytest.raises(PoolError, match="Partition 'A' was dissolved: divide the pool again"):
+        list(results)
+    assert next(results, "ended") == "ended"
+
+
+def test_all_results_of_a_partition_that_was_dissolved_are_read(start, monkeypatch):
+    monkeypatch.setattr("poolpart.mapping.LOOK_S", 0.0)
+    client = start({"a": {}})
+    part = Pool.from_client(client).divide({"A": rest()})["A"]
+    results = part.map(twice, range(4), chunk=1, window=4)
+    Pool(client, []).dissolve()
+    assert list(results) == [0, 2, 4, 6]
+
+
+def test_a_restart_of_the_cluster_ends_it(own_nannies):
+    part = Pool.from_client(own_nannies).divide({"A": rest()})["A"]
+    results = part.map(slow_from_100, itertools.count(100), chunk=1)
+    assert next(results) == 100
+    own_nannies.restart()
+    with pytest.raises(CancelledError, match="Scheduler has restarted") as caught:
+        list(results)  # it may have fetched some
+    assert not hasattr(caught.value, "__notes__")  # no item has killed a worker
 
 
 def test_a_partition_without_workers_is_told_of(client, caplog):

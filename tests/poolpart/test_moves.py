@@ -151,7 +151,7 @@ def test_a_cancelled_task_that_is_on_its_way_when_its_worker_leaves(start, monke
     assert client.submit(here, workers=[moving.address]).result(timeout=LONG_S) == moving.name
     worker = client.cluster.workers[moving.name]
     wait_until(lambda: not worker.state.tasks)
-    assert worker.state.total_resources == worker.state.available_resources == {"A": 0, "B": 1}
+    assert worker.state.total_resources == worker.state.available_resources == {"B": 1}
 
 
 async def _send_all(send, messages):

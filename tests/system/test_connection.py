@@ -7,7 +7,9 @@ import signal
 import socket
 import sys
 import time
+from multiprocessing import forkserver
 
+import dask
 import psutil
 import pytest
 from tests.clusters import cluster_of
@@ -21,6 +23,8 @@ from lidarpool.run.watch import Waiting
 
 def test_workers_are_forked_from_one_process_also_in_place_of_others():
     others = set(psutil.Process().children(recursive=True))  # of the tests' own cluster
+    preload = forkserver._forkserver._preload_modules
+    method = dask.config.get("distributed.worker.multiprocessing-method")
     with local_client(gpu_workers=1, lidar_slots=4, other_workers=0) as client:
         first = client.run(os.getpid)
         for pid in first.values():
@@ -34,6 +38,9 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
         modules = client.run(lambda: {"lidarpool.pipeline.stages", "open3d"} & sys.modules.keys())
         assert list(modules.values()) == [{"lidarpool.pipeline.stages"}] * 2
     assert set(psutil.Process(server).children()) <= others
+    # Those of the user's own processes.
+    assert forkserver._forkserver._preload_modules == preload
+    assert dask.config.get("distributed.worker.multiprocessing-method") == method
 
 
 @pytest.fixture

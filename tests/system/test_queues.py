@@ -191,7 +191,9 @@ def test_partitions_without_jobs_get_some_when_a_run_needs_them(empty_queue, tmp
     file["partitions"]["OTHER"] = JOBS["OTHER"] | ADAPTIVE
     run = Command(tmp_path, file)
     run.wait_for(r"started SLURMCluster: up to 5 workers, GPU 0 to 2, LIDAR 1, OTHER 0 to 2")
-    run.wait_for(r"waiting for workers: Partition 'GPU' has 0 of the 1 slots .* jobs in the queue")
+    run.wait_for(
+        r"waiting for workers, for .*: Partition 'GPU' has 0 of the 1 slots .* jobs in the queue"
+    )
     assert empty_queue.jobs()["waiting"][1] == "PENDING"
     empty_queue.ask("scontrol", "release", "jobname=waiting")
     run.assert_default_result()
@@ -207,7 +209,7 @@ def test_a_run_waits_for_jobs_that_replace_lost_ones(empty_queue, tmp_path):
     run = Command(tmp_path, file, MINUTE)
     run.wait_for(r"survey +[1-9]")
     empty_queue.ask("scancel", empty_queue.jobs()["gpu"][0])
-    run.wait_for(r"waiting for workers of partition GPU: 1 job in the queue, or starting")
+    run.wait_for(r"waiting for workers of partition GPU, for another \d+ s: 1 job in the queue")
     checksum, _ = run.result()
     assert checksum == expected
     assert empty_queue.jobs() == {}

@@ -10,12 +10,15 @@ from collections.abc import Callable
 import dask
 import pytest
 from distributed import Client, Future
+from tests.clusters import import_jobqueue
 
 import lidarpool.run.checks
+import poolpart.clusters
 from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool.pipeline import GPU, LIDAR
 from lidarpool.pipeline.workers import CastingWorkers
 from lidarpool.run.checks import common_backend
-from poolpart import Pool, worker_identities
+from poolpart import Pool, start_partitions, worker_identities
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=180, layers=16, step_deg=10), [(0, 0, 1)], steps=36)
 
@@ -128,3 +131,33 @@ def test_what_a_starting_run_waits_for_and_what_not(outside, lose_gpu):
         lose_gpu(lambda: cluster.kill("scheduler"))
         with pytest.raises(LidarpoolError, match=f"{cluster.address} cannot be reached any more"):
             run()
+
+
+def test_jobs_that_die_before_their_workers_connect_end_a_run(monkeypatch, tmp_path):
+    jobs, submitted = import_jobqueue().slurm.SLURMJob, []
+
+    async def submit(job: object, path: str) -> str:
+        submitted.append(path)
+        (tmp_path / "gpu-1.err").write_text("no module named lidarpool\n")
+        return "Submitted batch job 1"
+
+    async def close(job: object, number: str, command: str) -> None: ...
+
+    monkeypatch.setattr(jobs, "_submit_job", submit)
+    monkeypatch.setattr(jobs, "_close_job", close)
+    monkeypatch.setattr(poolpart.clusters, "_LOOK_EVERY_S", 0.1)
+    options = {"host": "127.0.0.1", "port": 0, "dashboard_address": "127.0.0.1:0"}
+    told: list[str] = []
+    with import_jobqueue().SLURMCluster(
+        cores=1, memory="1GB", log_directory=str(tmp_path), scheduler_options=options
+    ) as cluster:
+        kinds = {GPU: {"adapt": [0, 1]}, LIDAR: {"adapt": [0, 1], "slots": 4}}
+        start_partitions(cluster, kinds, told.append)
+        with Client(cluster) as client, pytest.raises(LidarpoolError) as caught:
+            simulate(Scene.seed(), SURVEY, client=client, wait_s=5.0)
+    assert len(submitted) == 2  # they may wait in the queue: no others in their place
+    assert "has no workers" in str(caught.value)
+    assert caught.value.__notes__ == [
+        "2 jobs in the queue, or starting: if they wait, give --wait more time."
+    ]
+    assert told == [f"The log {tmp_path}/gpu-1.err ends: no module named lidarpool"]

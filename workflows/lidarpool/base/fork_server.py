@@ -29,13 +29,15 @@ def start_fork_server() -> bool:
     """
     if sys.platform != "linux":
         return False
-    forkserver.set_forkserver_preload(["lidarpool.pipeline.forked"])
-    before = dict(os.environ)
+    server: Any = forkserver._forkserver
+    preload, before = server._preload_modules, dict(os.environ)
+    server.set_forkserver_preload(["lidarpool.pipeline.forked"])
     os.environ.update(_ENVIRONMENT)
     try:
         with children_spared():
-            forkserver.ensure_running()
+            server.ensure_running()
     finally:
+        server.set_forkserver_preload(preload)
         os.environ.clear()
         os.environ.update(before)
     return True

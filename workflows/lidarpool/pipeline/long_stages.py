@@ -215,7 +215,7 @@ class LongStages:
         if self.waiting:
             self._waited_from = self._waited_from or now
             self._enough_at = now
-        elif now - self._enough_at > self._patience_s and not seen.coming:
+        elif now - self._enough_at > self._patience_s:
             what = f"has had {seen.slots} of the {needed} slots needed for {self._patience_s:.0f} s"
             raise self._too_few(f"Partition {self.partition.name!r} {what}")
 
@@ -268,7 +268,7 @@ class LongStages:
                 free[task.worker] = free.get(task.worker, 0) + behind
                 self._submit(name, free)
                 started.append(name)
-            elif task.dead_since is not None and not seen.coming:
+            elif task.dead_since is not None:
                 self._wait_for_slot(name, now - task.dead_since)
         return StageChanges(died, started)
 

@@ -33,7 +33,6 @@ from .job import Job
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2
-SUBMIT_S = 30.0  # for jobs to be in the queue once slots are wanted
 
 
 class TooFewWorkersError(LidarpoolError):
@@ -58,10 +57,10 @@ def find_workers(
     """Find all workers, the casting ones among them, their backend and their software.
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
-    software that a resumed run was cast with. Workers that are missing or just died are waited
-    for as long as `waiting` says. Slots `needed` are by default those of the job. If scans are
-    `left` to be cast, slots are wanted of partitions that grow with their work, and jobs that are
-    in the queue are waited for.
+    software that a resumed run was cast with. Workers that are missing or just died, or whose jobs
+    are in the queue, are waited for as long as `waiting` says. Slots `needed` are by default those
+    of the job. If scans are `left` to be cast, slots are wanted of partitions that grow with their
+    work.
 
     LidarpoolError if workers, slots, memory or the backend are missing, or versions differ.
     """
@@ -69,7 +68,6 @@ def find_workers(
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
     waiting = waiting or Waiting()
     needed = needed or slots_needed(job)
-    began = time.monotonic()
     for name, slots in needed.items() if left is not None else ():
         Partition(name, client).want(max(slots, left or 0) if name == GPU else slots)
     while True:
@@ -85,32 +83,18 @@ def find_workers(
             casts = common_software(client, backend, casting, earlier or {})
             return pool, casting, backend, casts
         except TooFewWorkersError as error:
+            coming = 0  # jobs: a queue does not say which of them have died
+            if left is not None:
+                coming = sum(look_for_tasks(client, name).coming for name in needed)
             # One that has just died takes half a minute not to answer, which is no waiting: what
             # counts is when the last look began.
-            coming = _coming(client, needed) if left is not None else None
-            submitting = coming == 0 and looked - began < SUBMIT_S
-            if not (coming or submitting or waiting.left(looked)):
+            if not waiting.left(looked):
+                if coming:
+                    error.add_note(f"{queued(coming)}: if they wait, give --wait more time.")
                 raise
-            # Who waits has started them.
-            why = str(error).partition(": start ")[0]
-            why += f"; {queued(coming)}" if coming else ""
-            waiting.tell("workers", why, limited=not coming)
+            why = str(error).partition(": start ")[0] + (f"; {queued(coming)}" if coming else "")
+            waiting.tell("workers", why)  # who waits has started them
         time.sleep(LOOK_EVERY_S)
-
-
-def _coming(client: Client, needed: Mapping[str, int]) -> int | None:
-    """Jobs that wait in a queue, or start, of partitions that lack slots.
-
-    None if there is no such partition, or one that will not have enough.
-    """
-    jobs = None
-    for name, slots in needed.items():
-        seen = look_for_tasks(client, name)
-        if seen.slots < slots:
-            if seen.most_slots < slots:
-                return None
-            jobs = (jobs or 0) + seen.coming
-    return jobs
 
 
 def want_nothing(client: Client, names: Iterable[str]) -> None:

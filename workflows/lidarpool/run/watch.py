@@ -39,13 +39,12 @@ class Waiting:
         now = time.monotonic() if now is None else now
         return max(0.0, self._began + self.seconds - now)
 
-    def tell(self, what: str, why: str, limited: bool = True) -> None:
-        """Say what is waited for, if it is time to; perhaps without a limit."""
+    def tell(self, what: str, why: str) -> None:
+        """Say what is waited for, if it is time to."""
         now = time.monotonic()
         if now - max(self._told, self._began) >= max(TELL_EVERY_S, (now - self._began) / 10):
             self._told = now
-            limit = f", for another {self.left(now):.0f} s" if limited else ""
-            self._tell(f"waiting for {what}{limit}: {why}")
+            self._tell(f"waiting for {what}, for another {self.left(now):.0f} s: {why}")
 
 
 def queued(jobs: int) -> str:
@@ -58,8 +57,7 @@ class Watch:
 
     Dask itself would wait for ever. The workers of the partitions `names` get new tasks during the
     run; tasks of `lasting` ones last as long as the run, so their workers need not take more. One
-    may be empty for `patience_s`, or as long as jobs are in the queue of one that grows with its
-    work; `tell` is called every few seconds with a message meanwhile.
+    may be empty for `patience_s`; `tell` is called every few seconds with a message meanwhile.
     """
 
     def __init__(
@@ -99,12 +97,8 @@ class Watch:
                         self._note_paused(name, worker)
         self._say(now)
         for name, seen in self._seen.items():
-            if now - seen > self.patience_s and not self._coming(name):
+            if now - seen > self.patience_s:
                 raise LidarpoolError(self._error(name))
-
-    def _coming(self, name: str) -> int:
-        """Jobs of a partition that wait in a queue, or start."""
-        return 0 if name in self._paused else look_for_tasks(self.client, name).coming
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
         """Say once of each worker that it gets no more tasks."""
@@ -122,12 +116,12 @@ class Watch:
         if waiting and now - self._told >= max(TELL_EVERY_S, (now - min(waiting.values())) / 10):
             self._told = now
             for name, seen in waiting.items():
-                if coming := self._coming(name):
-                    self._tell(f"waiting for workers of partition {name}: {queued(coming)}")
-                    continue
                 left = max(0.0, self.patience_s - (now - seen))
-                advice = ": give them a larger --memory-limit" if name in self._paused else ""
-                what = "paused workers" if advice else "workers"
+                what, advice = "workers", ""
+                if name in self._paused:
+                    what, advice = "paused workers", ": give them a larger --memory-limit"
+                elif coming := look_for_tasks(self.client, name).coming:
+                    advice = f": {queued(coming)}"
                 self._tell(
                     f"waiting for {what} of partition {name}, for another {left:.0f} s{advice}"
                 )
