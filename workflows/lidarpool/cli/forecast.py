@@ -248,7 +248,6 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
 class _FewRays(Sensor):
     """A sensor of one beam, whose firings are some rays of another: one of each `every`."""
 
-    beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
     whole: Sensor = field(default_factory=Sensor)
     every: int = 1
     period = None
@@ -258,13 +257,9 @@ class _FewRays(Sensor):
         """Take one of so many rays, but some of each scan, though it may have a firing less."""
         first, stop = sensor.firings(0)
         every = max(1, min(every, (stop - first) * sensor.channels // 2))
-        return cls(
-            min_range_m=sensor.min_range_m,
-            max_range_m=sensor.max_range_m,
-            optics=sensor.optics,
-            whole=sensor,
-            every=every,
-        )
+        near, far = sensor.min_range_m, sensor.max_range_m
+        beams = Beams(np.zeros(1))
+        return cls(beams, sensor.head, near, far, "", sensor.optics, 0.0, sensor, every)
 
     def firings(self, step: int) -> tuple[int, int]:
         first, stop = self.whole.firings(step)
