@@ -85,7 +85,9 @@ def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:
     air, (kind,), noise = turns.air(0), turns.particles, turns.noise
     middle = np.linspace(edges[0], farthest_m, 400)
     size = np.linspace(0, kind.largest, 1500)[1:]
-    signal = air.returned(kind, size, middle[:, None]) / noise.threshold
+    # Of the light, at most as much as one that fills the beam.
+    share = np.minimum(size / (1000 * air.width(middle[:, None])), 1) ** 2
+    signal = kind.reflectance * air.white(middle[:, None]) * share / noise.threshold
     grid = np.linspace(-3, 12, 3001)
     detected = np.interp(
         THRESHOLD_SIGMAS * (signal - 1), grid, [NormalDist().cdf(x) for x in grid]

@@ -1,8 +1,8 @@
 """Do harm to campaigns until so many faults were done: `python -m tests.chaos.campaign`.
 
-Workers of an outside cluster are killed, and so is the driver, which resumes. The last line says
-whether a job was lost or doubled, and whether all files of jobs have the bytes of a run that nobody
-disturbed.
+Workers of an outside cluster are killed, and so is the driver, which resumes. Before it does, and
+when a data set is finished, files of jobs are deleted or cut in half. The last line says whether a
+job was lost or doubled, and whether all files of jobs have the bytes of an undisturbed run.
 """
 
 from __future__ import annotations
@@ -39,6 +39,8 @@ keep: folder
 """
 WORKERS = {"GPU": 1, "LIDAR": 5}  # slots of each of two
 DRIVER = "driver"
+HARMED = 0.5  # of the times that the driver is killed
+HARMS = 4  # runs of a finished data set, each after a file was harmed
 BETWEEN_S = 0.3, 4.0  # seconds between faults
 ENDS_WITHIN_S = 300.0
 
@@ -47,7 +49,7 @@ ENDS_WITHIN_S = 300.0
 class Tally:
     """What became of the data sets."""
 
-    done: Counter[str] = field(default_factory=Counter)  # {what was killed: how often}
+    done: Counter[str] = field(default_factory=Counter)  # {what was killed or harmed: how often}
     datasets: int = 0
     lost: int = 0  # jobs
     doubled: int = 0
@@ -97,9 +99,22 @@ class Arena:
             text=True,
         )
 
+    def _harm(self, dataset: Path) -> list[str]:
+        """Delete a file of a job or its manifest, or cut it; returns what was done."""
+        found = sorted([*dataset.glob("jobs/*/[cs]*"), *dataset.glob(".jobs/*.json")])
+        if not found:
+            return []
+        path = self._chance.choice(found)
+        if self._chance.random() < 0.5:
+            path.unlink()
+            return ["deleted"]
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+        return ["cut"]
+
     def disturb(self, out: str, tally: Tally, faults: int) -> None:
         """Make a data set, with so many faults at most."""
         driver = self.start(out)
+        harms = HARMS if faults else 0  # of the finished data set
         while driver.poll() is None and faults:
             time.sleep(self._chance.uniform(*BETWEEN_S))
             kind = self._chance.choice((*WORKERS, DRIVER))
@@ -115,12 +130,18 @@ class Arena:
                 continue
             driver.kill()
             driver.communicate()
+            if self._chance.random() < HARMED:
+                tally.done.update(self._harm(self.folder / out))
             driver = self.start(out)
         while True:
             _, err = driver.communicate(timeout=ENDS_WITHIN_S)
-            if driver.returncode == 0:
+            if driver.returncode == 0 and not harms:
                 return
-            tally.errors.append(err)
+            if driver.returncode == 0:
+                harms -= 1
+                tally.done.update(self._harm(self.folder / out))
+            else:
+                tally.errors.append(err)
             if len(tally.errors) > 10:
                 return
             driver = self.start(out)

@@ -18,10 +18,10 @@ from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 from tests.lidarpool.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
-from lidarpool import Cloud, LidarpoolError, Scene, read_cloud
+from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey, read_cloud
 from lidarpool.base.storage import Storage
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.dataset import DATA_SETS, INDEX_FILE, DataSet
+from lidarpool.export.dataset import DATA_SETS, INDEX_FILE, DataSet, Listing
 from lidarpool.export.formats import Format
 from lidarpool.export.jobs import JobRow
 from lidarpool.export.sweeps import Sweeps
@@ -156,7 +156,7 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
 
 
 @pytest.mark.parametrize("format", DATA_SETS)
-def test_the_same_job_has_the_same_bytes_and_can_be_removed(written, job, sweeps, tmp_path, format):  # noqa: A002
+def test_the_same_job_has_the_same_bytes_and_can_be_undone(written, job, sweeps, tmp_path, format):  # noqa: A002
     data, place = written(format)
     before = files_of(place)
     assert before and not [name for name in before if "lidarpool-" in Path(name).name]
@@ -164,16 +164,16 @@ def test_the_same_job_has_the_same_bytes_and_can_be_removed(written, job, sweeps
     assert len(pickle.dumps(data)) < 500
     moved.write_job(1, "001", job(1), sweeps)
     assert files_of(place) == before
-    moved.remove_job(1, "001")
-    moved.remove_job(1, "001")
-    assert len(files_of(place)) < len(before)
-    moved.finish([JobRow(0, "000"), JobRow(1, "001", error="failed"), JobRow(7, "007")])
     only = tmp_path / "only"
-    other = DataSet(Storage.at(only), format)
+    other, listing = DataSet(Storage.at(only), format), Listing(str(only))
     for number in (7, 0):
         other.write_job(number, f"{number:03}", job(number), sweeps)
-    other.finish([JobRow(0, "000"), JobRow(7, "007")])
-    assert files_of(place) == files_of(only)
+    before = files_of(only)
+    other.write_job(1, "001", job(1), sweeps, listing=listing)
+    listing.undo()
+    assert files_of(only) == before and not [*only.rglob("001")]
+    other.finish([JobRow(0, "000"), JobRow(1, "001", error="failed"), JobRow(7, "007")])
+    assert len(files_of(only)) > len(before)
 
 
 def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
@@ -232,6 +232,36 @@ def test_boxes_are_kept_as_the_formats_have_them(written, job, sweeps):
                 wanted = Boxes.of(sweeps, sweep, points)
                 np.testing.assert_allclose(kept["centres"][sweep], wanted.centres)
                 np.testing.assert_array_equal(kept["there"][sweep], wanted.there)
+
+
+@pytest.mark.parametrize("format", DATA_SETS)
+def test_a_manifest_lists_the_files_of_a_job(written, format):  # noqa: A002
+    data, place = written(format, (4,))
+    manifest = json.loads((place / ".jobs/004.json").read_bytes())
+    of_all = {"dataset.json", ".jobs/004.json"}
+    listed = {*manifest["files"]}
+    assert listed == {
+        n for n in files_of(place) if n not in of_all and n[:4] not in ("v1.0", "maps")
+    }
+    rows = [JobRow(4, "004")]
+    assert [wrong for _, (_, wrong) in data.look(rows, contents=True)] == [""]
+    harmed = place / max(listed)
+    harmed.write_bytes(bytes(harmed.stat().st_size))
+    assert [wrong for _, (_, wrong) in data.look(rows)] == [""]
+    assert [wrong for _, (_, wrong) in data.look(rows, contents=True)] == [
+        f"{max(listed)} is missing or damaged"
+    ]
+
+
+def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
+    """One of each: a file of Parquet is not a sweep, and has no boxes of actors."""
+    one = Survey(Sensor.grid(360, 4), [(0, 0, 1)], steps=SCANS)
+    only, cloud = Sweeps.of(one, scene), job(0)
+    cloud = cloud.part(np.flatnonzero(cloud.scan < SCANS))
+    assert len(only) == 1 and only.actors
+    DataSet(Storage.at(tmp_path), "parquet").write_job(0, "0", cloud, only)
+    with np.load(tmp_path / "boxes/0.npz") as kept:
+        np.testing.assert_allclose(kept["centres"][0], Boxes.of(only, 0, cloud).centres)
 
 
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):

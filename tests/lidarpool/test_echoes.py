@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -26,7 +27,7 @@ from lidarpool import (
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
-from lidarpool.sensor.noise import raw
+from lidarpool.sensor.noise import Purpose, raw
 from lidarpool.simulator.echoes import chosen
 from lidarpool.simulator.hits import Hits
 from lidarpool.simulator.rig import Rig
@@ -61,11 +62,14 @@ def cast(meshes, sensor=None, backend="numpy", at=(0, 0, 0), **options):
 
 def test_random_numbers_follow_from_what_they_are_for_alone():
     rays = np.arange(1000)
-    whole = raw(7, 1, 3, rays)
-    assert np.array_equal(whole[500:], raw(7, 1, np.full(500, 3), rays[500:]))
-    others = [raw(8, 1, 3, rays), raw(7, 2, 3, rays), raw(7, 1, 4, rays), raw(7, 1, 3, rays, 1)]
+    one, other = Purpose.RANGE, Purpose.ACROSS
+    whole = raw(7, one, 3, rays)
+    assert np.array_equal(whole[500:], raw(7, one, np.full(500, 3), rays[500:]))
+    keys = [(8, one, 3, rays), (7, other, 3, rays), (7, one, 4, rays), (7, one, 3, rays, 1)]
+    others = [raw(*key) for key in keys]
     assert len(set(np.concatenate([whole, *others]).tolist())) == 5000
-    assert raw(0, 0, 0, 0).tolist() == [16294208416658607535], "SplitMix64 of another program"
+    zero = SimpleNamespace(value=0)
+    assert raw(0, zero, 0, 0).tolist() == [16294208416658607535], "SplitMix64 of another program"
 
 
 # -- energies ------------------------------------------------------------------------------------

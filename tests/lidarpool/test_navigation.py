@@ -49,6 +49,7 @@ class Moving:
     navigation: Navigation
     path: object
     duration_ns: float
+    carrier: str = ""
 
 
 def standing(seconds, **navigation):
@@ -221,10 +222,9 @@ def test_pieces_do_not_matter():
         assert len(pieces) > 10 * len(whole)
         for name in whole[0]._fields:
             assert joined(whole, name).tobytes() == joined(pieces, name).tobytes()
-        other = replace(survey, navigation=replace(survey.navigation, seed=10))
-        assert joined(whole, whole[0]._fields[1]).tobytes() != (
-            joined(samples(other), whole[0]._fields[1]).tobytes()
-        )
+        for change in ({"navigation": replace(survey.navigation, seed=10)}, {"carrier": "left"}):
+            other = joined(samples(replace(survey, **change)), whole[0]._fields[1])
+            assert joined(whole, whole[0]._fields[1]).tobytes() != other.tobytes()
 
 
 def test_latitudes_of_east_north_and_up():

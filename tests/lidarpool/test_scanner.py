@@ -182,6 +182,54 @@ def test_an_image_has_the_ranges_of_sweeps(scene, name, given, monkeypatch):
     assert np.array_equal(scanner.ranges(poses, number=4, start_s=0.2), images)
 
 
+def correlations(*rows):
+    """Greatest correlation of two rows."""
+    return np.abs(np.corrcoef(rows) - np.eye(len(rows))).max()
+
+
+def test_each_name_has_random_numbers_of_its_own(scene):
+    given = {"columns": COLUMNS, "backend": "numpy"}
+    plain = Scanner(scene, GRID, **given).sweep(HERE)
+    noise = Noise(0.1, velocity_m_s=1)
+    named = [
+        Scanner(scene, GRID, name=name, noise=noise, **given) for name in ("", "left", "right")
+    ]
+    clouds = [scanner.sweep(HERE) for scanner in named]
+    for name in ("range", "radial_velocity"):
+        assert correlations(*(cloud[name] - plain[name] for cloud in clouds)) < 0.15
+    # Lost rays, drops and flakes; a Mounted's name is its own, and a survey has the same bytes.
+    options = {**PHYSICS, "noise": replace(PHYSICS["noise"], false_alarm_hz=1e5)}
+    given["columns"] = ["ray", "range", "cause"]
+    names = ("left", "right")
+    clouds = [Scanner(scene, GRID, name=name, **given, **options).sweep(HERE) for name in names]
+    for cause in (0, 1, 2):
+        some = [cloud.part(np.flatnonzero(cloud.cause == cause)) for cloud in clouds]
+        rays = [{*zip(cloud.scan.tolist(), cloud.ray.tolist(), strict=True)} for cloud in some]
+        assert len(rays[0]) > 10 and len(rays[0] - rays[1]) > 0.02 * len(rays[0]), cause
+    mounted = Mounted(GRID, name="left")
+    assert same(Scanner(scene, mounted, **given, **options).sweep(HERE), clouds[0])
+    options |= {"columns": given["columns"], "steps": GRID.steps_of_turn(0).stop, "poses": [HERE]}
+    assert same(surveyed(scene, Survey(sensors=[mounted], **options)), clouds[0])
+
+
+@pytest.mark.parametrize("sensor", [GRID, LATE])
+def test_without_a_number_only_the_random_numbers_advance(scene, sensor):
+    given = {"columns": COLUMNS, "backend": "numpy"}
+    plain = Scanner(scene, sensor, **given)
+    before = plain.sweep(BEND)
+    assert same(plain.sweep(BEND), before), "firings, times and numbers of scans stay"
+    scanner = Scanner(scene, sensor, noise=Noise(0.1, velocity_m_s=1), **given)
+    clouds = [scanner.sweep(BEND) for _ in range(3)]
+    assert same(clouds[0], scanner.sweep(BEND, number=0))
+    for name in ("scan", "ray", "time"):
+        assert all(np.array_equal(cloud[name], before[name]) for cloud in clouds)
+    for name in ("range", "radial_velocity"):
+        errors = [cloud[name] - before[name] for cloud in clouds]
+        assert correlations(*errors) < 5 / np.sqrt(len(before)), "5 standard deviations"
+    images = [*scanner.ranges([HERE, HERE]), *scanner.ranges(HERE), *scanner.ranges(HERE, number=0)]
+    assert len({image.tobytes() for image in images}) == 4
+
+
 def test_poses_can_be_given_in_several_forms(scene):
     scanner = Scanner(scene, GRID, backend="numpy")
     places = np.array([[0, 0, 1], [1, -1, 2.0]])
@@ -350,6 +398,10 @@ WRONG = {
     "row": (lambda s: s.ranges(np.ones((1, 4, 4))), "last row"),
     "backend": (lambda s: Scanner(Scene.seed(), GRID, backend="embre"), "'embre'. Did you mean"),
     "threads": (lambda s: Scanner(Scene.seed(), GRID, threads=0), "threads is 0"),
+    "names": (
+        lambda s: Scanner(Scene.seed(), Mounted(GRID, name="left"), name="right"),
+        "name is 'right', and a Mounted sensor has a name of its own: give it there",
+    ),
 }
 
 

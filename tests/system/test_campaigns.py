@@ -219,8 +219,8 @@ def test_jobs_that_cannot_be_sent_to_workers_fail_alone(client, tmp_path, left_o
 def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp_path, monkeypatch):
     write = DataSet.write_job
 
-    def fail(self: DataSet, number: int, name: str, *arguments: Any) -> None:
-        write(self, number, name, *arguments)
+    def fail(self: DataSet, number: int, name: str, *arguments: Any, **more: Any) -> None:
+        write(self, number, name, *arguments, **more)
         if number == 1:
             raise ValueError("cannot be written")
 
@@ -237,11 +237,11 @@ def test_a_full_disk_ends_the_run_and_keeps_it(client, tmp_path, monkeypatch):
     """It would fail all jobs, one after the other."""
     write, full = DataSet.write_job, [True]
 
-    def fail(self: DataSet, number: int, name: str, *arguments: Any) -> None:
+    def fail(self: DataSet, number: int, name: str, *arguments: Any, **more: Any) -> None:
         if number == 2 and full:
             with explained(f"Job {name} cannot be written to {self.place}"):
                 raise OSError(28, "No space left on device")
-        write(self, number, name, *arguments)
+        write(self, number, name, *arguments, **more)
 
     monkeypatch.setattr(DataSet, "write_job", fail)
     campaign = Campaign(make, 5, keep="folder")
@@ -304,6 +304,120 @@ def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     assert before.items() <= after.items() and len(after) > len(before)
     assert not (tmp_path / "ds" / "run").exists()
     assert campaign.run(tmp_path / "ds", client=client, retry_failed=True).done == 4
+
+
+# -- damaged files, mended meshes, and more jobs --------------------------------------------------
+
+
+def flip(path: Path) -> None:
+    """Change a bit in the middle of a file."""
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+
+
+def cut(path: Path) -> None:
+    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+
+
+HARM = {
+    "deleted": (Path.unlink, "jobs/0002/cloud.ply"),
+    "cut": (cut, "jobs/0002/cloud.ply"),
+    "flipped": (flip, "jobs/0002/sweeps.npz"),
+    "manifest cut": (cut, ".jobs/0002.json"),
+    "manifest flipped": (flip, ".jobs/0002.json"),
+}
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_a_damaged_job_is_named_and_made_again(files, whole, lidarpool, slots, no_pictures, harm):
+    change, name = HARM[harm]
+    run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
+    assert lidarpool(*run, "-q").code == 0
+    sound = lidarpool("run", "--verify", files / "ds")
+    assert (sound.code, sound.out) == (0, f"{files / 'ds'} is whole: 6 jobs\n")
+    change(files / "ds" / name)
+    for command in (["run", "--verify", files / "ds"], [*run, "-q", "--job", 2]):
+        found = lidarpool(*command)
+        assert found.code == 2
+        assert f"damaged: job 0002 ({name} is missing or damaged). " in found.err
+        assert "bit for bit" not in found.out and found.err.count("\n") == 1
+    again = lidarpool(*run, "--verify" if harm == "flipped" else "--resume")
+    assert again.code == 0 and "note: made again: job 0002 (" in again.out
+    assert bytes_of(files / "ds") == whole
+    assert not (files / "ds" / "run").exists()
+
+
+def test_jobs_of_an_unfinished_campaign_are_looked_at(client, tmp_path):
+    there = tmp_path / "there"
+
+    def make_if_there(number: int, rng: np.random.Generator) -> CampaignJob:
+        if number == 2 and not there.exists():
+            raise FileNotFoundError(there)
+        return make(number, rng)
+
+    campaign = Campaign(make_if_there, 4, keep="kitti")
+    campaign.run(tmp_path / "ds", client=client)
+    poses = tmp_path / "ds" / "sequences" / "01" / "poses.txt"
+    before = poses.read_bytes()
+    cut(poses)
+    there.touch()
+    run = campaign.run(tmp_path / "ds", client=client, resume=True)
+    assert (run.done, run.resumed, len(run.failed)) == (3, 3, 1)  # the failed one stays
+    assert poses.read_bytes() == before
+
+
+def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
+    (files / "report.json").write_text("{}")
+    for place in (files, files / "none"):
+        refused = lidarpool("run", "--verify", place)
+        assert refused.code == 2 and "is no data set of lidarpool" in refused.err
+    refused = lidarpool("run", files / "base.yaml", "--verify")
+    assert refused.code == 2 and "are for campaigns" in refused.err
+
+
+SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
+
+
+def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots, no_pictures):
+    (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
+    vary = "scene.files.0.file: {each: [a.obj, b.obj, c.obj]}"
+    (files / "c.yaml").write_text(f"base: base.yaml\nvary: {{{vary}}}\nkeep: folder\n")
+    a, b, c = (files / f"{name}.obj" for name in "abc")
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
+    a.write_text(SQUARE), b.write_text("nothing")
+    begun = lidarpool(*run)
+    assert begun.code == 2 and "c.obj' does not exist" in begun.err
+    assert not (files / "ds").exists()
+    c.write_text(SQUARE)
+    assert "1 job failed" in lidarpool(*run).err
+    b.write_text(SQUARE)
+    assert lidarpool(*run, "--job", 1).code == 0
+    c.unlink()  # of a job that is done
+    a.write_text(SQUARE.replace("9", "8"))
+    mixed = lidarpool(*run, "--retry-failed")
+    assert mixed.code == 2 and mixed.err.count("\n") == 1
+    assert "were made of another a.obj than there is now: 0000. Bring that back" in mixed.err
+    a.write_text(SQUARE)
+    b.unlink()  # fails its job, and no other
+    assert "b.obj" in lidarpool(*run, "--retry-failed").err
+    b.write_text(SQUARE)
+    assert lidarpool(*run, "--retry-failed").code == 0
+    assert "bit for bit" in lidarpool(*run, "--job", 1).out
+
+
+def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots, no_pictures):
+    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds", "--resume"]
+    for count in (2, 6):
+        (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", f"count: {count}"))
+        grown = lidarpool(*run)
+        assert grown.code == 0 and grown.out.count(f"{count} jobs, ") == 1
+    assert bytes_of(files / "ds") == whole
+    (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 3"))
+    fewer = lidarpool(*run)
+    assert fewer.code == 2 and fewer.err.count("\n") == 1
+    assert "has job 0003, and count is 3" in fewer.err
+    assert bytes_of(files / "ds") == whole and not (files / "ds" / "run").exists()
 
 
 # -- places and options ---------------------------------------------------------------------------
@@ -424,7 +538,7 @@ def drive(point, times):
         setattr(owner, name, call)
     before(RunDatabase, "__init__", "OPEN")
     before(RunDatabase, "commit", "COMMIT")
-    before(RunDatabase, "end_job", "END")
+    before(RunDatabase, "end_jobs", "END")
     before(RunStore, "remove", "DROP")
     before(output, "write_table", "TABLE")
     before(DataSet, "finish", "FINISH")

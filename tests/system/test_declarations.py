@@ -15,7 +15,7 @@ import pytest
 import lidarpool
 
 ROOT = Path(__file__).parents[2]
-LINE = '    gain_db: Annotated[float, Field(ge=0, le=9, description="of the receiver")] = 0.5\n'
+LINE = '    gain_db: Annotated[float, told("of the receiver", ge=0, le=9)] = 0.5\n'
 SMALL = """
 sensor: {{rays_per_revolution: 36, layers: 2}}
 poses: [[0, 0, 1]]

@@ -24,7 +24,9 @@ from tests.system.test_resume import SCENARIO as RESUMED
 import lidarpool as package
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, unpack
-from lidarpool.export.dataset import DATA_SETS
+from lidarpool.export.dataset import DATA_SETS, job_file
+from lidarpool.export.jobs import JobRow
+from lidarpool.export.sweeps import SWEEPS_FILE
 from lidarpool.run.store import RunStore
 
 pytest.importorskip("s3fs", reason="parts in an object store need s3fs")
@@ -187,11 +189,10 @@ def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, for
     for one, two in zip(there, local, strict=True):
         np.testing.assert_array_equal(one.points, two.points)
         assert (one.job, one.number, one.boxes.names) == (two.job, two.number, two.boxes.names)
-    data.remove_job(0, "00")
-    data.remove_job(0, "00")
-    left = files()
-    assert not [name for name in left if name.endswith(("/00.npz", "/00.json", "/00.mcap"))]
-    assert 0 < len(left) < len(kept)
+    rows = [JobRow(number, f"{number:02}") for number in (0, 1)]
+    assert [wrong for _, (_, wrong) in data.look(rows, contents=True)] == ["", ""]
+    system.rm(f"{folder}/{job_file(format, '00', SWEEPS_FILE)}")
+    assert [bool(wrong) for _, (_, wrong) in data.look(rows)] == [True, False]
     system.rm(f"{folder}/dataset.json")
     with pytest.raises(package.LidarpoolError, match="is an unfinished data set"):
         package.sweeps(url)

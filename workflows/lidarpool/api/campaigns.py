@@ -42,6 +42,7 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
         resume: bool = False,
         fresh: bool = False,
         retry_failed: bool = False,
+        verify: bool = False,
         live: bool = False,
         wait_s: float = WAIT_S,
         patience_s: float = PATIENCE_S,
@@ -72,6 +73,9 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             Remove first what an earlier run of a campaign has left in `out`.
         retry_failed
             Resume, and do the jobs that have failed again.
+        verify
+            Resume, and compare every byte of the jobs that are done: those with others are damaged,
+            and made again.
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
             in the cell.
@@ -101,8 +105,8 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             )
 
         making = Making(
-            output_place(out), client is None, resume, fresh, retry_failed, parts, backend,
-            wait_s, patience_s,
+            output_place(out), client is None, resume, fresh, retry_failed, verify, parts,
+            backend, wait_s, patience_s,
         )  # fmt: skip
         progress = bars_here() if on_progress is None else nullcontext(on_progress)
         with _page(self, live) as page:

@@ -1,6 +1,6 @@
 """Declarations of quantities that users set: what a scenario file needs beyond Python's types.
 
-A quantity is a field of a dataclass: `Annotated[type, Field(limits, description)] = default`.
+A quantity is a field of a dataclass: `Annotated[type, told(description, limits)] = default`.
 `checked_fields` lets the dataclass refuse values outside the limits, and a section of a scenario
 inherits the fields (`lidarpool.scenario.sections`).
 """
@@ -24,6 +24,11 @@ Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
+
+
+def told(description: str, *examples: Any, **limits: Any) -> Any:
+    """Describe a field; one whose default is computed has examples."""
+    return Field(description=description, examples=[*examples] or None, **limits)
 
 
 def declared(thing: Any, by: type) -> dict[str, Any]:

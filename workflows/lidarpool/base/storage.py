@@ -11,6 +11,7 @@ import os
 import re
 import secrets
 import tempfile
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -20,6 +21,7 @@ from typing import IO, Any
 
 from .errors import LidarpoolError
 
+_PIECE = 1 << 20  # bytes in memory of a file that is checked
 _TEMPORARY = ".lidarpool-tmp-"
 _LEFT = re.compile(rf"{re.escape(_TEMPORARY)}(.+)-[0-9a-f]{{8}}")
 
@@ -207,6 +209,14 @@ class Storage:
             return Path(self.url, name).read_bytes()
         with self._remote() as (system, folder):
             return bytes(system.cat_file(f"{folder}/{name}"))
+
+    def checksum(self, name: str) -> list[int]:
+        """Bytes of a file and their CRC-32, read a piece at a time."""
+        size = crc = 0
+        with self._remote() as (system, folder), system.open(f"{folder}/{name}", "rb") as file:
+            while piece := file.read(_PIECE):
+                size, crc = size + len(piece), zlib.crc32(piece, crc)
+        return [size, crc]
 
     def put(self, path: Path, name: str) -> None:
         """Copy a file of this machine, or a folder of files, into the storage."""

@@ -25,6 +25,7 @@ from ..report.campaign_output import (
     job_again,
     make_dataset,
     row_of,
+    verify,
 )
 from ..run.campaign import CampaignPage, CampaignRun
 from ..run.checks import slots_needed
@@ -56,8 +57,8 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
         return cluster_of(pool, slots, options, waiting)
 
     making = Making(
-        options.out, options.here, options.resume, options.fresh, retry_failed, options.parts,
-        options.backend, options.wait_s, options.patience_s,
+        options.out, options.here, options.resume, options.fresh, retry_failed, options.verify,
+        options.parts, options.backend, options.wait_s, options.patience_s,
     )  # fmt: skip
     with _page(campaign, options) as page:
         progress = shown_progress(options.quiet)
@@ -106,13 +107,14 @@ def run_job(campaign: Campaign, number: int, options: RunOptions) -> None:
 
     Where the place is the data set of the campaign, the result is a folder in it, and its points
     must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
-    other software.
+    other software, or its files there are damaged.
     """
     place = Storage.at(str(options.out))
     dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
     of_dataset = place.has(CAMPAIGN_FILE)
     if of_dataset:
         backend = check_same(place, campaign)["backend"]
+        verify(place, number)
         name = campaign.describe(number).name
         options = replace(options, out=output_place(f"{options.out}/job-{name}"), backend=backend)
     described, job = job_again(

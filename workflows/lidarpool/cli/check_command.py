@@ -87,6 +87,7 @@ def check(
             lines = told(job, found)
         elif number is None:
             campaign = Campaign.load(scenario)
+            campaign.check_files()
             found = _look_at_jobs(campaign, look)
             lines = _of_campaign(campaign, found)
         else:

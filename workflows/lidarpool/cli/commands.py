@@ -122,9 +122,7 @@ def demo(out: Path | Storage, **shown: Any) -> None:
 
 
 @cli.command()
-@click.argument(
-    "scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path(path_type=Path)
-)
+@click.argument("scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path())
 @options.out
 @options.scheduler
 @options.cluster
@@ -133,6 +131,7 @@ def demo(out: Path | Storage, **shown: Any) -> None:
 @options.flag("--resume", help="Resume an unfinished run, if there is one.")
 @options.flag("--fresh", help="Delete an unfinished run.")
 @options.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
+@options.flag("--verify", help="Compare every byte of a data set, or of the jobs to resume from.")
 @options.job
 @click.option(
     "--parts",
@@ -156,7 +155,7 @@ def demo(out: Path | Storage, **shown: Any) -> None:
     f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
 @_shown
-def run(scenarios: tuple[Path, ...], **given: Any) -> None:
+def run(scenarios: tuple[str, ...], **given: Any) -> None:
     """Run the survey of a scenario or mesh file, or a campaign of many.
 
     A campaign file, or several scenarios, make one data set.
@@ -171,6 +170,7 @@ def run(scenarios: tuple[Path, ...], **given: Any) -> None:
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
       lidarpool run examples/campaign.yaml --out dataset
+      lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
     queued = given["cluster"] is not None
     for name, default in (("wait_s", WAIT_S), ("patience_s", PATIENCE_S)):
@@ -181,11 +181,17 @@ def run(scenarios: tuple[Path, ...], **given: Any) -> None:
             "--tls is for a cluster of this machine: that of --cluster is encrypted if its file "
             "says so, that of --scheduler if its address begins with tls://."
         )
-    if given["resume"] and given["fresh"]:
+    if (given["resume"] or given["verify"]) and given["fresh"]:
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
     if given["retry_failed"] and (given["fresh"] or given["number"] is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
-    _run(scenarios, **given)
+    if given["verify"] and not Path(scenarios[0]).is_file():
+        from ..base.storage import Storage
+        from ..report.campaign_output import verify
+
+        click.echo(verify(Storage.at(scenarios[0])))
+        return
+    _run([*map(Path, scenarios)], **given)
 
 
 def _run(
@@ -214,8 +220,8 @@ def _run(
                 run_job(campaign, number, told)
             else:
                 run_campaign(campaign, told, retry_failed)
-        elif retry_failed or number is not None:
-            raise click.UsageError("--job and --retry-failed are for campaigns.")
+        elif retry_failed or told.verify or number is not None:
+            raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
         else:
             run_scenario(Scenario.load(paths[0]) if paths else Scenario(), told)
     finally:

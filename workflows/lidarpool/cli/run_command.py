@@ -59,6 +59,7 @@ class RunOptions:
     resumable: bool = True
     resume: bool = False
     fresh: bool = False
+    verify: bool = False
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False

@@ -45,7 +45,7 @@ class Column:
     source
         Name of an attribute of the returns of a batch (`lidarpool.simulator.returns.BatchReturns`),
         or a function that computes the column from them: an array (n,), one value for each
-        point. It runs on the worker that casts the rays. "" for columns made by the cloud.
+        point. It runs on the worker that casts the rays. By default the attribute of its name.
     coordinates
         Coordinate system of the values: "world", "sensor", or "" for none.
     kind
@@ -93,7 +93,7 @@ class Column:
         LidarpoolError if its source gives another number of values, or values that the type cannot
         hold.
         """
-        source = self.source
+        source = self.source or self.name
         values = np.asarray(source(returns) if callable(source) else getattr(returns, source))
         if values.shape != (len(returns),):
             raise LidarpoolError(
@@ -118,74 +118,58 @@ X = Column("x", "int32", "m", "position along x, to the east on maps", "cell_x",
 Y = Column("y", "int32", "m", "position along y, to the north on maps", "cell_y", "world")
 Z = Column("z", "int32", "m", "position along z, up", "cell_z", "world")
 CHANNEL = Column(
-    "channel",
-    "uint16",
-    "",
-    "beam of the sensor, the lowest is 0",
-    "channel",
-    kind="label",
-    file_name="ring",
+    "channel", "uint16", "", "beam of the sensor, the lowest is 0", kind="label", file_name="ring"
 )
-OBJECT = Column(
-    "object", "int32", "", "object that was hit; -1 for no surface", "object", kind="label"
-)
+OBJECT = Column("object", "int32", "", "object that was hit; -1 for no surface", kind="label")
 
 AXES = (X, Y, Z)  # in a part: whole multiples of the precision from the scene's local origin
 ALWAYS = (*AXES, CHANNEL, OBJECT)  # the columns that every part holds; `scan` follows from its rows
 OPTIONAL = (
-    Column("ray", "uint32", "", "number of the ray within its scan", "ray"),
-    Column("time", "int64", "ns", "time of the ray since the survey's start", "time"),
-    Column("azimuth", "float32", "deg", "angle about the sensor's z axis", "azimuth", "sensor"),
+    Column("ray", "uint32", "", "number of the ray within its scan"),
+    Column("time", "int64", "ns", "time of the ray since the survey's start"),
+    Column("azimuth", "float32", "deg", "angle about the sensor's z axis", coordinates="sensor"),
     Column(
-        "elevation", "float32", "deg", "angle above the sensor's xy plane", "elevation", "sensor"
+        "elevation", "float32", "deg", "angle above the sensor's xy plane", coordinates="sensor"
     ),
-    Column("range", "float32", "m", "distance from the beam's origin", "range", "sensor"),
+    Column("range", "float32", "m", "distance from the beam's origin", coordinates="sensor"),
     Column(
         "intensity",
         "float32",
         "",
         "energy received; 1 is a white surface 10 m away at right angles in clear air",
-        "intensity",
     ),
     Column(
         "reflectivity",
         "float32",
         "",
         "intensity without the loss by distance and air: reflectance times cosine of incidence",
-        "reflectivity",
     ),
     Column(
         VELOCITY,
         "float32",
         "m/s",
         "how fast the range grows: negative while it shrinks; NaN of false alarms",
-        "radial_velocity",
     ),
     Column(
         "amplitude",
         "float32",
         "",
         "height of the echo in the waveform; of one as narrow as the pulse its intensity",
-        "amplitude",
     ),
     Column(
         "pulse_width",
         "float32",
         "ns",
         "full width at half maximum of the echo; without waveforms the pulse's, 0 for no echo",
-        "pulse_width",
     ),
     Column(
         "return_number",
         "uint8",
         "",
         "number among the reported returns of its pulse, from 1",
-        "return_number",
         kind="label",
     ),
-    Column(
-        "returns", "uint8", "", "number of reported returns of its pulse", "returns", kind="label"
-    ),
+    Column("returns", "uint8", "", "number of reported returns of its pulse", kind="label"),
     Column(
         "class",
         "uint16",
@@ -199,14 +183,13 @@ OPTIONAL = (
         "uint8",
         "",
         "why the return is there: " + "; ".join(f"{n} {what}" for n, what in enumerate(CAUSES)),
-        "cause",
         kind="label",
     ),
     Column("sensor", "uint8", "", "sensor of the carrier, from 0", "sensor_number", kind="label"),
-    Column("triangle", "int32", "", "triangle of the scene that was hit", "triangle"),
-    Column("red", "uint8", "", "red of the surface, sRGB; what has no colour is grey, 188", "red"),
-    Column("green", "uint8", "", "green of the surface, sRGB", "green"),
-    Column("blue", "uint8", "", "blue of the surface, sRGB", "blue"),
+    Column("triangle", "int32", "", "triangle of the scene that was hit"),
+    Column("red", "uint8", "", "red of the surface, sRGB; what has no colour is grey, 188"),
+    Column("green", "uint8", "", "green of the surface, sRGB"),
+    Column("blue", "uint8", "", "blue of the surface, sRGB"),
 )
 COLOURS = ("red", "green", "blue")
 

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import io
 import json
+import zlib
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field
+from functools import lru_cache
+from itertools import islice
 from pathlib import Path
-from typing import IO, Any, Literal, TypeVar
+from typing import IO, Any, Literal
 
 import numpy as np
 
@@ -26,9 +29,6 @@ from .pieces import RANGE_PIECES, RANGE_POINTS, Entry, Pieces, Written, pieces_o
 from .sweeps import MIXED_UP, SWEEPS_FILE, Sweeps
 from .table import LAYOUTS
 
-T = TypeVar("T")
-U = TypeVar("U")
-
 # {format of a data set: format of its jobs}
 DATA_SETS = {
     "kitti": "kitti", "nuscenes": "nuscenes", "mcap": "mcap", "parquet": "parquet",
@@ -38,6 +38,8 @@ INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
 VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
+_AHEAD = 16  # jobs that are looked at ahead
+_LISTED = 32  # folders whose files are known at a time, some of which all jobs share
 
 
 def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
@@ -66,8 +68,9 @@ class DataSet:
     - folder: `jobs/NAME/cloud.ply`
 
     Beside these are `sweeps/NAME.npz` (`Sweeps`) and, where there are actors, `boxes/NAME.npz`,
-    which `lidarpool.sweeps` reads; with `folder` they are in `jobs/NAME`. `.jobs/NAME.json` has
-    what `finish` needs of a job, and is the last file that a job writes.
+    which `lidarpool.sweeps` reads; with `folder` they are in `jobs/NAME`. `.jobs/NAME.json`, the
+    job's manifest, is the last file that a job writes: it lists the others with bytes and CRC, and
+    the files that the job was made of, and has what `finish` needs.
 
     Parameters
     ----------
@@ -103,11 +106,21 @@ class DataSet:
         """Check that it can be written here; LidarpoolError if a package is missing."""
         self._of_jobs.check_installed()
 
-    def write_job(self, number: int, name: str, cloud: CloudLike, sweeps: Sweeps) -> None:
+    def write_job(
+        self,
+        number: int,
+        name: str,
+        cloud: CloudLike,
+        sweeps: Sweeps,
+        made_of: Sequence[Sequence[str]] = (),
+        *,
+        listing: Listing | None = None,
+    ) -> None:
         """Write the files of a job; whoever writes them again writes the same bytes.
 
         Points are read in order, a sweep at a time or, for Parquet, a million. Every file
-        appears completely or not at all.
+        appears completely or not at all. `made_of` has names and hashes of the files that the
+        job was made of; `listing` gets the files, also if not all are written.
 
         Raises
         ------
@@ -118,60 +131,36 @@ class DataSet:
         entry, one = Entry(number, name), self._of_jobs
         one.check_installed()
         one.check_columns(cloud)
-        place = self.place
+        place = listing or Listing(self.place.url, self.place.durable)
+        boxes: list[Boxes] = []
         with explained(f"Job {name} cannot be written to {place}"):
             if one.in_pieces:
-                summary, made = _write_pieces(pieces_of(one.format, cloud, sweeps, entry), place)
+                pieces = pieces_of(one.format, cloud, sweeps, entry)
+                manifest, made = _write_pieces(pieces, place)
+                boxes = made if pieces.boxes else []
             else:
-                summary, made = {}, []
+                manifest = {}
                 path = f"jobs/{name}/{one.file}" if self.format == "folder" else f"bags/{name}.mcap"
                 with local_folder(Path(place.url) if place.is_local else place) as folder:
                     (folder / path).parent.mkdir(parents=True, exist_ok=True)
                     one.write(folder / path, cloud, sweeps, overwrite=True)
+                    place.files[path] = Storage(str(folder)).checksum(path)
                     if not place.is_local:
                         place.put(folder / path, path)
             files = {job_file(self.format, name, SWEEPS_FILE): sweeps.packed()}
             if sweeps.actors:
-                if len(made) != len(sweeps):  # the format is not of single sweeps
-                    made = [
-                        Boxes.of(sweeps, sweep, points)
-                        for sweep, points in enumerate(sweeps.points(cloud))
-                    ]
-                files[job_file(self.format, name, BOXES_FILE)] = _packed(made)
-            of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
-            summary |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
-            files[_summary_file(name)] = json.dumps(summary).encode()
+                boxes = boxes or [
+                    Boxes.of(sweeps, sweep, points)
+                    for sweep, points in enumerate(sweeps.points(cloud))
+                ]
+                files[job_file(self.format, name, BOXES_FILE)] = _packed(boxes)
             for file, data in files.items():
-                _make_folder(place, file)
                 place.write(file, data)
-
-    def remove_job(self, number: int, name: str) -> None:
-        """Remove the files of a job, as far as there are any; LidarpoolError if that fails."""
-        place, own = self.place, f"{number:02}"
-        with explained(f"Job {name} cannot be removed from {place}"):
-            # First what says that it is there.
-            place.remove([_summary_file(name)])
-            if self.format == "kitti":
-                for folder in ("sequences", "poses"):
-                    for entry in Storage(place.path(folder)).entries():
-                        stem = entry.removesuffix(".txt")
-                        if stem == own or stem.startswith(f"{own}_"):
-                            place.discard(f"{folder}/{entry}")
-            elif self.format == "nuscenes":
-                for folder in ("samples", "sweeps"):
-                    for channel, size in Storage(place.path(folder)).entries().items():
-                        if size is None:
-                            place.discard(f"{folder}/{channel}/{name}")
-            else:
-                places = {
-                    "mcap": f"bags/{name}.mcap",
-                    "parquet": f"points/job={number}",
-                    "images": f"images/{name}",
-                    "folder": f"jobs/{name}",
-                }
-                place.discard(places[self.format])
-            for file in (SWEEPS_FILE, BOXES_FILE):
-                place.remove([job_file(self.format, name, file)])
+            of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
+            manifest |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
+            manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
+            manifest["crc"] = _crc(manifest)
+            place.write(_manifest_file(name), json.dumps(manifest).encode())
 
     def finish(self, jobs: Iterable[JobRow]) -> None:
         """Write the files that hold all jobs, from those that are done, in their order.
@@ -182,7 +171,7 @@ class DataSet:
         Raises
         ------
         LidarpoolError
-            If a job's files are not there, or the place cannot be written to.
+            If a job's files are not those of its manifest, or the place cannot be written to.
         """
         with explained(f"{self.place} cannot be written"):
             self.place.remove([INDEX_FILE])
@@ -191,11 +180,11 @@ class DataSet:
                 head = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
                 file.write(f'{json.dumps(head)[:-1]}, "jobs": ['.encode())
-                summaries = self._indexed(jobs, file)
+                manifests = self._indexed(jobs, file)
                 if self.format == "nuscenes":
-                    merge(self.place, summaries)
+                    merge(self.place, manifests)
                 else:
-                    deque(summaries, maxlen=0)
+                    deque(manifests, maxlen=0)
                 file.write(b"\n]}\n")
 
     def _tidy(self) -> None:
@@ -207,34 +196,77 @@ class DataSet:
                 remove_left(folder)
 
     def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
-        """Yield what each job that is done has left, and add it to the index."""
-        done = ((job.number, job.name) for job in jobs if job.done)
+        """Yield the manifest of each job that is done, and add it to the index."""
         comma = ""
-        for (number, name), summary in _ahead(self._summary, done):
-            row = {"number": number, "name": name, "sensors": summary["sensors"]}
+        for job, (manifest, wrong) in self.look(jobs):
+            if wrong:
+                told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
+                raise LidarpoolError(f"{told} Make it again with --resume.")
+            row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
             index.write(f"{comma}\n{json.dumps(row)}".encode())
             comma = ","
-            yield summary
+            yield manifest
 
-    def _summary(self, job: tuple[int, str]) -> dict[str, Any]:
-        name = job[1]
-        try:
-            summary: dict[str, Any] = json.loads(self.place.read(_summary_file(name)))
-        except (FileNotFoundError, ValueError) as error:
-            raise LidarpoolError(
-                f"Job {name} of {self.place} is not whole: its {_summary_file(name)} is missing or "
-                "damaged. Make the job again."
-            ) from error
-        return summary
+    def look(
+        self, jobs: Iterable[JobRow], *, contents: bool = False
+    ) -> Iterator[tuple[JobRow, tuple[dict[str, Any], str]]]:
+        """Yield the jobs that are done, their manifests, and what is wrong with their files.
+
+        The last is a clause, or empty; then the manifest may be, too. Sizes are compared, and with
+        `contents` every byte is read. OSError if the place cannot be read.
+        """
+        sizes = lru_cache(_LISTED)(lambda folder: Storage(self.place.path(folder)).sizes())
+
+        def look_at(job: JobRow) -> tuple[dict[str, Any], str]:
+            try:
+                manifest = json.loads(self.place.read(_manifest_file(job.name)))
+                if manifest.pop("crc") != _crc(manifest):
+                    raise ValueError("a bit has changed")
+            except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError):
+                return {}, f"{_manifest_file(job.name)} is missing or damaged"
+            for name, (size, crc) in manifest["files"].items():
+                folder, _, file = name.rpartition("/")
+                same = sizes(folder).get(file) == size
+                if not same or (contents and self.place.checksum(name) != [size, crc]):
+                    return manifest, f"{name} is missing or damaged"
+            return manifest, ""
+
+        done = (job for job in jobs if job.done)
+        with ThreadPoolExecutor(_REQUESTS, "read") as pool:
+            while some := [*islice(done, _AHEAD)]:
+                yield from zip(some, pool.map(look_at, some), strict=True)
 
 
-def _summary_file(name: str) -> str:
+@dataclass(frozen=True)
+class Listing(Storage):
+    """A storage that lists the files that are written, {name: [bytes, CRC-32]}."""
+
+    files: dict[str, list[int]] = field(default_factory=dict)
+
+    def write(self, name: str, data: Any) -> None:  # noqa: D102 - as of any
+        if self.is_local:
+            Path(self.path(name)).parent.mkdir(parents=True, exist_ok=True)
+        super().write(name, data)
+        self.files[name] = [len(data), zlib.crc32(data)]
+
+    def undo(self) -> None:
+        """Remove the files, and folders that are then empty."""
+        self.remove([*self.files])
+        folders = {str(folder) for file in self.files for folder in Path(file).parents}
+        for folder in sorted(folders - {"."}, key=len, reverse=True):
+            Storage(self.path(folder)).remove_folder()
+
+
+def _manifest_file(name: str) -> str:
     return f".jobs/{name}.json"
+
+
+def _crc(manifest: Mapping[str, Any]) -> int:
+    return zlib.crc32(json.dumps(manifest).encode())
 
 
 def _write_pieces(pieces: Pieces, place: Storage) -> tuple[dict[str, Any], list[Any]]:
     """Write all pieces of a job; returns its summary, and what was made of the pieces."""
-    pieces.make_folders(place)
     if place.is_local:
         rows, made = pieces.write(place, 0, len(pieces))
     else:
@@ -256,11 +288,6 @@ def _write_far(pieces: Pieces, place: Storage) -> Written:
     return sum(rows for rows, _ in written), [one for _, made in written for one in made]
 
 
-def _make_folder(place: Storage, file: str) -> None:
-    if place.is_local:
-        Path(place.path(file)).parent.mkdir(parents=True, exist_ok=True)
-
-
 def _packed(boxes: Sequence[Boxes]) -> bytes:
     """Boxes of all sweeps as a NumPy archive: float64 (n, a, 3), ... as the fields of `Boxes`."""
     memory = io.BytesIO()
@@ -268,20 +295,3 @@ def _packed(boxes: Sequence[Boxes]) -> bytes:
     arrays: dict[str, Any] = {n: np.stack([getattr(one, n) for one in boxes]) for n in names}
     np.savez_compressed(memory, **arrays)
     return memory.getvalue()
-
-
-def _ahead(function: Callable[[T], U], items: Iterable[T]) -> Iterator[tuple[T, U]]:
-    """Yield items with their values in order, a few of which are asked for ahead."""
-    with ThreadPoolExecutor(_REQUESTS, "read") as pool:
-        waiting: deque[tuple[T, Future[U]]] = deque()
-        try:
-            for item in items:
-                waiting.append((item, pool.submit(function, item)))
-                if len(waiting) > 2 * _REQUESTS:
-                    first, value = waiting.popleft()
-                    yield first, value.result()
-            while waiting:
-                first, value = waiting.popleft()
-                yield first, value.result()
-        finally:
-            pool.shutdown(cancel_futures=True)

@@ -239,7 +239,7 @@ def read_table(place: Storage) -> Iterator[JobRow]:
         except (ValueError, csv.Error) as error:
             raise LidarpoolError(
                 f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
-                "run the campaign again with --resume, which writes it anew."
+                "--resume writes that of an unfinished campaign anew; else bring it back."
             ) from error
 
 

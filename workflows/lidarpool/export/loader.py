@@ -302,7 +302,7 @@ def sweeps(
         not installed, or there is no such split, job or sensor.
     """
     storage = Storage.at(place)
-    head = _index(storage)
+    head = read_index(storage)
     Format(DATA_SETS[head["format"]]).check_installed()
     of_sensors = {row["number"]: row["sensors"] for row in head["jobs"]}
     rows = [job for job in read_table(storage) if job.number in of_sensors]
@@ -320,8 +320,8 @@ def sweeps(
     return SavedSweeps(storage, head["format"], head["layout"], runs, shuffle)
 
 
-def _index(place: Storage) -> dict[str, Any]:
-    """Read the index of a data set; LidarpoolError if there is none."""
+def read_index(place: Storage) -> dict[str, Any]:
+    """Read the index of a finished data set; LidarpoolError if there is none."""
     try:
         head: dict[str, Any] = json.loads(place.read(INDEX_FILE))
         if head["version"] != VERSION:

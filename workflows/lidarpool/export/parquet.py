@@ -28,6 +28,8 @@ class Pieces(pieces.Pieces):
     sweeps read one or two.
     """
 
+    boxes = False  # its pieces are not sweeps
+
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
         self.folders = [] if entry is None else [f"points/job={entry.number}"]

@@ -44,6 +44,7 @@ class Pieces:
     """
 
     folders: Sequence[str] = ()
+    boxes = True  # `files` returns the boxes of a sweep, where there are actors
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         self.cloud, self.sweeps, self.entry = cloud, sweeps, entry

@@ -12,7 +12,7 @@ import json
 import re
 import secrets
 import sqlite3
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -231,19 +231,20 @@ class RunDatabase:
             )
         self.trials.append(trial)
 
-    def end_job(self, number: int, data: Mapping[str, Any], *, failed: bool = False) -> None:
-        """Store that a job of a campaign has ended, and what is to be known of it."""
+    def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
+        """Store which jobs of a campaign have ended or failed, and what is to be known of them."""
         with self._transaction():
-            self._sql.execute(
-                "INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", (number, failed, json.dumps(data))
-            )
-        self.jobs[number] = int(failed)
+            for number, failed, data in jobs:
+                row = (number, failed, json.dumps(data))
+                self._sql.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", row)
+                self.jobs[number] = int(failed)
 
-    def forget_failed_jobs(self) -> None:
-        """Let the jobs that have failed be done again."""
+    def forget_jobs(self, numbers: Iterable[int]) -> None:
+        """Let some jobs be done again."""
         with self._transaction():
-            self._sql.execute("DELETE FROM jobs WHERE failed")
-        self.jobs = {number: failed for number, failed in self.jobs.items() if not failed}
+            for number in numbers:
+                self._sql.execute("DELETE FROM jobs WHERE number = ?", (number,))
+                del self.jobs[number]
 
     def save_frames(self) -> None:
         """Store how many frames were handed out; each commit does so anyway."""

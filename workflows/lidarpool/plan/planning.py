@@ -9,10 +9,9 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 
 from ..base.arguments import checked_fields
-from ..base.declared import Seed
+from ..base.declared import Seed, told
 from ..base.errors import LidarpoolError
 from .geometry import Floats, segment_distances
 
@@ -25,15 +24,13 @@ class Search:
     swarms converge more slowly.
     """
 
-    trials: Annotated[
-        int, Field(ge=1, le=1_000_000, description="particle swarms, each with its own seed")
-    ] = 100
-    particles: Annotated[int, Field(ge=1, le=10_000_000, description="of each swarm")] = 1000
-    iterations: Annotated[int, Field(ge=1, le=1_000_000, description="of each swarm")] = 300
+    trials: Annotated[int, told("particle swarms, each with its own seed", ge=1, le=10**6)] = 100
+    particles: Annotated[int, told("of each swarm", ge=1, le=10_000_000)] = 1000
+    iterations: Annotated[int, told("of each swarm", ge=1, le=1_000_000)] = 300
     waypoints: Annotated[
-        int, Field(ge=1, le=100, description="corners of the path between start and target")
+        int, told("corners of the path between start and target", ge=1, le=100)
     ] = 5
-    seed: Annotated[Seed, Field(description="the same seed gives the same path")] = 0
+    seed: Annotated[Seed, told("the same seed gives the same path")] = 0
 
 
 @dataclass(frozen=True, eq=False)

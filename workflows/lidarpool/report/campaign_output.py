@@ -22,15 +22,15 @@ from ..base.words import counted
 from ..export.dataset import INDEX_FILE, DataSet
 from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
-from ..export.loader import sweeps
+from ..export.loader import read_index, sweeps
 from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.identity import OF_CAMPAIGN
 from ..run.job import Job
 from ..run.progress import Show
-from ..run.store import RUN_FOLDER, remove_run
+from ..run.store import RUN_FOLDER, listed, remove_run
 from ..run.watch import Waiting
-from ..scenario.campaign import Campaign, Described
+from ..scenario.campaign import Campaign, Described, hashes
 from .campaign_figures import CampaignInfo
 from .campaign_report import write_card
 from .sweep_picture import draw_sweep
@@ -50,7 +50,8 @@ class Making:
     """How a campaign is to be made into a data set.
 
     `out` is its place; `own` says that the cluster is a local one for this run. `resume` continues
-    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again.
+    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again. Of the jobs that are
+    done a resumed run compares sizes of files, and with `verify` every byte.
     """
 
     out: Path | Storage
@@ -58,6 +59,7 @@ class Making:
     resume: bool = False
     fresh: bool = False
     retry_failed: bool = False
+    verify: bool = False
     parts: str | Path | None = None
     backend: str | None = None
     wait_s: float = 0.0
@@ -83,7 +85,7 @@ def make_dataset(
     out = Storage.at(str(making.out), durable=False)
     dataset = DataSet(out, campaign.keep.format, campaign.keep.layout)
     dataset.check_installed()
-    resume = making.resume or making.retry_failed
+    resume = making.resume or making.retry_failed or making.verify
     if making.fresh and resume:
         raise LidarpoolError("fresh removes the run that resume and retry_failed go on with.")
     place = f"{out}/{RUN_FOLDER}"
@@ -91,13 +93,16 @@ def make_dataset(
         if making.fresh:
             _remove_dataset(out, place)
         there = set(out.entries())
-        if resume and INDEX_FILE in there and RUN_FOLDER not in there:
-            check_same(out, campaign)
-            tell(f"{out} is complete: nothing is left to do")
-            run = run_result(_shown(read_table(out), page), time.monotonic())
-            page.finish(run)
-            return run
-        if RUN_FOLDER not in there and (found := sorted(there)):
+        made, wrong = None, dict[int, str]()
+        if resume and CAMPAIGN_FILE in there and RUN_FOLDER not in there:
+            made = check_same(out, campaign)
+            whole, wrong = _look(dataset, read_table(out), making.verify, campaign)
+            if INDEX_FILE in there and whole == campaign.count and not wrong:
+                tell(f"{out} is complete: nothing is left to do")
+                run = run_result(_shown(read_table(out), page), time.monotonic())
+                page.finish(run)
+                return run
+        elif RUN_FOLDER not in there and (found := sorted(there)):
             raise LidarpoolError(
                 f"{out} holds {found[0]}: a data set needs a folder of its own, give another with "
                 "--out."
@@ -111,9 +116,16 @@ def make_dataset(
             resume=resume,
         )
         stack.enter_context(store.kept_on_error())
-        if making.retry_failed:
-            store.forget_failed()
-        store.tidy_jobs()
+        if made is not None:
+            store.take_over(made, read_table(out))
+        else:
+            _, wrong = _look(dataset, store.rows(), making.verify, campaign)
+        if not store.kept:
+            campaign.check_files()
+        retried = (number for number, failed in store.db.jobs.items() if failed)
+        store.forget([*wrong, *(retried if making.retry_failed else ())])
+        if wrong:
+            store.notes.append(f"made again: {listed([*wrong.values()])}")
         deque(_shown(store.rows(), page), maxlen=0)
         if store.left:
             run = run_campaign(
@@ -152,6 +164,7 @@ def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: Cam
     """Write what all jobs share, and last what says that the data set is complete."""
     place = dataset.place
     made = {"identity": dict(store.identity), "casting": store.casting, "backend": store.backend}
+    made |= {"sensors": run.sensors}
     with explained(f"{place} cannot be written"):
         place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
     write_table(place, campaign.names, store.rows())
@@ -179,6 +192,55 @@ def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: Cam
             draw_sweep(next(iter(saved))).save(picture)
             info = replace(info, picture=picture)
         write_card(place, info, store.rows())
+
+
+def _look(
+    dataset: DataSet, rows: Iterable[JobRow], contents: bool, campaign: Campaign | None = None
+) -> tuple[int, dict[int, str]]:
+    """Count the jobs that are whole, and tell what is wrong with others, {number: a clause}.
+
+    LidarpoolError if a file of the campaign is another than the one that whole jobs are made of.
+    """
+    whole, wrong = 0, dict[int, str]()
+    made: dict[tuple[str, str], list[str]] = {}  # {name and hash of a file: jobs made of it}
+    with explained(f"{dataset.place} cannot be read"):
+        for row, (manifest, difference) in dataset.look(rows, contents=contents):
+            if campaign is not None and row.number >= campaign.count:
+                raise LidarpoolError(
+                    f"{dataset.place} has job {row.name}, and count is {campaign.count:,}: a "
+                    "campaign can only grow. Give another folder with --out."
+                )
+            if difference:
+                wrong[row.number] = f"job {row.name} ({difference})"
+                continue
+            whole += 1
+            for file in manifest["made_of"]:
+                made.setdefault(tuple(file), []).append(row.name)
+    now = hashes(campaign.files) if campaign is not None and made else []
+    for (name, digest), jobs in made.items():
+        if (name, digest) not in now and name in dict(now):
+            raise LidarpoolError(
+                f"Jobs of {dataset.place} were made of another {name} than there is now: "
+                f"{listed(jobs)}. Bring that back, or give another folder with --out."
+            )
+    return whole, wrong
+
+
+def verify(place: Storage, number: int | None = None) -> str:
+    """Compare each file of a finished data set, or of one of its jobs, with what is kept of it.
+
+    Returns a line; LidarpoolError names what is damaged, or says that there is no such data set.
+    """
+    index = read_index(place)
+    dataset = DataSet(place, index["format"], index["layout"])
+    rows = [JobRow(row["number"], row["name"]) for row in index["jobs"]]
+    rows = [row for row in rows if number in (None, row.number)]
+    if wrong := _look(dataset, rows, True)[1]:
+        raise LidarpoolError(
+            f"{place} is damaged: {listed([*wrong.values()])}. With the campaign, --verify makes "
+            "these jobs again."
+        )
+    return f"{place} is whole: {counted(len(rows), 'job')}"
 
 
 def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:

@@ -21,7 +21,7 @@ from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..export.folder import result_folder, staging
 from ..export.recordings import Recording, Turn, open_recording
-from ..sensor.noise import uniform
+from ..sensor.noise import Purpose, uniform
 from .page.words import millimetres, ratio
 from .range_image import RangeImages, range_images
 
@@ -31,7 +31,6 @@ Reals = NDArray[np.float32]
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
 MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
-_CHOICE = 1000  # purpose of the hashes that choose
 
 
 # Points (n, 3) of a cloud, and their distances (n,) to the other.
@@ -338,7 +337,7 @@ def chosen(count: int, most: int, group: int) -> NDArray[np.intp]:
     """Choose about `most` numbers below `count`, in order, by their hashes; all of fewer."""
     if count <= most:
         return np.arange(count)
-    return np.flatnonzero(uniform(0, _CHOICE, group, np.arange(count)) < most / count)
+    return np.flatnonzero(uniform(0, Purpose.CHOICE, group, np.arange(count)) < most / count)
 
 
 def nearest(points: Floats, others: Floats) -> tuple[Floats, NDArray[np.int64]]:

@@ -113,10 +113,10 @@ def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
 def _parameters(scene: Scene, survey: Survey) -> dict[str, Any]:
     options = declared(survey, CloudOptions) | declared(survey, Weather)
     del options["columns"]  # which have a table of their own
-    each = zip(survey.carried, survey.returns_each, survey.noise_each, strict=True)
     sensors = [
-        _sensor(mounted.sensor) | {"returns": asdict(returns), "noise": asdict(noise)}
-        for mounted, returns, noise in each
+        _sensor(mounted.sensor)
+        | {"returns": asdict(returns), "noise": asdict(mounted.noise or survey.noise)}
+        for mounted, returns in zip(survey.carried, survey.returns_each, strict=True)
     ]
     return {
         "objects": len(scene.all_names),

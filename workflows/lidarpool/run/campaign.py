@@ -19,7 +19,6 @@ from poolpart import (
     Partition,
     Recorder,
     TaskRecord,
-    WorkerLeft,
     fetch_available,
     look_for_tasks,
 )
@@ -29,14 +28,14 @@ from ..base.software import call_alike
 from ..base.storage import Storage
 from ..columns.cloud import CloudLike
 from ..columns.parts import StoredCloud
-from ..export.dataset import DataSet
+from ..export.dataset import DataSet, Listing
 from ..export.jobs import JobRow, Tally, Value
 from ..export.sweeps import Sweeps
 from ..export.table import check_whole
 from ..pipeline import EXPORT, INTERSECT, LIDAR, Crew, JobError, SurveyDriver
 from ..pipeline.failures import raise_if_failed, was_killed
 from ..pipeline.task_book import StageTotals, TaskBook
-from ..scenario.campaign import Campaign, Described
+from ..scenario.campaign import Campaign, Described, hashes
 from ..scenario.scenario import KeptScenes
 from .campaign_store import CampaignStore
 from .checks import slots_needed
@@ -62,6 +61,7 @@ class Entry:
     job: Job
     store: RunStore
     sweeps: Sweeps
+    made_of: Sequence[Sequence[str]]
     driver: SurveyDriver | None = None
     casting: float = 0.0  # seconds of its tasks
 
@@ -147,8 +147,9 @@ class CampaignRun:
     sensors: Mapping[str, str]
 
 
-def failed_row(number: int, name: str, error: object, described: Described | None) -> JobRow:
+def failed_row(number: int, error: object, described: Described | None) -> JobRow:
     """Return the row of a job that has failed."""
+    name = described.name if described else f"{number:04}"
     split = described.split if described else ""
     return JobRow(number, name, split, dict(described.values) if described else {}, str(error))
 
@@ -225,6 +226,7 @@ class _Maker:
         described = None
         try:
             described = self._campaign.describe(number)
+            made_of = hashes(described.scenario.files) if described.scenario else []
             job = described_job(described, self._columns, self._scenes, **self._options)
             sweeps = Sweeps.of(job.survey, job.scene)
         except MemoryError:
@@ -232,12 +234,11 @@ class _Maker:
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
             told = str(error) if isinstance(error, LidarpoolError) else repr(error)
-            name = described.name if described else f"{number:04}"
-            return failed_row(number, name, told, described)
+            return failed_row(number, told, described)
         try:
-            return Entry(described, job, self._store.store_of(described.name, job), sweeps)
+            return Entry(described, job, self._store.store_of(described.name, job), sweeps, made_of)
         except JobError as error:  # any other is of the place, which all jobs need
-            return failed_row(number, described.name, error, described)
+            return failed_row(number, error, described)
 
     def _put(self, found: Entry | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():
@@ -262,7 +263,7 @@ class _Maker:
 
 def write_job(
     dataset: DataSet, probes: tuple[Any, Any], number: int, name: str, cloud: StoredCloud,
-    sweeps: Sweeps,
+    sweeps: Sweeps, made_of: Sequence[Sequence[str]],
 ) -> tuple[dict[str, Any] | None, TaskRecord]:  # fmt: skip
     """Write the files of a job on a LIDAR worker, and count its points.
 
@@ -272,24 +273,25 @@ def write_job(
     (place, *probe), (parts, *other) = probes
     if not place.sees(*probe) or not parts.sees(*other):
         return None, recorder.done()
-    written = _written(dataset, number, name, cloud, sweeps)
+    written = _written(dataset, number, name, cloud, sweeps, made_of)
     return written, recorder.done(int(sweeps.scans[-1]))
 
 
 def _written(
-    dataset: DataSet, number: int, name: str, cloud: CloudLike, sweeps: Sweeps
+    dataset: DataSet, number: int, name: str, cloud: CloudLike, *more: Any
 ) -> dict[str, Any]:
     """Write a job; JobError if that fails, LidarpoolError if it is because of the place."""
+    listing = Listing(dataset.place.url, dataset.place.durable)
     try:
         tally = Tally.of(cloud)
-        dataset.write_job(number, name, cloud, sweeps)
-    except WorkerLeft:
-        raise
+        dataset.write_job(number, name, cloud, *more, listing=listing)
     except Exception as error:
         why = error if isinstance(error, OSError) else error.__cause__
         if isinstance(why, OSError):  # a full disk fails all jobs
             told = f"{error}" if isinstance(error, LidarpoolError) else f"job {name}: {error}"
             raise LidarpoolError(told) from error
+        with suppress(OSError):
+            listing.undo()
         raise JobError(str(error) if isinstance(error, LidarpoolError) else repr(error)) from error
     return {"points": tally.points, "sha256": tally.sha256, "classes": tally.classes}
 
@@ -376,14 +378,14 @@ class _Writer:
         number, name = entry.described.number, entry.name
         future: Future = self.partition.submit(
             call_alike, self.sources, write_job, self.dataset, self.probes, number, name,
-            entry.store.points(), entry.sweeps, priority=5,
+            entry.store.points(), entry.sweeps, entry.made_of, priority=5,
         )  # fmt: skip
         return future
 
     def _write_here(self, entry: Entry) -> None:
         number, name = entry.described.number, entry.name
-        points = entry.store.points()
-        written = self._thread.submit(_written, self.dataset, number, name, points, entry.sweeps)
+        what = (entry.store.points(), entry.sweeps, entry.made_of)
+        written = self._thread.submit(_written, self.dataset, number, name, *what)
         self.here[written] = entry
 
     def close(self) -> None:
@@ -456,7 +458,7 @@ class CampaignDriver(Surveys):
         for_all: LidarpoolError | None = None
         for entry, made in self._writer.step(slots) if len(self._writer) else ():
             if isinstance(made, JobError):
-                self._fail(entry, made, written=True)
+                self._fail(entry, made)
             elif isinstance(made, LidarpoolError):
                 self._writer.add(entry)  # it is not lost
                 for_all = made
@@ -552,25 +554,22 @@ class CampaignDriver(Surveys):
         self._commit(row)
         self._drop(entry, row)
 
-    def _fail(self, entry: Entry, error: LidarpoolError, *, written: bool = False) -> None:
-        """Commit that a job has failed; some of its files may have been written."""
+    def _fail(self, entry: Entry, error: LidarpoolError) -> None:
+        """Commit that a job has failed."""
         described = entry.described
-        self._commit(failed_row(described.number, described.name, error, described))
-        self._drop(entry, written=written)
+        self._commit(failed_row(described.number, error, described))
+        self._drop(entry)
 
     def _commit(self, row: JobRow) -> None:
         self._store.end(row)
         self._page.ended(row)
 
-    def _drop(self, entry: Entry, row: JobRow | None = None, *, written: bool = False) -> None:
+    def _drop(self, entry: Entry, row: JobRow | None = None) -> None:
         def drop() -> None:
             try:
                 if row is not None:
                     self._page.look(row, entry.store)
             finally:
-                if written:
-                    with suppress(LidarpoolError):
-                        self._writer.dataset.remove_job(entry.described.number, entry.name)
                 with suppress(LidarpoolError, OSError):  # what is left does no harm
                     entry.store.remove()
 
@@ -650,7 +649,7 @@ def run_campaign(
                 break
             except JobError as error:  # it is too large for the workers; others may not be
                 described = first.described
-                row = failed_row(described.number, described.name, error, described)
+                row = failed_row(described.number, error, described)
                 store.end(row)
                 page.ended(row)
                 maker.take()  # that one

@@ -7,6 +7,7 @@ from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 from ..base.errors import LidarpoolError
 from ..base.software import software
@@ -56,9 +57,17 @@ class CampaignStore(KeptRun):
         """Numbers of the jobs that have not ended."""
         return [number for number in range(self.count) if number not in self.db.jobs]
 
-    def forget_failed(self) -> None:
-        """Let the jobs that have failed be done again."""
-        self.db.forget_failed_jobs()
+    def forget(self, numbers: Iterable[int]) -> None:
+        """Let some jobs be done again."""
+        self.db.forget_jobs(numbers)
+        self.resumed = len(self.db.jobs)
+
+    def take_over(self, made: Mapping[str, Any], rows: Iterable[JobRow]) -> None:
+        """Begin with the jobs of a finished data set, whose record is given."""
+        kept = {name: json.dumps(made[name]) for name in ("casting", "sensors")}
+        self.db.set(backend=made["backend"], **kept)
+        self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
+        self._go_on(self.identity, True, {})
         self.resumed = len(self.db.jobs)
 
     def rows(self) -> Iterator[JobRow]:
@@ -69,7 +78,7 @@ class CampaignStore(KeptRun):
 
     def end(self, row: JobRow) -> None:
         """Commit that a job has ended."""
-        self.db.end_job(row.number, asdict(row), failed=bool(row.error))
+        self.db.end_jobs([(row.number, bool(row.error), asdict(row))])
 
     @property
     def sensors(self) -> dict[str, str]:
@@ -115,14 +124,6 @@ class CampaignStore(KeptRun):
     def folder_of(self, store: RunStore) -> str:
         """Folder of a job's parts in the storage of the campaign."""
         return f"{parts_folder(store.db.meta['mark'])}/"
-
-    def tidy_jobs(self) -> None:
-        """Remove what a killed run has left of jobs that have ended."""
-        if remains := self.remains():
-            ended = {row.name for row in self.rows()}
-            for name in ended.intersection(remains):
-                with suppress(LidarpoolError):  # it does no harm
-                    remove_run(self._place_of(name))
 
     def remains(self) -> list[str]:
         """Names of the jobs of which there is something."""

@@ -204,7 +204,7 @@ class KeptRun:
         for what, parts in lost.items():
             if parts:
                 self.db.drop(parts)
-                names, scans = _listed([p.name for p in parts]), _listed([*map(_span, parts)])
+                names, scans = listed([p.name for p in parts]), listed([*map(_span, parts)])
                 verb = "was" if len(parts) == 1 else "were"
                 self.notes.append(
                     f"cast again: {scans}; {names} {verb} {what} in {self.storage.url}"
@@ -489,7 +489,7 @@ def _span(part: Receipt) -> str:
     return f"scan {last}" if part.first == last else f"scans {part.first} to {last}"
 
 
-def _listed(names: Sequence[str]) -> str:
+def listed(names: Sequence[str]) -> str:
     """Return the first names, and how many more there are."""
     more = len(names) - NAMED
     return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")

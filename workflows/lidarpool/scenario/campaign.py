@@ -8,7 +8,7 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any, Protocol
@@ -18,7 +18,7 @@ from pydantic import Field, ValidationError
 
 from ..base.arguments import checked, checked_fields, shown
 from ..base.declared import Seed, declared
-from ..base.errors import LidarpoolError, Mistakes, explained, prefixed
+from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
 from ..base.words import counted
 from ..base.yamlfile import read_yaml
@@ -35,7 +35,6 @@ _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")
 SHOWN_MOST = 5  # files of a command that are named
 _NOISE = "noise.seed"  # where a job's own seed goes
-_DIGITS_LEAST = 4  # of a job's name, so that a campaign may grow
 _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # or one mapping {…}
 _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
 
@@ -96,6 +95,8 @@ class Described:
 class _Jobs(Protocol):
     """Where the jobs of a campaign come from."""
 
+    files: set[Path]  # that they may be made of
+
     @property
     def names(self) -> tuple[str, ...]: ...
     @property
@@ -147,6 +148,7 @@ class Campaign:
     title: str
     command: str = ""  # what follows ``lidarpool run``; empty for a function
     description: str = ""  # the file's text, where there is one
+    files: set[Path]  # that its jobs may be made of; some may be missing
 
     @checked
     def __init__(
@@ -167,7 +169,7 @@ class Campaign:
         assert head.count is not None, "known by now"
         self.count, self.seed, self.license = head.count, head.seed, head.license
         self.title, self.splits = head.title, dict(head.splits)
-        self.keep = Keep(**declared(head.keep, Keep))
+        self.keep, self.files = Keep(**declared(head.keep, Keep)), jobs.files
         self._jobs, self._split = jobs, Splits(head.splits, head.seed)
 
     @classmethod
@@ -250,17 +252,25 @@ class Campaign:
             )
         number = int(number)  # of NumPy, perhaps
         found = self._jobs.job(number)
-        name = found.name or f"{number:0{max(_DIGITS_LEAST, len(str(self.count - 1)))}d}"
+        name = found.name or f"{number:04}"  # however many there are
         return replace(found, name=name, split=self._split(number))
+
+    def check_files(self) -> None:
+        """Check that all files are there that jobs may be made of, or raise LidarpoolError."""
+        mistakes = Mistakes()
+        for path in self.files:
+            if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
+                mistakes.lines.append(f"{self.command}: {str(path)!r} does not exist.")
+        mistakes.tell()
 
     @cached_property
     def identity(self) -> dict[str, str]:
         """Hashes of what the data set depends on: {name: SHA-256, hexadecimal}.
 
-        Campaigns of the same content have the same, wherever their files are. Files that mesh
-        files refer to (images, buffers) are not read for it.
+        Campaigns of the same content have the same, wherever their files are and however many jobs
+        they have. Files are no part of it but tables of rows: others are of the jobs that use them.
         """
-        shared = {"seed": self.seed, "count": self.count, "keep": self.keep}
+        shared = {"seed": self.seed, "keep": self.keep}
         own = {name: fingerprint(value) for name, value in shared.items()}
         return own | {"splits": fingerprint(dict(self.splits))} | self._jobs.identity
 
@@ -302,6 +312,7 @@ class _Made:
 
     def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
         self._make, self._count, self._seed = make, count, seed
+        self.files = set[Path]()
 
     choices: Mapping[str, str] = MappingProxyType({})
 
@@ -365,7 +376,7 @@ class _Given:
             raise LidarpoolError("a campaign needs a scenario at least: name one or more files.")
         self.paths, self.count = paths, len(paths)
         mistakes = Mistakes()
-        self._files: list[list[Path]] = []
+        self.files = set[Path]()
         self._prints: list[str] = []
         for path in paths:
             with mistakes.noted():
@@ -374,14 +385,13 @@ class _Given:
                     raise LidarpoolError(told)
                 read = Scenario.load(path)
                 self._prints.append(_print(read))
-                self._files.append(_existing(read, str(path)))
+                self.files.update(read.files)
         mistakes.tell()
         self._names = _unique([path.stem for path in paths])
 
     @property
     def identity(self) -> dict[str, str]:
-        files = [path for each in self._files for path in each]
-        return {"scenarios": fingerprint(self._prints), "files": _contents(files)}
+        return {"scenarios": fingerprint(self._prints)}
 
     def job(self, number: int) -> Described:
         return Described(
@@ -423,6 +433,7 @@ class _Varied:
         for one in self._bases:
             one.check(self._source, mistakes)
         mistakes.tell()
+        self.files = {path for base in self._bases for path in base.files}
         self._strides: dict[str, int] = {}  # {path with each: jobs until its value changes}
         grid = len(self._bases)
         for text, choice in section.vary.items():
@@ -449,11 +460,10 @@ class _Varied:
 
     @property
     def identity(self) -> dict[str, str]:
-        files = sorted({path for base in self._bases for path in base.files})
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
-            "files": _contents(files),
+            "tables": fingerprint(repr([base.tables for base in self._bases])),
         }
 
     def job(self, number: int) -> Described:
@@ -508,7 +518,6 @@ class _Base:
                 if (key := (table, repr(kind))) not in tables:
                     tables[key] = read_rows(table, kind)
                 self.tables[text] = tables[key]
-                self.files.add(table)
                 if (most := choice.sample.count[1]) > (there := len(tables[key])):
                     has = counted(there, "row")
                     raise LidarpoolError(f"count is up to {most:,}, and {table} has {has}.")
@@ -535,7 +544,7 @@ class _Base:
                     )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
-        """Note values that are not valid, and files that are missing.
+        """Note values that are not valid, and find out which files jobs may be made of.
 
         The first values of all paths are tried together, then the second, and so on; only if
         something is wrong, each alone, to find out which.
@@ -552,7 +561,7 @@ class _Base:
             except LidarpoolError as error:
                 together = error
                 break
-            self._take_files(found, source, mistakes)
+            self.files.update(found.files)
         if together is None:
             return
         wrong = [
@@ -580,10 +589,6 @@ class _Base:
                 given = f"{text} can be {shown(value)}"
                 lines.append(f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}")
         return lines
-
-    def _take_files(self, scenario: Scenario, source: str, mistakes: Mistakes) -> None:
-        with mistakes.noted():
-            self.files.update(_existing(scenario, source, self.files))
 
     def scenario_of(
         self,
@@ -631,21 +636,21 @@ def _print(scenario: Scenario) -> str:
     return fingerprint(scenario.model_dump(exclude={"pool"}))
 
 
-def _existing(scenario: Scenario, source: str, known: Iterable[Path] = ()) -> list[Path]:
-    """Files that a scenario names; LidarpoolError if one is missing."""
-    known = known if isinstance(known, set) else set(known)
-    files = [path for path in scenario.files if path not in known]
-    # os.path also takes names that no file can have.
-    if missing := [path for path in files if not os.path.exists(path)]:  # noqa: PTH110
-        more = f", nor do {len(missing) - 1:,} more" if missing[1:] else ""
-        raise LidarpoolError(f"{source}: {str(missing[0])!r} does not exist{more}.")
-    return files
+def hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
+    """Name and SHA-256 of files that can be read, in order: the same wherever they are.
+
+    Files that mesh files refer to (images, buffers) are not read.
+    """
+    found = set()
+    for path in files:
+        with suppress(OSError, ValueError):  # which the reader of the file tells
+            state = path.stat()
+            found.add((path.name, _hash(path, state.st_mtime_ns, state.st_size)))
+    return sorted(found)
 
 
-def _contents(files: Iterable[Path]) -> str:
-    """Fingerprint of the content of files, wherever they are."""
-    digests = []
-    for path in sorted(set(files), key=lambda path: path.name):
-        with explained(f"{path} cannot be read"), path.open("rb") as file:
-            digests.append((path.name, hashlib.file_digest(file, "sha256").hexdigest()))
-    return fingerprint(sorted(digests))
+@cache
+def _hash(path: Path, *_: int) -> str:
+    """SHA-256 of a file, which is read once for each of its states."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

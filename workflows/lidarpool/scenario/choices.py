@@ -16,10 +16,10 @@ from pydantic import BeforeValidator, Field, Strict, model_validator
 
 from ..base.arguments import checked_fields
 from ..base.arguments import shown as given
-from ..base.declared import Seed, Text, TextOrTexts, is_text, short
+from ..base.declared import Seed, Text, TextOrTexts, is_text, short, told
 from ..export.table import FORMATS, LAYOUTS
 from .draws import SHARE_LEAST, SIGMAS, Draw
-from .sections import Section, told
+from .sections import Section
 
 COUNT_MOST = 10_000_000
 KEPT = ("kitti", "nuscenes", "mcap", "parquet", "images", "folder")
@@ -87,10 +87,10 @@ class Sample(Section):
 
     file: Annotated[
         Text,
-        Field(
-            alias="from",
-            description="a .csv with a header of fields of an entry (name, box, "
+        told(
+            "a .csv with a header of fields of an entry (name, box, "
             "trajectory.points); from the base's folder",
+            alias="from",
         ),
     ]
     count: Annotated[
@@ -259,11 +259,11 @@ class Keep:
 
     format: Annotated[
         Literal[KEPT],  # type: ignore[valid-type]
-        Field(description="kitti, nuscenes, mcap, parquet, images; folder: a cloud for each job"),
+        told("kitti, nuscenes, mcap, parquet, images; folder: a cloud for each job"),
     ] = "kitti"
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        Field(description="layout of points in mcap"),
+        told("layout of points in mcap"),
     ] = "velodyne"
 
     @property

@@ -10,22 +10,19 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Strict, model_validator
 
-from ..base.declared import Text, TextOrTexts, Triple, is_text, short
+from ..base.declared import Text, TextOrTexts, Triple, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
-from ..sensor import Mounted, Pose, Track, load_trajectory
+from ..sensor import Sensor, Track, load_trajectory
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
 from .sections import (
     MeshEntry,
-    NoiseSection,
     PoseSection,
-    ReturnsSection,
     Section,
     SensorSection,
     ShapeSection,
-    told,
 )
 from .standing import Standing, following
 
@@ -58,18 +55,9 @@ class CarriedSection(SensorSection):
         told("its time steps (scans), instead of the survey's", 120),
     ] = None
 
-    def mounted(
-        self,
-        folder: Path,
-        mount: Pose,
-        noise: NoiseSection,
-        returns: ReturnsSection,
-        name: str = "",
-    ) -> Mounted:
-        """Return it on its carrier; LidarpoolError if its files cannot be used."""
-        carried = super().mounted(folder, mount, noise, returns, name)
-        sensor = replace(carried.sensor, start_ns=self.start_s * 1e9)
-        return replace(carried, sensor=sensor, steps=self.steps)
+    def sensor(self, folder: Path) -> Sensor:
+        """Make the sensor, which starts at its own time; errors as of `SensorSection`."""
+        return replace(super().sensor(folder), start_ns=self.start_s * 1e9)
 
 
 class TimedPose(PoseSection):

@@ -16,7 +16,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import PrivateAttr, Strict, ValidationError
 
-from ..base.declared import Text, declared
+from ..base.declared import Text, declared, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
@@ -59,7 +59,6 @@ from .sections import (
     WeatherSection,
     may_be_empty,
     scene_in_short,
-    told,
 )
 from .standing import Standing
 from .traffic import TrafficSection, VehicleSection, actors_of, read_fcd
@@ -789,7 +788,10 @@ class Scenario(Section):
         common = self.noise, self.returns
         if self.sensors:
             return [
-                section.mounted(self._folder, self._mount(section.mount), *common, name)
+                replace(
+                    section.mounted(self._folder, self._mount(section.mount), *common, name),
+                    steps=section.steps,
+                )
                 for name, section in self.sensors.items()
             ]
         mount = MountSection() if self.mount is None else self.mount

@@ -20,6 +20,7 @@ from ..base.declared import (
     declared,
     is_text,
     short,
+    told,
 )
 from ..base.vocabulary import BACKENDS, UNITS_M
 from ..export.table import EXPORTS, FORMATS, LAYOUTS
@@ -48,11 +49,6 @@ Scale = Annotated[
 ]
 Length = Annotated[float, Field(gt=0, le=1e4)]
 Lengths = Annotated[tuple[Length, Length, Length], Strict(False)]
-
-
-def told(description: str, *examples: Any, **limits: Any) -> Any:
-    """Describe a field; one whose default is computed has examples."""
-    return Field(description=description, examples=[*examples] or None, **limits)
 
 
 def _check_rectangle(name: str, sides: tuple[float, float, float, float] | None) -> None:
@@ -232,7 +228,7 @@ class ShapeSection(Section):
     ] = None
     semantic_class: Annotated[
         SemanticClass | None,
-        Field(alias="class", description="class of its points; by default that of its material"),
+        told("class of its points; by default that of its material", alias="class"),
     ] = None
 
     @model_validator(mode="after")

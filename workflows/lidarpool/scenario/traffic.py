@@ -15,9 +15,8 @@ from xml.parsers import expat
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
-from ..base.declared import Text, TextOrTexts, Triple
+from ..base.declared import Text, TextOrTexts, Triple, told
 from ..base.errors import LidarpoolError
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
@@ -26,7 +25,7 @@ from ..sensor import Track
 from ..sensor.calibrations import said
 from ..sensor.trajectory import quaternions_of, rotations_of
 from ..sensor.trajectory_files import Seconds
-from .sections import Section, ShapeSection, told
+from .sections import Section, ShapeSection
 from .standing import Standing, following
 
 ACTORS_MOST = 10_000
@@ -55,7 +54,7 @@ class TrafficSection(Section):
     file: Annotated[Text, told("what sumo --fcd-output writes, .xml or .xml.gz")]
     vehicles: Annotated[
         tuple[VehicleSection, ...],
-        Field(strict=False, description="shapes of vehicles and persons, by type", min_length=1),
+        told("shapes of vehicles and persons, by type", strict=False, min_length=1),
     ]
     offset_s: Annotated[Seconds, told("added to all times")] = 0.0
     translation: Annotated[Triple, told("added to all positions, metres")] = (0, 0, 0)

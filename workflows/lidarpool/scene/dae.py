@@ -239,25 +239,17 @@ class _Document:
 
 
 class _Effects:
-    """Diffuse colours of effects, each read once."""
+    """Diffuse colours of effects, whose images are read once."""
 
     def __init__(self, path: Path, wanted: Wanted, allowance: Allowance) -> None:
         self.notes = MaskNotes()
         self._path, self._wanted, self._allowance = path, wanted, allowance
         self._texture = remembered(self._read_texture)
-        self._made: dict[Element, Texture | Colour | None] = {}
 
     def shade(
         self, effect: Element, ids: dict[tuple[str, str], Element]
     ) -> Texture | Colour | None:
         """Image or colour, (1, 1, 3), of an effect; None if it has none."""
-        if effect not in self._made:
-            self._made[effect] = self._read(effect, ids)
-        return self._made[effect]
-
-    def _read(
-        self, effect: Element, ids: dict[tuple[str, str], Element]
-    ) -> Texture | Colour | None:
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
             return None

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from ..base.arguments import as_array, checked, checked_fields
+from ..base.declared import told
 from ..base.errors import LidarpoolError
 
 CHANNELS_MOST = 65_535  # the type of the column
@@ -106,9 +107,7 @@ class Head(Protocol):
         """Azimuth of the head at firings, radians: (k,)."""
 
 
-Step = Annotated[
-    float, Field(gt=0, le=360, description="degrees that the head turns in one time step")
-]
+Step = Annotated[float, told("degrees that the head turns in one time step", gt=0, le=360)]
 Rate = Annotated[float, Field(gt=0, le=1e6)]
 Motion = Literal["sine", "triangle", "sawtooth"]
 Width = Annotated[float, Field(gt=0, le=360)]

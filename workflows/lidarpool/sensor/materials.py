@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from ..base.arguments import checked_fields, shown
-from ..base.declared import Share, TextOrTexts, written_as
+from ..base.declared import Share, TextOrTexts, told, written_as
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .leaves import LeafAngle
@@ -81,72 +81,67 @@ class Material:
     objects: Annotated[
         str | Sequence[str],
         written_as(TextOrTexts),
-        Field(min_length=1, description="names of objects, with * and ?"),
+        told("names of objects, with * and ?", min_length=1),
     ]
     reflectance: Annotated[
         Share | Literal["texture"] | None,
         BeforeValidator(_share_or_texture),
-        Field(
-            description="share of light that is scattered; by default 0.5, for glass and mirrors "
-            "0; texture: the luminance of the colour that was hit",
+        told(
+            "share of light that is scattered; by default 0.5, for glass and mirrors "
+            "0; texture: the luminance of the colour that was hit"
         ),
     ] = None
-    semantic_class: Annotated[
-        SemanticClass, Field(alias="class", description="value of the column class")
-    ] = 0
+    semantic_class: Annotated[SemanticClass, told("value of the column class", alias="class")] = 0
     retro: Annotated[
-        bool, Field(description="whether light returns in its own direction, as from traffic signs")
+        bool, told("whether light returns in its own direction, as from traffic signs")
     ] = False
     transparent: Annotated[
         Transparent,
-        Field(description="the rest of the light passes through (pass), or is reflected (mirror)"),
+        told("the rest of the light passes through (pass), or is reflected (mirror)"),
     ] = "none"
     scale: Annotated[
         float,
-        Field(gt=0, le=100, description="with reflectance: texture, a factor of the luminance"),
+        told("with reflectance: texture, a factor of the luminance", gt=0, le=100),
     ] = 1.0
     material: Annotated[
         str | None,
-        Field(
-            description="instead of reflectance: a material of the table of reflectances",
-            examples=["asphalt, dry"],
-        ),
+        told("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
     ] = None
     roughness: Annotated[
         float | None,
-        Field(ge=0.1, le=1, description="adds a gloss, as of paint or metal; by default none"),
+        told("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1),
     ] = None
     metalness: Annotated[
-        Share, Field(description="with roughness: 1 for metals, which scatter by their gloss alone")
+        Share, told("with roughness: 1 for metals, which scatter by their gloss alone")
     ] = 0.0
     refractive_index: Annotated[
         float | None,
-        Field(
+        told(
+            "with transparent: pass, light is refracted and slower within the closed "
+            "surface, as 1.33 for water; by default it goes straight on",
+            1.33,
             ge=1,
             le=4,
-            description="with transparent: pass, light is refracted and slower within the closed "
-            "surface, as 1.33 for water; by default it goes straight on",
-            examples=[1.33],
         ),
     ] = None
     attenuation_per_m: Annotated[
         float,
-        Field(ge=0, le=1e6, description="with refractive_index, extinction within the surface"),
+        told("with refractive_index, extinction within the surface", ge=0, le=1e6),
     ] = 0.0
     leaf_area_density: Annotated[
         float | None,
-        Field(
+        told(
+            "the closed surface is full of leaves: their one-sided area, m²/m³; "
+            "reflectance is theirs",
+            0.8,
             gt=0,
             le=1e4,
-            description="the closed surface is full of leaves: their one-sided area, m²/m³; "
-            "reflectance is theirs",
-            examples=[0.8],
         ),
     ] = None
     leaf_angle: Annotated[
         LeafAngle,
-        Field(
-            description="with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
+        told(
+            "with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
             "planophile, erectophile, plagiophile, extremophile, uniform, or Campbell's ratio "
             "of axes"
         ),

@@ -26,14 +26,10 @@ from pydantic import Field, Strict
 from ..base.arguments import checked_fields
 from ..base.declared import Seed, written_as
 from ..base.errors import LidarpoolError
-from .noise import normal
+from .noise import Purpose, named_seed, normal
 from .trajectory import CENTRE, Pose, Trajectory, velocities
 
 BLOCK = 1 << 14  # samples that are made at a time
-
-# Purposes of random numbers: of gyroscopes, accelerometers and the position, in each the white
-# noise, the Gauss-Markov process and the random walk.
-_GYROSCOPE, _ACCELEROMETER, _POSITION = (41, 42, 43), (44, 45, 46), (47, 48, 49)
 
 Real = NDArray[np.float64]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
@@ -184,6 +180,10 @@ class Moving(Protocol):
         """Instruments."""
 
     @property
+    def carrier(self) -> str:
+        """Name of the carrier."""
+
+    @property
     def path(self) -> Trajectory:
         """Trajectory of the carrier, of one station."""
 
@@ -230,11 +230,10 @@ def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
     navigation, path = survey.navigation, survey.path
     if navigation is None or navigation.imu is None:
         return
-    imu, seed = navigation.imu, navigation.seed
+    imu, seed = navigation.imu, named_seed(navigation.seed, survey.carrier)
     step_s, three = 1 / imu.rate_hz, np.ones(3)
     gyroscope = _Errors(
-        seed,
-        _GYROSCOPE,
+        named_seed(seed, "gyroscope"),
         step_s,
         three * imu.gyroscope_noise_density * math.sqrt(imu.rate_hz),
         three * imu.gyroscope_bias,
@@ -242,8 +241,7 @@ def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
         three * imu.gyroscope_random_walk,
     )
     accelerometer = _Errors(
-        seed,
-        _ACCELEROMETER,
+        named_seed(seed, "accelerometer"),
         step_s,
         three * imu.accelerometer_noise_density * math.sqrt(imu.rate_hz),
         three * imu.accelerometer_bias,
@@ -274,8 +272,7 @@ def fixes(survey: Moving, block: int = BLOCK) -> Iterator[Fixes]:
         return
     gnss = navigation.gnss
     errors = _Errors(
-        navigation.seed,
-        _POSITION,
+        named_seed(named_seed(navigation.seed, survey.carrier), "gnss"),
         1 / gnss.rate_hz,
         np.array([gnss.horizontal_m, gnss.horizontal_m, gnss.vertical_m]),
         np.array([gnss.drift_horizontal_m, gnss.drift_horizontal_m, gnss.drift_vertical_m]),
@@ -323,14 +320,13 @@ class _Errors:
     def __init__(
         self,
         seed: int,
-        purposes: tuple[int, int, int],
         step_s: float,
         white: Real,  # (3,): standard deviation of a sample
         bias: Real,  # (3,): standard deviation of the Gauss-Markov process
         bias_time_s: float,
         walk: Real,  # (3,): of the random walk in a second
     ) -> None:
-        self._seed, self._purposes = seed, purposes
+        self._seed = seed
         self._white, self._bias, self._walk = white, bias, walk * math.sqrt(step_s)
         # To single precision, in which an exponential is the same on every machine.
         self._kept = float(np.float32(math.exp(-step_s / bias_time_s)))
@@ -340,12 +336,11 @@ class _Errors:
 
     def of(self, samples: NDArray[np.int64]) -> Real:
         """Return the errors of the next samples (k,): (k, 3)."""
-        white, driven, steps = self._purposes
         out = np.zeros((len(samples), 3))
         if self._white.any():
-            out += self._white * self._normal(white, samples)
+            out += self._white * self._normal(Purpose.WHITE, samples)
         if self._bias.any():
-            noise = self._normal(driven, samples)
+            noise = self._normal(Purpose.DRIVEN, samples)
             noise[samples > 0] *= self._driven
             noise[samples == 0] *= self._bias  # a bias that has been there for long
             kept = self._kept
@@ -358,14 +353,14 @@ class _Errors:
                 out[:, axis] += (values := np.array(list(made))[1:])
                 self._biases[axis] = values[-1]
         if self._walk.any():
-            noise = self._walk * self._normal(steps, samples)
+            noise = self._walk * self._normal(Purpose.WALK, samples)
             noise[0] += self._walked
             walked = np.cumsum(noise, axis=0)
             self._walked = walked[-1]
             out += walked
         return out
 
-    def _normal(self, purpose: int, samples: NDArray[np.int64]) -> Real:
+    def _normal(self, purpose: Purpose, samples: NDArray[np.int64]) -> Real:
         """Make normal deviates for samples (k,) along each axis: (k, 3)."""
         high, low = np.divmod(samples, 1 << 32)
         return np.stack([normal(self._seed, purpose, high, low, axis) for axis in range(3)], axis=1)

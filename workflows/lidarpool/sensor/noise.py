@@ -1,22 +1,23 @@
 """Noise of ranges and angles, lost returns and false ones; their random numbers.
 
-A random number is a hash of (seed, purpose, scan, ray, number): the same on every worker and in
-every batch, whatever the order of drawing.
+A random number is a hash of (seed, name, purpose, scan, ray, number): the same on every worker and
+in every batch, whatever the order of drawing.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from enum import Enum, unique
 from functools import cache
+from hashlib import sha256
 from statistics import NormalDist
 from typing import Annotated, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import Field
 
 from ..base.arguments import checked_fields
-from ..base.declared import Seed, Share
+from ..base.declared import Seed, Share, told
 from ..base.errors import LidarpoolError
 from .materials import at_right_angles
 
@@ -25,15 +26,45 @@ THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
 
-_RANGE, _ACROSS, _UP, _DETECTION, _LOSS = range(1, 6)  # purposes of random numbers
-_VELOCITY = 40
-_ALARM, _PEAK, _STRAY, _OTHER = range(20, 24)
-
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
 
 Whole = NDArray[np.integer[Any]]
 Real = NDArray[np.float64]
+
+
+@unique
+class Purpose(Enum):
+    """What random numbers are for, and its number in the hash: each one has numbers of its own.
+
+    What is there several times, such as kinds of particles or instruments, has seeds of its own
+    instead: see `named_seed`.
+    """
+
+    RANGE = 1  # noise of a return's range
+    ACROSS = 2  # noise of a beam's direction
+    UP = 3
+    DETECTION = 4  # noise of a return's energy
+    LOSS = 5  # whether a return is lost
+    FOG_CELL = 10  # which cell of fog has the highest peak
+    FOG_PLACE = 11  # where the peak is in its cell
+    PARTICLES = 12  # how many drops or flakes a beam meets
+    PARTICLE_RANGE = 13
+    PARTICLE_DIAMETER = 14
+    PARTICLE_SUBRAY = 15  # which it is in
+    ALARM = 20  # time until the next false alarm
+    PEAK = 21  # energy of a false alarm
+    STRAY = 22  # noise of stray light's energy
+    OTHER = 23  # noise of the energy of another sensor's pulse
+    LEAF = 30  # depth of leaves that light gets through
+    WHICH = 31  # which of the crowns that overlap the leaf is of
+    VELOCITY = 40  # noise of a return's radial velocity
+    WHITE = 41  # white noise of an instrument
+    DRIVEN = 42  # steps of its bias
+    WALK = 43  # steps of its random walk
+    SAMPLES = 50  # stream of the samples of a waveform
+    SAMPLE = 51  # noise of a sample
+    CHOICE = 1000  # points of a cloud that are compared
 
 
 @dataclass(frozen=True)
@@ -54,93 +85,80 @@ class Noise:
 
     range_m: Annotated[
         float,
-        Field(ge=0, le=1000, description="standard deviation of ranges, metres", examples=[0.02]),
+        told("standard deviation of ranges, metres", 0.02, ge=0, le=1000),
     ] = 0.0
     range_per_m: Annotated[
         float,
-        Field(
-            ge=0,
-            le=1,
-            description="standard deviation added for each metre of range",
-            examples=[0.0002],
-        ),
+        told("standard deviation added for each metre of range", 0.0002, ge=0, le=1),
     ] = 0.0
     angle_deg: Annotated[
         float,
-        Field(
-            ge=0,
-            le=10,
-            description="standard deviation of beam directions, in both axes",
-            examples=[0.05],
-        ),
+        told("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10),
     ] = 0.0
-    dropout: Annotated[
-        Share, Field(description="share of returns that are lost, whatever their energy")
-    ] = 0.0
+    dropout: Annotated[Share, told("share of returns that are lost, whatever their energy")] = 0.0
     detection_range_m: Annotated[
         float | None,
-        Field(
+        told(
+            "range at which a surface of 10 % reflectance returns half the pulses; "
+            "weaker returns are lost",
+            100.0,
             ge=0.001,
             le=1e8,
-            description="range at which a surface of 10 % reflectance returns half the pulses; "
-            "weaker returns are lost",
-            examples=[100.0],
         ),
     ] = None
-    seed: Annotated[Seed, Field(description="the same seed gives the same noise")] = 0
+    seed: Annotated[Seed, told("the same seed gives the same noise")] = 0
     overlap_m: Annotated[
         float,
-        Field(
+        told(
+            "from here on the receiver sees the whole beam; nearer, rain, snow, fog "
+            "and dust do not return more",
             ge=0,
             le=1000,
-            description="from here on the receiver sees the whole beam; nearer, rain, snow, fog "
-            "and dust do not return more",
         ),
     ] = 10.0
     range_at_threshold_m: Annotated[
         float,
-        Field(
+        told(
+            "standard deviation of the range of a return at the threshold of "
+            "detection, metres; falls as its energy grows, added in squares",
+            0.05,
             ge=0,
             le=1000,
-            description="standard deviation of the range of a return at the threshold of "
-            "detection, metres; falls as its energy grows, added in squares",
-            examples=[0.05],
         ),
     ] = 0.0
     walk_m: Annotated[
         float,
-        Field(
+        told(
+            "range walk: a return 1.65 times as strong as the threshold of detection "
+            "appears so much nearer, one 10,000 times as strong 4.3 times as much",
+            0.02,
             ge=0,
             le=10,
-            description="range walk: a return 1.65 times as strong as the threshold of detection "
-            "appears so much nearer, one 10,000 times as strong 4.3 times as much",
-            examples=[0.02],
         ),
     ] = 0.0
     false_alarm_hz: Annotated[
         float,
-        Field(
+        told(
+            "rate of false alarms, dark counts and sun, while the receiver waits for returns",
+            200.0,
             ge=0,
             le=1e9,
-            description="rate of false alarms, dark counts and sun, while the receiver waits for "
-            "returns",
-            examples=[200.0],
         ),
     ] = 0.0
     stray_light: Annotated[
         Share,
-        Field(
-            description="blooming of retro-reflectors: share of their light that a beam 1 degree "
+        told(
+            "blooming of retro-reflectors: share of their light that a beam 1 degree "
             "beside them receives; falls with the square of the angle",
-            examples=[1e-6],
+            1e-6,
         ),
     ] = 0.0
 
     crosstalk: Annotated[
-        bool, Field(description="whether it receives pulses of the other sensors of the survey")
+        bool, told("whether it receives pulses of the other sensors of the survey")
     ] = False
     velocity_m_s: Annotated[
-        float, Field(ge=0, le=1000, description="standard deviation of radial velocities, m/s")
+        float, told("standard deviation of radial velocities, m/s", ge=0, le=1000)
     ] = 0.0
 
     def __post_init__(self) -> None:
@@ -175,6 +193,10 @@ class Noise:
         """Whether ranges deviate."""
         return any((self.range_m, self.range_per_m, self.range_at_threshold_m, self.walk_m))
 
+    def named(self, name: str) -> Noise:
+        """Return the noise of a sensor, whose name is part of all its random numbers."""
+        return replace(self, seed=named_seed(self.seed, name))
+
     def ranges(
         self, distance: Real, energy: Real | None, scan: Whole, ray: Whole, number: Whole
     ) -> Real:
@@ -188,11 +210,11 @@ class Noise:
             sigma = np.sqrt(sigma * sigma + weak * weak)
         if self.walk_m and energy is not None:
             distance = distance - self.walk(energy)
-        return np.maximum(distance + sigma * normal(self.seed, _RANGE, scan, ray, number), 0)
+        return np.maximum(distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number), 0)
 
     def velocities(self, velocity: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
         """Return the reported radial velocities of returns (n,), m/s."""
-        return velocity + self.velocity_m_s * normal(self.seed, _VELOCITY, scan, ray, number)
+        return velocity + self.velocity_m_s * normal(self.seed, Purpose.VELOCITY, scan, ray, number)
 
     def walk(self, energy: Real) -> Real:
         """By how much returns (n,) appear nearer than one at the threshold, metres.
@@ -221,11 +243,11 @@ class Noise:
         number = 0
         while len(rows) or not found:
             # The time until the next one is exponentially distributed.
-            left = uniform(self.seed, _ALARM, scan[rows], ray[rows], number)
+            left = uniform(self.seed, Purpose.ALARM, scan[rows], ray[rows], number)
             some = np.flatnonzero(left > np.exp(-self.false_alarm_hz * (gate_s - since)))
             rows, since, left = rows[some], since[some], left[some]
             since = np.minimum(since - np.log(left) / self.false_alarm_hz, gate_s)
-            share = 1 - uniform(self.seed, _PEAK, scan[rows], ray[rows], number)
+            share = 1 - uniform(self.seed, Purpose.PEAK, scan[rows], ray[rows], number)
             peak = np.sqrt(1 - 2 / THRESHOLD_SIGMAS**2 * np.log(share))
             found.append((rows, since, self.threshold * peak))
             number += 1
@@ -236,8 +258,8 @@ class Noise:
         """Deviations of beams, across and up: (n,) and (n,), radians."""
         sigma = np.radians(self.angle_deg)
         return (
-            sigma * normal(self.seed, _ACROSS, scan, ray),
-            sigma * normal(self.seed, _UP, scan, ray),
+            sigma * normal(self.seed, Purpose.ACROSS, scan, ray),
+            sigma * normal(self.seed, Purpose.UP, scan, ray),
         )
 
     def detected(self, energy: Real, scan: Whole, ray: Whole, number: Whole) -> NDArray[np.bool_]:
@@ -247,25 +269,15 @@ class Noise:
         to the threshold half of the returns are detected, at 1.4 times as much 97.7 %, and at a
         fifth of it 3 in 100,000.
         """
-        seen = uniform(self.seed, _LOSS, scan, ray, number) >= self.dropout
+        seen = uniform(self.seed, Purpose.LOSS, scan, ray, number) >= self.dropout
         if self.detection_range_m is not None:
-            seen &= self._passes(_DETECTION, energy, scan, ray, number)
+            seen &= self.passes(Purpose.DETECTION, energy, scan, ray, number)
         return seen
 
-    def detected_stray(self, energy: Real, scan: Whole, ray: Whole) -> NDArray[np.bool_]:
-        """Whether stray light (n,) of retro-reflectors is detected, see `detected`."""
-        return self._passes(_STRAY, energy, scan, ray, np.zeros(len(ray), np.int64))
-
-    def detected_other(
-        self, energy: Real, scan: Whole, ray: Whole, number: Whole
+    def passes(
+        self, purpose: Purpose, energy: Real, scan: Whole, ray: Whole, number: ArrayLike = 0
     ) -> NDArray[np.bool_]:
-        """Whether pulses (n,) of other sensors are detected, see `detected`."""
-        return self._passes(_OTHER, energy, scan, ray, number)
-
-    def _passes(
-        self, purpose: int, energy: Real, scan: Whole, ray: Whole, number: Whole
-    ) -> NDArray[np.bool_]:
-        """Whether signals with their noise pass the threshold."""
+        """Whether signals (n,) with their noise pass the threshold, see `detected`."""
         above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
         return np.asarray(above + normal(self.seed, purpose, scan, ray, number) > 0)
 
@@ -279,16 +291,23 @@ def _mixed(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
     return x
 
 
+def named_seed(seed: int, name: str) -> int:
+    """Return the seed of what has a name: the same on every machine; without a name `seed`."""
+    if not name:
+        return seed
+    return int.from_bytes(sha256(f"{seed}\n{name}".encode()).digest()[:8], "little") >> 1
+
+
 def raw(
-    seed: int, purpose: int, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
+    seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> NDArray[np.uint64]:
     """64 random bits for each ray: uint64 (n,).
 
-    Seed and purpose are below 2**63. The others are (n,) or one for all: the ray within its scan,
+    The seed is below 2**63. The others are (n,) or one for all: the ray within its scan,
     below 2**32, and the number, below 256.
     """
     start = np.array([int(seed) * _GAMMA % 2**64], np.uint64)
-    start = _mixed(_mixed(start) + np.uint64(purpose * _GAMMA % 2**64))
+    start = _mixed(_mixed(start) + np.uint64(purpose.value * _GAMMA % 2**64))
     # A stream of SplitMix64 for each scan, of which a ray has 256 numbers.
     begins = _mixed(start + np.asarray(scan).astype(np.uint64) * np.uint64(_GAMMA))
     steps = np.asarray(ray).astype(np.uint64) * np.uint64(_NUMBERS)
@@ -297,7 +316,7 @@ def raw(
 
 
 def uniform(
-    seed: int, purpose: int, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
+    seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> NDArray[np.float64]:
     """Numbers uniform in [0, 1), multiples of 2**-53: (n,); arguments as of `raw`."""
     bits = raw(seed, purpose, scan, ray, number) >> np.uint64(11)
@@ -305,7 +324,7 @@ def uniform(
 
 
 def normal(
-    seed: int, purpose: int, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
+    seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> NDArray[np.float64]:
     """Numbers of mean 0 and variance 1, normally distributed: (n,); arguments as of `raw`.
 

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from ..base.arguments import checked_fields, shown
+from ..base.declared import told
 from ..base.errors import LidarpoolError
 from .disc import SUBRAYS, Beam, Profile
 
@@ -49,22 +50,20 @@ class Optics:
     """Light and resolution of a sensor."""
 
     wavelength_nm: Annotated[
-        float, Field(ge=200, le=20_000, description="of the laser; 905 if no source states it")
+        float, told("of the laser; 905 if no source states it", ge=200, le=20_000)
     ] = 905.0
     divergence_mrad: Annotated[
         Divergence | None,
-        Field(description="full angle of the beam, or two, across and up; None if unknown"),
+        told("full angle of the beam, or two, across and up; None if unknown"),
     ] = None
-    pulse_ns: Annotated[Pulse, Field(description="length of a pulse")] = 5.0
+    pulse_ns: Annotated[Pulse, told("length of a pulse")] = 5.0
     resolution_m: Annotated[
-        Precision, Field(description="of reported ranges: default step for rounding positions")
+        Precision, told("of reported ranges: default step for rounding positions")
     ] = 0.01
     beam_profile: Annotated[
-        Profile, Field(description="how light is spread over the beam, where it has sub-rays")
+        Profile, told("how light is spread over the beam, where it has sub-rays")
     ] = "even"
-    exit_diameter_m: Annotated[
-        Diameter, Field(description="width of the beam where it leaves the sensor")
-    ] = 0.0
+    exit_diameter_m: Annotated[Diameter, told("width of the beam where it leaves the sensor")] = 0.0
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, Sequence):
@@ -86,65 +85,49 @@ class Returns:
 
     mode: Annotated[
         Mode,
-        Field(
-            description="returns reported for a pulse; dual: strongest and last",
-            examples=["dual"],
-        ),
+        told("returns reported for a pulse; dual: strongest and last", "dual"),
     ] = "strongest"
     subrays: Annotated[
         Literal[SUBRAYS],  # type: ignore[valid-type]
-        Field(
-            description="rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance",
-            examples=[1],
-        ),
+        told("rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance", 1),
     ] = 1
     divergence_mrad: Annotated[
         Divergence | None,
-        Field(
-            description="full angle of the beam, or two, across and up; by default the sensor's",
-            examples=[3.0],
-        ),
+        told("full angle of the beam, or two, across and up; by default the sensor's", 3.0),
     ] = None
     pulse_ns: Annotated[
         Pulse | None,
-        Field(
-            description="length of the pulse, in waveforms at half of its maximum: surfaces less "
+        told(
+            "length of the pulse, in waveforms at half of its maximum: surfaces less "
             "than half of it apart are one return; by default the sensor's, or 5",
-            examples=[5.0],
+            5.0,
         ),
     ] = None
     beam_profile: Annotated[
         Profile | None,
-        Field(
-            description="how light is spread over the beam; by default the sensor's, or even",
-            examples=["gaussian"],
-        ),
+        told("how light is spread over the beam; by default the sensor's, or even", "gaussian"),
     ] = None
     exit_diameter_m: Annotated[
         Diameter | None,
-        Field(
-            description="width of the beam where it leaves the sensor; by default the sensor's, "
-            "or 0",
-            examples=[0.01],
-        ),
+        told("width of the beam where it leaves the sensor; by default the sensor's, or 0", 0.01),
     ] = None
     waveform: Annotated[
         Processing,
-        Field(
-            description="how returns are found in the waveform: peaks, or gaussian decomposition; "
+        told(
+            "how returns are found in the waveform: peaks, or gaussian decomposition; "
             "none: hits within half of the pulse are one return"
         ),
     ] = "none"
     sample_ns: Annotated[
-        float, Field(ge=0.001, le=1000, description="time between two samples of the waveform")
+        float, told("time between two samples of the waveform", ge=0.001, le=1000)
     ] = 1.0
     bandwidth_mhz: Annotated[
         float | None,
-        Field(
+        told(
+            "of the receiver of waveforms, at -3 dB; by default without limit",
+            300.0,
             ge=0.1,
             le=1e6,
-            description="of the receiver of waveforms, at -3 dB; by default without limit",
-            examples=[300.0],
         ),
     ] = None
 

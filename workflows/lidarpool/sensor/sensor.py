@@ -12,17 +12,14 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from ..base.arguments import checked, checked_fields
+from ..base.declared import told
 from ..base.errors import LidarpoolError
 from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
 from .optics import LIGHT_M_NS, Optics
 
-RaysPerRevolution = Annotated[
-    int, Field(ge=1, le=10_000_000, description="for a grid: azimuths in one turn")
-]
-Layers = Annotated[int, Field(ge=1, le=CHANNELS_MOST, description="for a grid: elevations (rings)")]
-Fov = Annotated[
-    float, Field(gt=0, le=180, description="for a grid: degrees, half of it below the horizon")
-]
+RaysPerRevolution = Annotated[int, told("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
+Layers = Annotated[int, told("for a grid: elevations (rings)", ge=1, le=CHANNELS_MOST)]
+Fov = Annotated[float, told("for a grid: degrees, half of it below the horizon", gt=0, le=180)]
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
 

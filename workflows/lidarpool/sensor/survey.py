@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
 from ..base.arguments import checked_fields, shown
-from ..base.declared import FILLED_IN, written_as
+from ..base.declared import FILLED_IN, told, written_as
 from ..base.errors import LidarpoolError
 from ..columns.table import (
     COORDINATES,
@@ -61,7 +61,7 @@ class Mounted:
     mount
         Its pose in the carrier's axes.
     name
-        Its name, needed if there are several.
+        Its name, needed if there are several; part of all its random numbers.
     steps
         Time steps from each station; by default those of the survey.
     returns, noise
@@ -94,6 +94,8 @@ class ScanSpec:
         Number of its sensor.
     channels
         Of that.
+    ahead
+        By how many scans its random numbers are ahead of its number.
     """
 
     scan: int
@@ -102,6 +104,7 @@ class ScanSpec:
     start_ns: int = 0
     sensor: int = 0
     channels: int = 1
+    ahead: int = 0
 
     @property
     def ray_count(self) -> int:
@@ -119,62 +122,58 @@ class CloudOptions:
     keep_every: Annotated[
         int,
         FILLED_IN,
-        Field(
+        told(
+            "keep every n-th hit of a scan; by default every hit, of a scene with the "
+            "default objects every 5th",
+            5,
             ge=1,
             le=1_000_000,
-            description="keep every n-th hit of a scan; by default every hit, of a scene with the "
-            "default objects every 5th",
-            examples=[5],
         ),
     ] = None  # type: ignore[assignment]
     precision_m: Annotated[
         Precision,
         FILLED_IN,
-        Field(
-            description="step in metres that points are rounded to; by default the sensor's, "
-            "or 0.01",
-            examples=[0.01],
-        ),
+        told("step in metres that points are rounded to; by default the sensor's, or 0.01", 0.01),
     ] = None  # type: ignore[assignment]
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
-        Field(description="world; or sensor: its axes when it fired, as sensor drivers have them"),
+        told("world; or sensor: its axes when it fired, as sensor drivers have them"),
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
         written_as(Annotated[tuple[Literal[OPTIONAL_NAMES], ...], Strict(False)]),
-        Field(
-            description="columns in addition to x, y, z, scan, channel and object: "
+        told(
+            "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
-            examples=[["time", "range", "intensity"]],
+            ["time", "range", "intensity"],
         ),
     ] = ()
     waveform_samples: Annotated[
         int,
-        Field(
+        told(
+            "samples of the waveform that are recorded around each return, for LAS and "
+            "LAZ; 0 for none",
+            80,
             ge=0,
             le=4096,
-            description="samples of the waveform that are recorded around each return, for LAS and "
-            "LAZ; 0 for none",
-            examples=[80],
         ),
     ] = 0
     epsg: Annotated[
         int | None,
-        Field(
+        told(
+            "EPSG code of the world's coordinate system, for LAS and LAZ, that rasters "
+            "are brought to; by default theirs",
+            25832,
             ge=1024,
             le=32767,
-            description="EPSG code of the world's coordinate system, for LAS and LAZ, that rasters "
-            "are brought to; by default theirs",
-            examples=[25832],
         ),
     ] = None
     start: Annotated[
         datetime | None,
         written_as(Annotated[AwareDatetime, Strict(False)] | None),
-        Field(
-            description="when the survey starts, with its time zone, for LAS, LAZ and bags",
-            examples=["2026-11-21T10:00:00Z"],
+        told(
+            "when the survey starts, with its time zone, for LAS, LAZ and bags",
+            "2026-11-21T10:00:00Z",
         ),
     ] = None
 
@@ -379,6 +378,11 @@ class Survey(CloudOptions, Weather):
         """The sensors, also if there is only one."""
         return tuple(self.sensors) or (Mounted(self.sensor),)
 
+    @property
+    def carrier(self) -> str:
+        """Name of the carrier, for the seeds of its instruments: that of its first sensor."""
+        return self.carried[0].name
+
     @cached_property
     def returns_each(self) -> tuple[Returns, ...]:
         """What each sensor reports of its pulses."""
@@ -386,8 +390,8 @@ class Survey(CloudOptions, Weather):
 
     @cached_property
     def noise_each(self) -> tuple[Noise, ...]:
-        """Noise of each sensor."""
-        return tuple(carried.noise or self.noise for carried in self.carried)
+        """Noise of each sensor, whose seed its name is part of."""
+        return tuple((carried.noise or self.noise).named(carried.name) for carried in self.carried)
 
     @cached_property
     def stored_columns(self) -> tuple[Column, ...]:

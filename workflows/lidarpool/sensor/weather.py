@@ -13,8 +13,8 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
 
+from ..base.declared import told
 from .materials import REFERENCE_M, extinction
 
 # Index of refraction of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
@@ -47,33 +47,30 @@ class Weather:
 
     visibility_km: Annotated[
         float | None,
-        Field(
+        told(
+            "meteorological visibility, of fog and haze alone; by default without extinction",
+            10.0,
             ge=0.001,
             le=1e6,
-            description="meteorological visibility, of fog and haze alone; by default without "
-            "extinction",
-            examples=[10.0],
         ),
     ] = None
     fog_lidar_ratio_sr: Annotated[
         float | None,
-        Field(
+        told(
+            "extinction over back-scatter of what limits visibility_km, for returns "
+            "from it: 65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
+            65.0,
             ge=1,
             le=1000,
-            description="extinction over back-scatter of what limits visibility_km, for returns "
-            "from it: 65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
-            examples=[65.0],
         ),
     ] = None
-    rain_mm_h: Annotated[
-        float, Field(ge=0, le=300, description="rain; drops return light, and take some")
-    ] = 0.0
+    rain_mm_h: Annotated[float, told("rain; drops return light, and take some", ge=0, le=300)] = 0.0
     snow_mm_h: Annotated[
         float,
-        Field(ge=0, le=50, description="dry snow, melted; flakes return light, and take some"),
+        told("dry snow, melted; flakes return light, and take some", ge=0, le=50),
     ] = 0.0
     dust_mg_m3: Annotated[
-        float, Field(ge=0, le=1e5, description="mineral dust; it returns light, and takes some")
+        float, told("mineral dust; it returns light, and takes some", ge=0, le=1e5)
     ] = 0.0
 
     @property
@@ -209,11 +206,6 @@ class Air(NamedTuple):
         share = energy / (particles.reflectance * self.white(distance))
         wide = 1000 * self.width(distance) * np.sqrt(share)
         return np.where(share <= 1, wide, np.inf)
-
-    def returned(self, particles: Particles, diameter_mm: Real, distance: Real) -> Real:
-        """Energies returned by particles: at most as by one that fills the beam."""
-        share = np.minimum(diameter_mm / (1000 * self.width(distance)), 1) ** 2
-        return np.asarray(particles.reflectance * self.white(distance) * share)
 
     def rate(self, particles: Particles, energy: float, distance: Real) -> Real:
         """Particles in the beam that return at least an energy, in each metre: 1/m."""

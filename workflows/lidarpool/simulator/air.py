@@ -16,20 +16,16 @@ from numpy.typing import NDArray
 
 from ..scene.colours import GREY, packed
 from ..sensor import Survey
-from ..sensor.noise import THRESHOLD_SIGMAS, raw, uniform
+from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, raw, uniform
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, numbers
+from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, joined, numbers
 from .surfaces import Surfaces
 
 QUANTILES = 1 << 16
 TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
 CELLS_MOST = 255  # pulse lengths of fog
 TAIL_SIGMAS = 6.0
-# Purposes of random numbers.
-_FOG_CELL, _FOG_PLACE = 10, 11
-_COUNT, _RANGE, _DIAMETER, _PLACE = 12, 13, 14, 15  # of the first kind of particles, then 4 more
-_PURPOSES = 4
 
 
 class _Seen(NamedTuple):
@@ -72,6 +68,8 @@ class AirCaster:
         air, least = survey.air(number), FAINTEST * noise.threshold
         begins, ends = reach_of(sensor.min_range_m, sensor.max_range_m)
         self._seen = [_seen(air, kind, least, begins, ends) for kind in survey.particles]
+        names = [f"kind {kind}" if kind else "" for kind in range(len(self._seen))]
+        self._seeds = [named_seed(noise.seed, name) for name in names]
         scatters = survey.scatters(self._wavelength_nm)
         self._fog = _fog(air, scatters, noise.threshold, begins, ends, self._gap_m)
 
@@ -85,8 +83,8 @@ class AirCaster:
         scan, ray = keys.of(np.arange(*rays))
         reach = self._reach(hits, len(ray) * each)
         parts = [
-            self._met(seen, _PURPOSES * which, scan, ray, reach, each)
-            for which, seen in enumerate(self._seen)
+            self._met(seen, seed, scan, ray, reach, each)
+            for seen, seed in zip(self._seen, self._seeds, strict=True)
             if seen is not None
         ]
         if self._fog is not None:
@@ -146,21 +144,21 @@ class AirCaster:
         return reach
 
     def _met(
-        self, seen: _Seen, first: int, scan: Whole, ray: Whole, reach: Real, each: int
+        self, seen: _Seen, seed: int, scan: Whole, ray: Whole, reach: Real, each: int
     ) -> tuple[Whole, Real, Real]:
         """Sub-rays, distances and energies of particles of a kind."""
-        chance = uniform(self._seed, _COUNT + first, scan, ray)
+        chance = uniform(seed, Purpose.PARTICLES, scan, ray)
         some = np.flatnonzero(chance >= seen.counts[0])
         beam = np.repeat(some, np.searchsorted(seen.counts, chance[some], side="right"))
         key = scan[beam], ray[beam], numbers(beam)
-        place = (raw(self._seed, _RANGE + first, *key) >> np.uint64(48)).astype(np.intp)
+        place = (raw(seed, Purpose.PARTICLE_RANGE, *key) >> np.uint64(48)).astype(np.intp)
         distance = seen.distance[place]
         sub = beam * each
         if each > 1:
-            sub += (raw(self._seed, _PLACE + first, *key) % np.uint64(each)).astype(np.int64)
+            sub += (raw(seed, Purpose.PARTICLE_SUBRAY, *key) % np.uint64(each)).astype(np.int64)
         before = np.flatnonzero(distance < reach[sub])
         place, key = place[before], (key[0][before], key[1][before], key[2][before])
-        rank = uniform(self._seed, _DIAMETER + first, *key) * seen.larger[place]
+        rank = uniform(seed, Purpose.PARTICLE_DIAMETER, *key) * seen.larger[place]
         longer = seen.step * _exponential()[(rank * QUANTILES).astype(np.intp)]
         diameter = seen.smallest[place] + longer
         energy = np.minimum(seen.energy[place] * diameter * diameter, seen.most[place])
@@ -175,9 +173,9 @@ class AirCaster:
         free = np.clip(free, 0, cells).astype(np.int64)
         some = np.flatnonzero(free)
         free, scan, ray = free[some], scan[some], ray[some]
-        chance = free + uniform(self._seed, _FOG_CELL, scan, ray)
+        chance = free + uniform(self._seed, Purpose.FOG_CELL, scan, ray)
         cell = np.searchsorted(fog.peaks, chance, side="right") - free * cells
-        place = uniform(self._seed, _FOG_PLACE, scan, ray)
+        place = uniform(self._seed, Purpose.FOG_PLACE, scan, ray)
         return some * each, fog.begins + (cell + place) * fog.cell, each * fog.energy[cell]
 
 
@@ -185,39 +183,22 @@ def _inserted(
     hits: Hits, planes: Planes, ray: Whole, distance: Real, energy: Real
 ) -> tuple[Hits, Planes]:
     """Insert hits in the air before the others of their rays."""
-    count = len(hits.ray) + len(ray)
-    new = np.searchsorted(hits.ray, ray) + np.arange(len(ray))
-    old = np.ones(count, np.bool_)
-    old[new] = False
-
-    def both(before: NDArray, added: NDArray) -> NDArray:  # type: ignore[type-arg]
-        out = np.empty(count, before.dtype)
-        out[old], out[new] = before, added
-        return out
-
-    grey = packed(GREY[0])[0]
-    triangle = np.full(len(ray), NO_SURFACE, np.int32)
-    causes = np.zeros(len(hits.ray), np.uint8) if hits.cause is None else hits.cause
-    merged = Hits(
-        both(hits.ray, ray),
-        both(hits.distance, distance),
-        both(hits.triangle, triangle),
-        both(hits.energy, energy),
-        None if hits.colour is None else both(hits.colour, np.full(len(ray), grey)),
-        both(causes, np.full(len(ray), AIR, np.uint8)),
-        # Those of the air are filled in by `Paths.with_velocities`.
-        None if hits.velocity is None else both(hits.velocity, np.full(len(ray), np.nan)),
-    )
-    row = np.cumsum(old) - 1
+    count = len(ray)
+    triangle, cause = np.full(count, NO_SURFACE, np.int32), np.full(count, AIR, np.uint8)
+    colour = None if hits.colour is None else np.full(count, packed(GREY[0])[0])
+    # Their velocities are filled in by `Paths.with_velocities`.
+    air = Hits(ray, distance, triangle, energy, colour, cause)
+    order = np.argsort(np.concatenate([ray, hits.ray]), kind="stable")
+    row = order - count  # of the others
 
     def seen(rows: NDArray[np.intp]) -> tuple[Real, Real]:
         normals, directions = np.zeros((2, len(rows), 3))
-        solid = old[rows]
+        solid = row[rows] >= 0
         if solid.any():
             normals[solid], directions[solid] = planes(row[rows[solid]])
         return normals, directions
 
-    return merged, seen
+    return joined([air, hits]).take(order), seen
 
 
 @lru_cache(TABLES_KEPT)

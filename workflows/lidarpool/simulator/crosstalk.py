@@ -20,7 +20,6 @@ from .world import World
 
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
-SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
 SLACK_NS = 10.0  # by which the time of a pulse at the receiver may be off before it is computed
 
 
@@ -86,7 +85,8 @@ class Crosstalk:
             seen &= (distance >= sensor.min_range_m) & (distance <= sensor.max_range_m)
             some = np.flatnonzero(seen & (far > 0))
             when = fired[row[some]] + spec.start_ns
-            some = some[self._free(origins[row[some]], towards[some], far[some], when, poses)]
+            given = origins[row[some]], towards[some], far[some], when, poses.ways
+            some = some[self._world.free(*given)]
             energy = self._energy(spots, spot[some], towards[some], far[some])
             found.append((row[some], distance[some], energy))
         if not found:
@@ -162,17 +162,6 @@ class Crosstalk:
             found.triangle,
             distance,
         )
-
-    def _free(
-        self, origins: Real, towards: Real, far: Real, times: Real, poses: Poses
-    ) -> NDArray[np.bool_]:
-        """Whether nothing stands before points (n, 3), seen from origins."""
-        free = np.ones(len(far), np.bool_)
-        if len(far):
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), poses.ways))
-            found = self._world.scan(Pattern(towards / far[:, None], origins), now)
-            free[found.ray] = found.distance > far[found.ray] * (1 - SHORT)
-        return free
 
     def _energy(self, spots: _Spots, spot: NDArray[np.intp], towards: Real, far: Real) -> Real:
         """Energies that are received of spots: (n,), as of a sensor's own pulses."""

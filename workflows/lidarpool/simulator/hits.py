@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -17,6 +17,11 @@ SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING = range(len(CAUSES))
 Whole = NDArray[np.int64]
 Rays = NDArray[np.integer[Any]]
 Real = NDArray[np.float64]
+
+
+def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
+    """Yield some rows of each column; None for one that is not there."""
+    return (None if column is None else column[rows] for column in columns)
 
 
 class Hits(NamedTuple):
@@ -38,13 +43,7 @@ class Hits(NamedTuple):
 
     def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
         """Select some of them."""
-        colour = None if self.colour is None else self.colour[rows]
-        cause = None if self.cause is None else self.cause[rows]
-        velocity = None if self.velocity is None else self.velocity[rows]
-        width = None if self.width is None else self.width[rows]
-        waveform = None if self.waveform is None else self.waveform[rows]
-        own = self.ray[rows], self.distance[rows], self.triangle[rows], self.energy[rows]
-        return Hits(*own, colour, cause, velocity, width, waveform)
+        return Hits(*selected(self, rows))
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their

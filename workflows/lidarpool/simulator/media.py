@@ -8,7 +8,7 @@ are met after an exponentially distributed optical depth (Ross 1981).
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -21,21 +21,21 @@ from ..scene.scene import Scene
 from ..sensor import Trajectory
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
+from ..sensor.noise import Purpose
 from ..sensor.optics import any_axes
-from .hits import Real, Whole
+from .hits import Real, Whole, selected
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces
 from .world import World
 
 DEPTH = 8  # media around a place that are known at most
 PROBES_MOST = 256  # surfaces that a search for media around a place passes
-LEAF, WHICH = 30, 31  # purposes of random numbers: see `Leaves`
 UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of that search; along no edge of what people model
 
 Bools = NDArray[np.bool_]
 Numbers = NDArray[np.int32]
 # Random bits of rays for a purpose: (n,).
-Draw = Callable[[int, Whole], NDArray[np.uint64]]
+Draw = Callable[[Purpose, Whole], NDArray[np.uint64]]
 
 
 class Rays(NamedTuple):
@@ -59,13 +59,9 @@ class Around:
         """Make them for light in the air."""
         return cls(*(np.full((count, DEPTH), -1, np.int32) for _ in range(2)))
 
-    def take(self, rows: NDArray[np.integer[Any]]) -> Around:
+    def __getitem__(self, rows: NDArray[np.integer[Any]]) -> Around:
         """Select those of some sub-rays."""
         return Around(self.objects[rows], self.triangles[rows])
-
-    def restore(self, rows: NDArray[np.intp], before: Around) -> None:
-        """Undo what happened to some."""
-        self.objects[rows], self.triangles[rows] = before.objects[rows], before.triangles[rows]
 
     def enter(self, rows: NDArray[np.intp], objects: Numbers, triangles: Numbers) -> None:
         """Enter a medium each."""
@@ -110,9 +106,9 @@ class Bundle:
         none = np.zeros(len(ways))
         return cls(index.copy(), index, none, np.zeros_like(ways), ways)
 
-    def take(self, rows: NDArray[np.integer[Any]]) -> Bundle:
+    def __getitem__(self, rows: NDArray[np.integer[Any]]) -> Bundle:
         """Select those of some sub-rays."""
-        return Bundle(*(getattr(self, field.name)[rows] for field in fields(self)))
+        return Bundle(*selected(vars(self).values(), rows))
 
     def go(self, step: Real, attenuation: Real) -> None:
         """Go straight on so many metres (n,), where so much is lost, 1/m (n,)."""
@@ -260,7 +256,7 @@ class Media:
 
     def behind(self, around: Around, objects: Numbers, triangles: Numbers, along: Real) -> Around:
         """Media behind surfaces (n,), which light meets at the cosines `along`."""
-        behind = around.take(np.arange(len(objects)))
+        behind = around[np.arange(len(objects))]
         enters, filled = self.sides(objects, along), self.filled[objects]
         comes, goes = np.flatnonzero(filled & enters), np.flatnonzero(filled & ~enters)
         behind.enter(comes, objects[comes], triangles[comes])
@@ -302,14 +298,9 @@ class Within:
     bundle: Bundle | None  # None if nothing refracts
     left: Real | None  # (n,): optical depth until a leaf; None if there are none
 
-    def take(self, rows: NDArray[np.integer[Any]]) -> Within:
+    def __getitem__(self, rows: NDArray[np.integer[Any]]) -> Within:
         """Select that of some sub-rays."""
-        return Within(
-            self.media,
-            self.around.take(rows),
-            None if self.bundle is None else self.bundle.take(rows),
-            None if self.left is None else self.left[rows],
-        )
+        return Within(self.media, *selected((self.around, self.bundle, self.left), rows))
 
     @property
     def index(self) -> Real | float:
@@ -348,7 +339,7 @@ class Within:
             metres = np.where(np.isnan(ends[rows]), metres, ends[rows])
         self.left = self.left - depth
         # Where crowns overlap, a leaf is of one of them in proportion to its density.
-        share = (draw(WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
+        share = (draw(Purpose.WHICH, ray[rows]) >> np.uint64(11)).astype(np.float64) * 2.0**-53
         place = (sums[rows] <= (share * total[rows])[:, None]).sum(axis=1)
         cosines = self.media.bright(self.around.objects[rows, place], upright[rows])
         return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
@@ -406,7 +397,8 @@ class Within:
             return directions, 1.0, np.zeros(len(objects), np.bool_)
         ratio = self.media.index(self.around) / self.bundle.index
         ahead, passes, whole = refracted(directions, normals, along, ratio)
-        self.around.restore(np.flatnonzero(whole), before)
+        self.around.objects[whole] = before.objects[whole]
+        self.around.triangles[whole] = before.triangles[whole]
         return ahead, passes, whole
 
     def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools) -> None:

@@ -13,10 +13,10 @@ from raybeam import Pattern
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.noise import raw
+from ..sensor.noise import Purpose, raw
 from .doppler import BLOCK_HITS, approach
-from .hits import AIR, Hits, Keys, Planes, Real, Whole, joined
-from .media import LEAF, Media, Rays, Within, depths
+from .hits import AIR, Hits, Keys, Planes, Real, Whole, joined, selected
+from .media import Media, Rays, Within, depths
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
 from .world import World
@@ -43,17 +43,7 @@ class _Light:
 
     def on(self, rows: NDArray[np.integer[Any]]) -> _Light:
         """Select that of some sub-rays."""
-        return _Light(
-            self.ray[rows],
-            self.times[rows],
-            self.origins[rows],
-            self.directions[rows],
-            self.share[rows],
-            self.before[rows],
-            None if self.turns is None else self.turns[rows],
-            None if self.within is None else self.within.take(rows),
-            None if self.growth is None else self.growth[rows],
-        )
+        return _Light(*selected(vars(self).values(), rows))
 
 
 class Paths:
@@ -117,7 +107,7 @@ class Paths:
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
         )
 
-        def draw(purpose: int, ray: Whole) -> NDArray[np.uint64]:
+        def draw(purpose: Purpose, ray: Whole) -> NDArray[np.uint64]:
             scan, number = keys.of(first + ray // each)
             return raw(self._seed, purpose, scan, number, ray % each)
 
@@ -126,7 +116,7 @@ class Paths:
         if materials.mirrors.any() or (media is not None and media.bends):
             light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
         if media is not None:
-            left = depths(draw(LEAF, ray)) if leafy else None
+            left = depths(draw(Purpose.LEAF, ray)) if leafy else None
             rays = Rays(origins, directions, light.times, poses.ways)
             light.within = media.within(self._world, rays, left)
         step, triangle = found.distance, found.triangle

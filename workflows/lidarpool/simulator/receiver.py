@@ -15,6 +15,7 @@ from raybeam import Pattern
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
 from ..sensor import Survey
+from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS, any_axes
 from .crosstalk import Crosstalk
 from .hits import (
@@ -29,7 +30,7 @@ from .hits import (
     joined,
     numbers,
 )
-from .motion import Clock, Poses, into_axes, products
+from .motion import Poses, into_axes, products
 from .paths import Paths
 from .surfaces import Surfaces
 from .world import World
@@ -40,7 +41,6 @@ CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looke
 STRAY_MOST = np.radians(30.0)  # no stray light comes from farther aside
 FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
 INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
-SHORT = 1e-3  # of the distance: a ray that ends so much before a triangle has reached it
 
 
 def unreal(ray: Whole, distance: Real, energy: Real, cause: int, *, coloured: bool = False) -> Hits:
@@ -128,7 +128,8 @@ class Receiver:
                 row, distance, energy = self._others.received(keys.scan, rays, *own)
                 order = np.lexsort((distance, row))
                 row, distance, energy = row[order], distance[order], energy[order]
-                seen = self._noise.detected_other(energy, *keys.of(rays[row]), numbers(row))
+                key = *keys.of(rays[row]), numbers(row)
+                seen = self._noise.passes(Purpose.OTHER, energy, *key)
                 add(rays[row[seen]], distance[seen], energy[seen], CROSSTALK)
         if sum(len(part.ray) for part in parts) == len(returns.ray):
             return returns
@@ -164,12 +165,12 @@ class Receiver:
             more = energy > best[near]
             best[near[more]], ends[near[more]] = energy[more], towards[more]
         row = np.flatnonzero(best > FAINTEST * self._noise.threshold)
-        row = row[self._noise.detected_stray(best[row], *keys.of(rays[row]))]
+        row = row[self._noise.passes(Purpose.STRAY, best[row], *keys.of(rays[row]))]
         distance = np.sqrt(products(ends[row].T, ends[row].T))
         low, high = self._sensor.min_range_m, self._sensor.max_range_m
         within = (distance >= low) & (distance <= high)
         row, distance = row[within], distance[within]
-        seen = self._seen(origins[row], ends[row], distance, times[row], poses)
+        seen = self._world.free(origins[row], ends[row], distance, times[row], poses.ways)
         seen &= ~self._beside(returns, rays[row], distance)
         row = row[seen]
         return row, distance[seen], best[row]
@@ -230,18 +231,6 @@ class Receiver:
             more = energy > best[some]
             best[some[more]], ends[some[more]] = energy[more], point[some[more]]
         return best, ends
-
-    def _seen(
-        self, origins: Real, towards: Real, distance: Real, times: Real, poses: Poses
-    ) -> NDArray[np.bool_]:
-        """Whether nothing stands before points (n, 3) that are seen from origins."""
-        free = np.ones(len(distance), np.bool_)
-        if len(distance):
-            light = Pattern(towards / distance[:, None], origins)
-            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), poses.ways))
-            found = self._world.scan(light, now)
-            free[found.ray] = found.distance > distance[found.ray] * (1 - SHORT)
-        return free
 
     def _beside(self, returns: Hits, ray: Whole, distance: Real) -> NDArray[np.bool_]:
         """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""

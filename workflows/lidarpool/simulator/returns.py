@@ -317,7 +317,8 @@ class BatchReturns:
                 velocity[no_light] = np.nan
         noise = self.survey.noise_each[self.specs[0].sensor]
         if noise.velocity_m_s:
-            velocity = noise.velocities(velocity, self.scan, self.ray, self.return_number)
+            scan = self.scan.astype(np.int64) + self.specs[0].ahead
+            velocity = noise.velocities(velocity, scan, self.ray, self.return_number)
         return velocity
 
     @property

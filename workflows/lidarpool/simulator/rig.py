@@ -193,7 +193,8 @@ class Rig:
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
         echoes = self._echoes[number]
-        found = echoes.scan(specs[0].scan, pattern, subrays, poses, window, groups)
+        scan = specs[0].scan + specs[0].ahead
+        found = echoes.scan(scan, pattern, subrays, poses, window, groups)
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
@@ -234,7 +235,8 @@ class Rig:
             poses = Poses(positions[block], None if rotations is None else rotations[block], rays)
             poses = self._timed(poses, specs, count)
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
-            scan, window = specs[0].scan + begin * len(specs), (0, len(image))
+            scan = specs[0].scan + specs[0].ahead + begin * len(specs)
+            window = (0, len(image))
             echoes = self._echoes[number]
             found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=False)
             nearest = found.number == 1

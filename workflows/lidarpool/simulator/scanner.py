@@ -49,8 +49,9 @@ class Scanner:
     """A sensor in a scene, which scans when it is called: no cluster, no files.
 
     It gives the bytes that a survey gives for the same scans: sweep `number` is the turn (or frame)
-    of that number of a survey along the same trajectory, with the same random numbers. Threads may
-    share it.
+    of that number of a survey along the same trajectory, with the same random numbers. Scanners of
+    equal names and equal seeds of their noise repeat each other's random numbers. Threads may share
+    a scanner.
 
     Parameters
     ----------
@@ -58,6 +59,9 @@ class Scanner:
         What is scanned.
     sensor
         The lidar, or the lidar `Mounted` on a carrier: then poses are the carrier's.
+    name
+        Name of the sensor, which is part of all random numbers: give each sensor of a robot its
+        own. A `Mounted` has a name already.
     columns, precision_m, coordinates, materials, returns, noise, visibility_km, \
     fog_lidar_ratio_sr, rain_mm_h, snow_mm_h, dust_mg_m3
         As of `Survey`.
@@ -89,6 +93,7 @@ class Scanner:
         scene: Scene,
         sensor: Sensor | Mounted,
         *,
+        name: str = "",
         columns: Sequence[str | Column] = (),
         precision_m: float | None = None,
         coordinates: str = "world",
@@ -104,8 +109,13 @@ class Scanner:
         threads: int | None = None,
         device: int | None = None,
     ) -> None:
+        if name and isinstance(sensor, Mounted):
+            raise LidarpoolError(
+                f"name is {name!r}, and a Mounted sensor has a name of its own: give it there, "
+                f"Mounted(sensor, name={name!r})."
+            )
         survey = Survey(
-            sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor)],
+            sensors=[sensor if isinstance(sensor, Mounted) else Mounted(sensor, name=name)],
             poses=[CENTRE],
             steps=1,
             precision_m=precision_m,  # type: ignore[arg-type]  # None for the sensor's
@@ -135,6 +145,7 @@ class Scanner:
             self._movable[scene.face_object] = False
         # Sweeps share the caster, and copies are moved in it.
         self._lock, self._casts, self._moves = threading.Condition(), 0, 0
+        self._unnumbered = 0  # sweeps and images without a number so far
 
     def __repr__(self) -> str:
         rig = self._rig
@@ -150,7 +161,7 @@ class Scanner:
         self,
         pose: Pose | Trajectory | Sequence[float],
         *,
-        number: Number = 0,
+        number: Number | None = None,
         start_s: Start = None,
     ) -> Cloud:
         """Scan once around.
@@ -162,7 +173,8 @@ class Scanner:
             from where it is at its own time. In the scene's local coordinates.
         number
             Number of the turn, or frame, from 0. It chooses the firings, since a head turns on
-            where its last turn has ended, and the random numbers.
+            where its last turn has ended, and the random numbers. Without, the firings and times
+            are those of turn 0, and each call has random numbers of its own.
         start_s
             When the turn begins, seconds since the start of the trajectory, and of those of
             actors. By default when it does in a survey: `number` times the duration of a turn.
@@ -179,7 +191,7 @@ class Scanner:
         """
         path = _path(pose)
         with self._casting() as rig:
-            specs, late_ns = _specs(rig, number, start_s)
+            specs, late_ns = self._specs(rig, number, start_s, 1)
             begin_ns, end_ns = _span_ns(rig, specs)
             if end_ns > path.duration_ns:
                 raise LidarpoolError(
@@ -201,7 +213,7 @@ class Scanner:
 
     @checked
     def ranges(
-        self, poses: Pose | ArrayLike, *, number: Number = 0, start_s: Start = None
+        self, poses: Pose | ArrayLike, *, number: Number | None = None, start_s: Start = None
     ) -> NDArray[np.float32]:
         """Ranges that the sensor measures from many poses at one time, as images.
 
@@ -213,7 +225,8 @@ class Scanner:
             One pose, or a list; positions (k, 3), metres; or matrices (k, 4, 4) from the axes of
             the sensor, or of its carrier, to the scene's. The sensor stands at each.
         number
-            Number of the turn. The image of pose i has the random numbers of turn ``number + i``.
+            Number of the turn; as of `sweep`. The image of pose i has the random numbers of turn
+            ``number + i``.
         start_s
             When the turn begins, for actors; as of `sweep`.
 
@@ -230,7 +243,7 @@ class Scanner:
         """
         positions, rotations = _placed(poses)
         with self._casting() as rig:
-            specs, _ = _specs(rig, number, start_s)
+            specs, _ = self._specs(rig, number, start_s, len(positions))
             if not len(positions):
                 firings = specs[-1].firings[1] - specs[0].firings[0]
                 return np.empty((0, firings, specs[0].channels), np.float32)
@@ -296,6 +309,31 @@ class Scanner:
                 self._moves -= 1
                 self._lock.notify_all()
 
+    def _specs(
+        self, rig: Rig, number: int | None, start_s: float | None, count: int
+    ) -> tuple[list[ScanSpec], float]:
+        """Return the scans of a turn, and how late it is, nanoseconds; of `count` sweeps."""
+        sensor, ahead = rig.survey.sensor, 0
+        steps = sensor.steps_of_turn(number or 0)
+        if steps.stop > SCANS_MOST:
+            raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
+        if number is None:
+            with self._lock:
+                ahead = self._unnumbered * len(steps)
+                self._unnumbered += count
+        late_ns = 0
+        if start_s is not None:
+            late_ns = round(start_s * 1e9 - sensor.turn_ns(number or 0))
+        specs = [
+            ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels, ahead)
+            for step in steps
+        ]
+        begin_ns, end_ns = _span_ns(rig, specs)
+        for actor in rig.scene.actors:
+            if actor.trajectory.moves:
+                actor.check(begin_ns, end_ns)
+        return specs, late_ns
+
     @contextmanager
     def _casting(self) -> Iterator[Rig]:
         """Rig as it is now; meanwhile instances stay where they are."""
@@ -309,23 +347,6 @@ class Scanner:
             with self._lock:
                 self._casts -= 1
                 self._lock.notify_all()
-
-
-def _specs(rig: Rig, number: int, start_s: float | None) -> tuple[list[ScanSpec], float]:
-    """Return the scans of a turn, and how late it is, nanoseconds."""
-    sensor = rig.survey.sensor
-    steps = sensor.steps_of_turn(number)
-    if steps.stop > SCANS_MOST:
-        raise LidarpoolError(f"number is {number}; scans are counted up to {SCANS_MOST:,}.")
-    late_ns = 0
-    if start_s is not None:
-        late_ns = round(start_s * 1e9 - sensor.turn_ns(number))
-    specs = [ScanSpec(step, 0, sensor.firings(step), late_ns, 0, sensor.channels) for step in steps]
-    begin_ns, end_ns = _span_ns(rig, specs)
-    for actor in rig.scene.actors:
-        if actor.trajectory.moves:
-            actor.check(begin_ns, end_ns)
-    return specs, late_ns
 
 
 def _span_ns(rig: Rig, specs: list[ScanSpec]) -> tuple[float, float]:

@@ -55,14 +55,12 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     energy = np.bincount(which, hits.energy).astype(np.float64)
     distance = np.bincount(which, hits.energy * hits.distance) / energy
     strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
-    first = strongest[numbers(which[strongest]) == 0]
-    colour = None if hits.colour is None else hits.colour[first]
-    cause = None if hits.cause is None else hits.cause[first]
+    first = hits.take(strongest[numbers(which[strongest]) == 0])
     velocity = None
     if hits.velocity is not None:
         velocity = np.bincount(which, hits.energy * hits.velocity) / energy
-    own = beam[begins], distance, hits.triangle[first], energy / each
-    return Hits(*own, colour, cause, velocity)
+    energy /= each
+    return first._replace(ray=beam[begins], distance=distance, energy=energy, velocity=velocity)
 
 
 def continued(

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..columns.waveforms import SILENT, ZERO, record
-from ..sensor.noise import normal, raw
+from ..sensor.noise import Purpose, normal, raw
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
 from .hits import Hits, Keys, Planes, Real, Whole, numbers, runs
 from .separation import continued
@@ -38,8 +38,6 @@ MOVES = 2.0  # standard deviations that a fit may move from its first guess
 HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
 BLOCK_HITS = 1 << 15  # whose waveforms are made at a time
 BLOCK_SAMPLES = 1 << 20  # of recorded waveforms that are made at a time
-
-_SAMPLES, _SAMPLE = 50, 51  # purposes of random numbers
 
 
 @dataclass(frozen=True)
@@ -479,9 +477,9 @@ def recorded(
         if noise is not None:
             sigma, seed, keys = noise
             scan, ray = keys.of(beam[block])
-            stream = raw(seed, _SAMPLES, scan, ray)[:, None]
+            stream = raw(seed, Purpose.SAMPLES, scan, ray)[:, None]
             number = begins[block, None] + np.arange(count)
-            samples += sigma * normal(seed, _SAMPLE, stream, number >> 8, number & 255)
+            samples += sigma * normal(seed, Purpose.SAMPLE, stream, number >> 8, number & 255)
         steps, exponents = digitised(samples)
         low_row, high_row = np.searchsorted(window, [start, start + size])
         mine = window[low_row:high_row] - start

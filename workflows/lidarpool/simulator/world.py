@@ -34,12 +34,13 @@ from ..scene.mesh import Mesh as ActorMesh
 from ..scene.scene import Scene
 from ..sensor import Trajectory
 from ..sensor.trajectory import presence_ns
-from .motion import Poses, into_axes, products
+from .motion import Clock, Poses, into_axes, products
 from .surfaces import Surfaces
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
 CELL_RAYS = 1 << 10  # rays in a cell of a still sensor, which are fired at nearly one time
 CELLS = 64  # cells that share one look at an actor's trajectory
+SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
 NEAR_M = 1.0  # rays of a cell start no farther than this from its position
 TURN = 2e-3  # radians: rays of a cell deviate at most so much from the pattern in its pose
 
@@ -154,6 +155,22 @@ class World:
             ray, distance, triangle = ray[kept], distance[kept], triangle[kept]
         none = np.zeros(len(ray), np.int32)
         return ScanReturns(ray.astype(np.uint32), distance, triangle, counts, counted, none)
+
+    def free(
+        self,
+        origins: Float,
+        towards: Float,
+        distance: Float,
+        times: Float,
+        ways: tuple[Trajectory, ...],
+    ) -> NDArray[np.bool_]:
+        """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
+        free = np.ones(len(distance), np.bool_)
+        if len(distance):
+            now = Poses(np.zeros(3), clock=Clock(times, np.zeros(1), ways))
+            found = self.scan(Pattern(towards / distance[:, None], origins), now)
+            free[found.ray] = found.distance > distance[found.ray] * (1 - SHORT)
+        return free
 
     def _with_actors(
         self,

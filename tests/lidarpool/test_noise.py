@@ -1,0 +1,108 @@
+"""Every random number has one use."""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from lidarpool import (
+    Gnss,
+    Imu,
+    Material,
+    Mounted,
+    Navigation,
+    Noise,
+    Pose,
+    Returns,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+)
+from lidarpool.scene.actors import box
+from lidarpool.scene.mesh import Mesh
+from lidarpool.sensor.navigation import fixes, imu_samples
+from lidarpool.sensor.noise import Purpose, named_seed, raw
+from lidarpool.sensor.weather import Weather, rain, snow
+from lidarpool.simulator.rig import Rig
+
+SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)
+NOISE = Noise(
+    0.02, angle_deg=0.05, dropout=0.05, detection_range_m=150, range_at_threshold_m=0.05,
+    walk_m=0.02, false_alarm_hz=2e6, stray_light=0.1, crosstalk=True, velocity_m_s=0.1, seed=3,
+)  # fmt: skip
+IMU = Imu(
+    rate_hz=100, gyroscope_noise_density=1e-3, gyroscope_bias=1e-3, gyroscope_random_walk=1e-4,
+    accelerometer_noise_density=0.01, accelerometer_bias=0.1, accelerometer_random_walk=0.01,
+)  # fmt: skip
+
+
+def everything():
+    """A scene and a survey with every effect that draws random numbers."""
+    corners = np.array([[-30, -30, 0], [30, -30, 0], [30, 30, 0], [-30, 30, 0.0]])
+    meshes = [Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))]
+    for name, x in (("Crown 1", 5.0), ("Crown 2", 6.0), ("Sign", -4.0)):
+        cube = box(name, (3, 3, 3))
+        meshes.append(replace(cube, vertices=cube.vertices + np.array([x, 0.3, 0.2])))
+    other = Mounted(replace(SENSOR, start_ns=100.0), Pose((0, 0.5, 0)), name="right")
+    return Scene.from_meshes(meshes), Survey(
+        sensors=[Mounted(SENSOR, name="left"), other],
+        trajectory=Track([0, 0.5], [[0, 0, 1.2], [0.5, 0, 1.2]]),
+        steps=4,
+        materials=[
+            Material("*"),
+            Material("Crown*", leaf_area_density=0.5),
+            Material("Sign", 0.5, retro=True),
+        ],
+        returns=Returns("all", 7, 20.0, waveform="peaks"),
+        noise=NOISE,
+        columns=["range", "cause", "radial_velocity"],
+        waveform_samples=200,
+        navigation=Navigation(imu=IMU, gnss=Gnss(horizontal_m=1, drift_vertical_m=2), seed=3),
+        fog_lidar_ratio_sr=18.8,
+        visibility_km=0.5,
+        snow_mm_h=1.0,
+    )
+
+
+def test_no_random_number_is_used_twice(monkeypatch):
+    """With three kinds of particles: keys that differ have hashes that differ."""
+    drawn = {}
+
+    def recorded(seed, purpose, *key):
+        bits = raw(seed, purpose, *key)
+        drawn.setdefault(purpose, []).append(np.ravel(bits))
+        return bits
+
+    for name, module in [*sys.modules.items()]:
+        if name.startswith("lidarpool") and getattr(module, "raw", None) is raw:
+            monkeypatch.setattr(module, "raw", recorded)
+    kinds = rain(20.0), snow(1.0), rain(5.0)
+    monkeypatch.setattr(Weather, "particles", property(lambda _: kinds))
+    scene, survey = everything()
+    for returns in Rig(scene, survey, "numpy").cast(0, survey.scan_count):
+        assert len(returns.radial_velocity) > 1000
+    assert len([*imu_samples(survey), *fixes(survey)]) == 2
+    assert {*Purpose} - drawn.keys() == {Purpose.CHOICE}, "all are tried"
+    each = {purpose: np.concatenate(bits) for purpose, bits in drawn.items()}
+    for again in (Purpose.SAMPLES, Purpose.SAMPLE):  # windows of one waveform share samples
+        each[again] = np.unique(each[again])
+    for purpose, bits in each.items():
+        assert len(np.unique(bits)) == len(bits), purpose
+    bits = np.concatenate([*each.values()])
+    assert len(np.unique(bits)) == len(bits)
+
+
+def test_a_purpose_is_one_of_the_register():
+    with pytest.raises(AttributeError):
+        raw(0, 1, 0, 0)
+    assert len(Purpose.__members__) == len(Purpose), "no two have one number"
+
+
+def test_seeds_of_names_are_the_same_on_every_machine():
+    assert named_seed(7, "") == 7
+    assert named_seed(0, "left") == 1296481425350128941
+    assert named_seed(1, "hinten links ü") == 4561067770506489771
