@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 
@@ -48,13 +49,23 @@ else:
 _HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
 
 
-@pytest.fixture(autouse=True)
-def _as_before() -> Iterator[None]:
-    """Undo what a command that ran in this process did.
+@pytest.fixture(scope="session", autouse=True)
+def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """Run fixtures of modules in a folder of their own, too."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(tmp_path_factory.mktemp("fixtures"))
+        yield
 
-    Without -v it silences all libraries, and a second interrupt ends the process at once: that of
-    a later test.
+
+@pytest.fixture(autouse=True)
+def _as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Run a test in a folder of its own, and undo what a command in this process did.
+
+    The checkout may hold results of `make demo`, and files of the same names as a test's. Without
+    -v, a command silences all libraries, and a second interrupt ends the process at once: that of a
+    later test.
     """
+    monkeypatch.chdir(tmp_path)
     yield
     logging.disable(logging.NOTSET)
     for number, handler in _HANDLERS.items():

@@ -70,19 +70,6 @@ def test_numpy_opens_a_part():
             assert np.array_equal(archive[column.name], part.columns[column.name])
 
 
-def test_threads_can_read_parts(monkeypatch):
-    """Python's parser, which NumPy reads headers with, fails now and then in several threads."""
-    data = bytes(pack(SMALL))
-
-    def fail(*_):
-        raise SystemError("AST constructor recursion depth mismatch (before=45, after=42)")
-
-    monkeypatch.setattr("ast.literal_eval", fail)
-    with pytest.raises(SystemError):
-        np.load(io.BytesIO(data))["x"]
-    assert bytes(pack(unpack(data))) == data
-
-
 def test_columns_that_are_not_contiguous_are_packed_as_they_read():
     part = part_of(0, [4])
     wide = {name: np.repeat(values, 2)[::2] for name, values in part.columns.items()}

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,12 +15,14 @@ from trimesh import creation
 from lidarpool.scenario.placing import inside_note, place, poses_around
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
+from lidarpool.scene.instances import Instance
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.plants import SPECIES, tree
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
 from lidarpool.scene.surroundings import Surroundings, in_the_way, is_open
 from lidarpool.scene.terrain import terrain
+from lidarpool.scene.transform import Transform
 from lidarpool.sensor import Mounted, Sensor, Survey
 from lidarpool.sensor.models import load_sensor
 from lidarpool.simulator.rig import Rig
@@ -224,3 +229,29 @@ def test_the_axes_of_several_objs_are_one_note(tmp_path):
     (note,) = [note for note in read.advice(read.build_scene()) if "axes" in note]
     assert note.startswith("a.obj states no axes and is taken as Z-up") and "\n" not in note
     assert "set up_axis: y" in note and note.endswith("; 1 more file, too")
+
+
+CHECK = """
+import re
+from pathlib import Path
+from lidarpool.cli.commands import main
+try:
+    main(["check", "forest.glb", "--out", "out"])
+finally:
+    print(re.search(r"VmHWM:\\s*(\\d+)", Path("/proc/self/status").read_text())[1])
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
+def test_looking_around_in_a_forest_takes_little_memory():
+    """1,000 trees of 50,000 leaves: all triangles that pictures show took over a gigabyte."""
+    rng = np.random.default_rng(0)
+    leaves = rng.normal(size=(50_000, 1, 3)) + 0.05 * rng.normal(size=(50_000, 3, 3))
+    tree = Mesh("Tree", leaves.reshape(-1, 3), np.arange(150_000).reshape(-1, 3))
+    at = [(np.eye(3), np.array([8.0 * (k % 32), 8.0 * (k // 32), 0])) for k in range(1000)]
+    forest = [Instance(tree, Transform(*each), f"Tree {k}") for k, each in enumerate(at)]
+    write_scene(Path("forest.glb"), Scene.from_meshes(forest))
+    run = subprocess.run([sys.executable, "-c", CHECK], capture_output=True, text=True, check=True)
+    *told, peak = run.stdout.splitlines()
+    assert "1,000 of them instances of 1 mesh, 50,000,000 triangles" in told[1]
+    assert int(peak) < 400_000  # kB

@@ -19,7 +19,7 @@ from tests.clusters import thread_cluster
 from tests.lidarpool.meshes import PLY
 
 import lidarpool.cli.forecast
-from lidarpool import simulate
+from lidarpool import Mounted, Returns, Sensor, Survey, Track, simulate
 from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.job import make_job
 from lidarpool.scenario.scenario import Scenario
@@ -28,6 +28,7 @@ from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Cutout, Mesh
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
+from lidarpool.simulator.rig import Rig
 from raybeam import available_backends
 
 SHORT = {"sensor": {"layers": 8}, "planning": {"trials": 4}, "pool": {"backend": "numpy"}}
@@ -66,13 +67,48 @@ def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
     assert made["disk"]["result"] > len(result.points) * 22
 
 
-def test_an_estimate_from_few_scans_is_near(monkeypatch):
+CYLINDER = trimesh.creation.cylinder(0.5, 4.0)
+AROUND = [(3 * np.cos(angle), 3 * np.sin(angle), 0) for angle in np.linspace(0, 6, 20)]
+TWO = [
+    Mounted(Sensor.grid(1000, layers=32, step_deg=step, max_range_m=50), name=f"{step}")
+    for step in (9, 20)
+]
+DRIVE = Track([0, 4], [(-4, -3, 0), (5, -3, 0)])
+
+
+@pytest.mark.parametrize(
+    "survey",
+    [
+        Survey(Sensor.grid(), poses=AROUND, returns=Returns(subrays=61, divergence_mrad=3)),
+        Survey(Sensor.grid(10_000, layers=200), poses=AROUND[:2], keep_every=7),
+        Survey(Sensor.grid(200, layers=2), poses=AROUND * 40, keep_every=7),
+        Survey(sensors=TWO, trajectory=DRIVE),
+        Survey(Sensor.grid(100, layers=40, rate_hz=500), trajectory=DRIVE),
+    ],
+    ids=["sub-rays", "dense", "many stations", "two sensors", "many scans"],
+)
+def test_an_estimate_is_near_what_a_run_gives(survey):
+    """Of a thing that fills some scans and is in few of them."""
+    scene = Scene.from_meshes([Mesh("Cylinder", CYLINDER.vertices, CYLINDER.faces)])
+    made = sample_survey(scene, survey, "numpy")
+    assert made["rays"] < survey.ray_count
+    rig = Rig(scene, survey)
+    found = [one for k in range(0, survey.scan_count, 36) for one in cast(rig, k)]
+    assert made["points"] == pytest.approx(sum(map(len, found)), rel=0.05)
+    assert made["hits"] == pytest.approx(sum(one.hits.sum() for one in found), rel=0.05)
+
+
+def cast(rig: Rig, first: int) -> Iterator[Any]:
+    return rig.cast(first, min(first + 36, rig.survey.scan_count))
+
+
+def test_an_estimate_from_few_rays_is_near(monkeypatch):
     job = make_job(Scenario(), no_plan=True)
     monkeypatch.setattr(lidarpool.cli.forecast, "SAMPLE_RAYS", 40_000)
     part = sample_survey(job.scene, job.survey, "numpy")
     assert 30_000 < part["rays"] < 50_000
-    assert part["hits"] == pytest.approx(4926, rel=0.3)
-    assert part["points"] == pytest.approx(995, rel=0.3)
+    assert part["hits"] == pytest.approx(4926, rel=0.05)
+    assert part["points"] == pytest.approx(995, rel=0.05)
 
 
 def test_it_tells_what_a_run_would_do_and_starts_nothing(check, tmp_path):

@@ -3,29 +3,42 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
+import math
+import re
+import zipfile
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from .allowance import Allowance
 from .errors import LidarpoolError
+
+# Head of an array of numbers in format 1.0 of NumPy, after ten bytes with its length at their end.
+_HEADER = re.compile(
+    rb"\{'descr': '([<>|][a-zV]\d+)', 'fortran_order': (False|True), "
+    rb"'shape': \(((?:\d+, ?)*\d*)\), \} *\n"
+)
+_LIMITED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others unpack more than they are asked for
+_AGAIN = "get it again, or read it on a machine with more memory"
 
 
 @contextmanager
-def open_archive(path: Path | str, data: bytes | None = None) -> Iterator[Any]:
-    """Open an archive for the body, whose errors become LidarpoolError; nothing in it is run.
+def open_archive(
+    path: Path | str, read: Callable[[], bytes] | None = None
+) -> Iterator[dict[str, Any]]:
+    """Read an archive for the body, whose errors become LidarpoolError; nothing in it is run.
 
-    With `data`, the content of the file, the path is only its name in errors.
+    With `read`, which returns the content of the file, the path is only its name in errors.
     """
     try:
-        # NumPy leaves a file open that it opened itself and cannot read.
-        with (
-            Path(path).open("rb") if data is None else io.BytesIO(data) as file,
-            np.load(file, allow_pickle=False) as archive,
-        ):
-            yield archive
+        data = read() if read else Path(path).read_bytes()
+        yield read_arrays(data, Allowance(len(data), _AGAIN))
+    except LidarpoolError as error:
+        raise LidarpoolError(f"{path}: {error}") from error
     except OSError as error:
         raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
     except Exception as error:  # zipfile, zlib, NumPy and Scene have many
@@ -34,3 +47,43 @@ def open_archive(path: Path | str, data: bytes | None = None) -> Iterator[Any]:
             f"{path} is damaged or not of this version of lidarpool ({reason}): run the survey "
             "again."
         ) from error
+
+
+def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, NDArray[Any]]:
+    """Read all arrays of an archive, and compare their checksums.
+
+    They are taken from `allowance`. LidarpoolError if they are more; any exception if the archive
+    is damaged.
+    """
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        names = archive.namelist()
+        # A damaged entry of the file list may hide later ones.
+        if len(names) != int.from_bytes(data[-12:-10], "little"):
+            raise ValueError(f"{len(names)} arrays")
+        return {name.removesuffix(".npy"): read_array(archive, name, allowance) for name in names}
+
+
+def read_array(
+    archive: zipfile.ZipFile, name: str, allowance: Allowance | None = None
+) -> NDArray[Any]:
+    """Read an array to its end, where its checksum is compared; errors as of `read_arrays`.
+
+    Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now
+    and then in threads of Python 3.11: "AST constructor recursion depth mismatch".
+    """
+    if archive.getinfo(name).compress_type not in _LIMITED:
+        raise ValueError(f"{name} is compressed by a method other than Deflate")
+    with archive.open(name) as file:
+        length = int.from_bytes(file.read(10)[8:], "little")
+        if (header := _HEADER.fullmatch(file.read(length))) is None:
+            raise ValueError(f"{name} is not an array of numbers")
+        kind = np.dtype(header[1].decode())
+        shape = tuple(map(int, re.findall(rb"\d+", header[3])))
+        size = math.prod(shape) * kind.itemsize
+        if allowance is not None:
+            allowance.take(size)
+        data = bytearray(file.read(size))
+        if file.read(1):
+            raise ValueError(f"{name} is longer than its array")
+    array = np.frombuffer(data, kind)
+    return array.reshape(shape[::-1]).T if header[2] == b"True" else array.reshape(shape)

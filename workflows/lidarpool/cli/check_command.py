@@ -50,7 +50,7 @@ def check(
     The scenario is checked; nothing is started. Of a campaign, the values that vary, and five of
     its jobs.
 
-    Some scans are cast here to estimate the number of points. The exit code is 0 if it can run,
+    Some rays are cast here to estimate the number of points. The exit code is 0 if it can run,
     and 2, with the reasons, if it cannot.
 
     \b

@@ -6,6 +6,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +15,7 @@ from dask.system import CPU_COUNT
 from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
+from numpy.typing import NDArray
 
 from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
@@ -38,7 +40,8 @@ from ..run.store import RUN_FOLDER
 from ..scenario.sections import PoolSection
 from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
-from ..sensor import Survey
+from ..sensor import Sensor, Survey
+from ..sensor.beams import Beams
 from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
@@ -61,9 +64,9 @@ WAY_POSES = 1000  # that the length of a way is measured by
 SUMMARY_BYTES = 28  # of a scan, in the database
 FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most: LAS
 
-# Rays that are cast at most, whole scans of them, and the least and most scans.
-SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
-SAMPLE_MOST = 20_000_000  # rays beyond which fewer scans are cast, one at least
+# Rays that are sampled, parts of the survey, and consecutive scans of each part, at most.
+SAMPLE_RAYS, SAMPLE_PARTS, SAMPLE_SCANS = 500_000, 500, 40
+GOLDEN = (5**0.5 - 1) / 2
 
 
 def forecast(
@@ -211,23 +214,77 @@ def _drive(survey: Survey) -> dict[str, Any] | None:
 
 
 def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[str, int]:
-    """Estimate hits and points of a survey by casting some of its scans, all if they are few.
+    """Estimate hits and points of a survey by casting some of its rays, all if they are few.
 
-    Also returns how many rays were cast.
+    They are spread evenly over all scans; of many thousand scans, over some of each part. Also
+    returns how many rays were cast.
     """
-    rig = Rig(scene, survey, backend)
-    all_rays = survey.ray_count * max(returns.subrays for returns in survey.returns_each)
-    least, most = SAMPLE_SCANS
-    few = max(1, SAMPLE_MOST * survey.scan_count // all_rays)
-    count = np.clip(SAMPLE_RAYS * survey.scan_count // all_rays, min(least, few), most)
-    rays = hits = points = 0
-    for scan in one_of_each_part(survey.scan_count, int(count)).tolist():
-        rays += survey.scan(scan).ray_count
-        for found in rig.cast(scan, scan + 1):
-            hits += int(found.hits.sum())
-            points += len(found)
-    share = survey.ray_count / rays
-    return {"rays": rays, "hits": round(hits * share), "points": round(points * share)}
+    each = min(*survey.steps_each, SAMPLE_SCANS)  # of at most two stations: a cast of each
+    firsts = each * one_of_each_part(-(-survey.scan_count // each), SAMPLE_PARTS)
+    stops = np.minimum(firsts + each, survey.scan_count)
+    subrays = max(returns.subrays for returns in survey.returns_each)
+    rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
+    sampled = survey
+    if (every := -(-rays // SAMPLE_RAYS)) > 1:
+        carried = [
+            replace(one, sensor=_FewRays.of(one.sensor, every), steps=steps)
+            for one, steps in zip(survey.carried, survey.steps_each, strict=True)
+        ]
+        sampled = replace(survey, sensors=carried)
+    rig = Rig(scene, sampled, backend)
+    cast = whole = hits = points = 0
+    for first, stop in zip(firsts.tolist(), stops.tolist(), strict=True):
+        for found in rig.cast(first, stop):
+            every = getattr(sampled.carried[found.specs[0].sensor].sensor, "every", 1)
+            rays = sum(spec.ray_count for spec in found.specs)
+            cast, whole = cast + rays, whole + rays * every
+            hits += int(found.hits.sum()) * every
+            points += int(np.ceil(found.hits * every / survey.keep_every).sum())
+    share = survey.ray_count / whole
+    return {"rays": cast, "hits": round(hits * share), "points": round(points * share)}
+
+
+@dataclass(frozen=True, eq=False)
+class _FewRays(Sensor):
+    """A sensor of one beam, whose firings are some rays of another: one of each `every`."""
+
+    whole: Sensor = field(default_factory=Sensor)
+    every: int = 1
+    period = None
+
+    @classmethod
+    def of(cls, sensor: Sensor, every: int) -> _FewRays:
+        """Take one of so many rays, but some of each scan, though it may have a firing less."""
+        first, stop = sensor.firings(0)
+        every = max(1, min(every, (stop - first) * sensor.channels // 2))
+        near, far = sensor.min_range_m, sensor.max_range_m
+        beams = Beams(np.zeros(1))
+        return cls(beams, sensor.head, near, far, "", sensor.optics, 0.0, sensor, every)
+
+    def firings(self, step: int) -> tuple[int, int]:
+        first, stop = self.whole.firings(step)
+        channels = self.whole.channels
+        return first * channels // self.every, stop * channels // self.every
+
+    def _rays(self, firings: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
+        """Return firings of the other, and which of these and which channel each ray is of."""
+        # Steps of the golden ratio spread the rays evenly over firings and channels.
+        ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
+        fired, channel = np.divmod(ray, self.whole.channels)
+        return *np.unique(fired, return_inverse=True), channel
+
+    def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        some, row, channel = self._rays(firings)
+        return self.whole.directions(some)[row, channel, None]
+
+    def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+        some, row, channel = self._rays(firings)
+        starts = self.whole.origins(some)
+        return None if starts is None else starts[row, channel, None]
+
+    def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+        some, row, _ = self._rays(firings)
+        return self.whole.begins_ns(some)[row] + self.whole.lead_ns
 
 
 def _slots(

@@ -20,6 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.archives import read_array, read_arrays
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage, target_of
@@ -30,11 +31,6 @@ from .waveforms import WAVEFORM
 # Files of a run in the folder of its parts: its mark, then what it is.
 _OWN = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8}|\d{8,}-\d{8,}\.npz)", re.ASCII)
 _AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
-# Head of an array: format 1.0 of NumPy, and what it says of one row of numbers.
-_MAGIC = b"\x93NUMPY\x01\x00"
-_HEADER = re.compile(
-    rb"\{'descr': '([<>|][a-zV]\d+)', 'fortran_order': False, 'shape': \((\d+),\), \} *\n"
-)
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
 
@@ -170,12 +166,7 @@ def unpack(data: bytes) -> PartColumns:
     LidarpoolError if it is not a part, or damaged; the message is a clause.
     """
     try:
-        with zipfile.ZipFile(io.BytesIO(data)) as archive:
-            names = archive.namelist()
-            # A damaged entry of the file list may hide later ones.
-            if len(names) != int.from_bytes(data[-12:-10], "little"):
-                raise ValueError(f"{len(names)} arrays")
-            arrays = {name.removesuffix(".npy"): _read_array(archive, name) for name in names}
+        arrays = read_arrays(data)
         first, stop = arrays.pop(".scans").tolist()
         part = PartColumns(
             first, arrays.pop(".counts"), arrays, arrays.pop(".triangles"), arrays.pop(".hits")
@@ -190,23 +181,6 @@ def unpack(data: bytes) -> PartColumns:
     except Exception as error:  # zipfile, zlib, lzma and NumPy have a dozen kinds
         raise LidarpoolError(f"it is damaged ({error})") from error
     return part
-
-
-def _read_array(archive: zipfile.ZipFile, name: str) -> NDArray[Any]:
-    """Read an array to its end, where its checksum is compared.
-
-    Parts are read by several threads. NumPy's reader parses headers with `ast`, which failed now
-    and then in threads of Python 3.11: "AST constructor recursion depth mismatch".
-    """
-    with archive.open(name) as file:
-        length = int.from_bytes(file.read(len(_MAGIC) + 2)[len(_MAGIC) :], "little")
-        if (header := _HEADER.fullmatch(file.read(length))) is None:
-            raise ValueError(f"{name} is not an array of a part")
-        kind, count = np.dtype(header[1].decode()), int(header[2])
-        data = bytearray(file.read(count * kind.itemsize))
-        if file.read(1):
-            raise ValueError(f"{name} is longer than its array")
-    return np.frombuffer(data, kind, count)
 
 
 def read_part(storage: Storage, name: str) -> PartColumns:
@@ -230,7 +204,7 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
         return part.triangles, part.hits
     try:
         with zipfile.ZipFile(storage.path(name)) as archive:
-            return _read_array(archive, ".triangles.npy"), _read_array(archive, ".hits.npy")
+            return read_array(archive, ".triangles.npy"), read_array(archive, ".hits.npy")
     except Exception as error:  # as above
         raise LidarpoolError(
             f"The part {storage.path(name)} cannot be used ({error}). {_AGAIN}"

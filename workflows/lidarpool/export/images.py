@@ -5,12 +5,14 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import count
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.archives import open_archive
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor import Sensor
@@ -144,9 +146,9 @@ class Reader(reading.Reader):
 
     def read(self, sweep: int) -> reading.Points:
         """Return the points of a sweep, in the order of their rays."""
-        with np.load(io.BytesIO(self.place.read(self.file(sweep)))) as archive:
-            arrays = dict(archive.items())
-        images = {name: array for name, array in arrays.items() if name not in ("pose", "scan")}
+        file = self.file(sweep)
+        with open_archive(self.place.path(file), partial(self.place.read, file)) as images:
+            del images["pose"], images["scan"]
         planes = next(n for n in count(1) if _key("range", n) not in images)
         further = {_key(name, plane) for name in images for plane in range(1, planes)}
         there = ~np.isnan(np.stack([images[_key("range", plane)] for plane in range(planes)]))

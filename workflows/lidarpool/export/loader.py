@@ -10,6 +10,7 @@ from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
@@ -215,12 +216,12 @@ class _OpenJob:
     def __init__(self, place: Storage, format: str, layout: str, job: JobRow) -> None:  # noqa: A002
         self.place, self.job = place, job
         name = job_file(format, job.name, SWEEPS_FILE)
-        self.sweeps = Sweeps.load(place.path(name), _content(place, name))
+        self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
         self.boxes: dict[str, NDArray[Any]] = {}
         if self.sweeps.actors:
             name = job_file(format, job.name, BOXES_FILE)
-            with open_archive(place.path(name), _content(place, name)) as arrays:
-                self.boxes = {name: arrays[name] for name in arrays.files}
+            with open_archive(place.path(name), partial(place.read, name)) as arrays:
+                self.boxes = arrays
         module = import_module(f".{FORMATS[DATA_SETS[format]].module}", __package__)
         self.reader: Reader = module.Reader(place, self.sweeps, Entry(job.number, job.name), layout)
 
@@ -380,13 +381,6 @@ def _check_known(what: str, wanted: Sequence[str], there: Any, place: Storage) -
             raise LidarpoolError(
                 f"{place} has no {what} {name!r}.{did_you_mean(name, names) or known}"
             )
-
-
-def _content(place: Storage, name: str) -> bytes:
-    try:
-        return place.read(name)
-    except OSError as error:
-        raise _unreadable(place.path(name), error) from error
 
 
 def _unreadable(file: str, error: Exception) -> LidarpoolError:

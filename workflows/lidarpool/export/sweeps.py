@@ -5,7 +5,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import pairwise
@@ -225,17 +225,15 @@ class Sweeps:
         return memory.getvalue()
 
     @classmethod
-    def load(cls, path: Path | str, data: bytes | None = None) -> Sweeps:
-        """Read what `save` wrote; nothing in the file is run.
-
-        With `data`, the content of the file, the path is only its name in errors.
+    def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:
+        """Read what `save` wrote; nothing in the file is run. `read` is as of `open_archive`.
 
         Raises
         ------
         LidarpoolError
             If it cannot be read, is damaged, or of another version.
         """
-        with open_archive(path, data) as arrays:
+        with open_archive(path, read) as arrays:
             words = json.loads(arrays["words"].tobytes())
             if words["format"] != _FORMAT:
                 raise ValueError(f"it is of format {words['format']}, not {_FORMAT}")

@@ -31,8 +31,8 @@ _AZIMUTHS_DEG, _ABOVE_DEG, _FAR = (45, 135, 225, 315), 20.0, (1.5, 3.0)
 _LOOKED_AT = 1000  # firings that tell a sensor's field of view
 _FACING_DEG = 45.0  # rays of that field
 
-# Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second: a
-# tree takes 300 bytes and some microseconds a triangle.
+# Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second,
+# and instances have no more: a tree takes 300 bytes and some microseconds a triangle.
 _TRIANGLES_MOST, _SHEETS_MOST = 2_000_000, 200_000
 
 
@@ -52,9 +52,9 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
     a lower room. Around an object they are on four sides and above it.
     """
-    drawn = Drawn.of(scene).scene
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
+    drawn = _simple(scene, middle - scene.origin)
     if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
         ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
@@ -113,7 +113,7 @@ def _local(poses: Sequence[Pose], scene: Scene) -> Real:
 
 def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
     """Say that local positions (k, 3) are inside a closed body; else empty."""
-    looker = _looker(Drawn.of(scene).scene)
+    looker = _looker(_simple(scene, positions))
     return "" if looker is None else _inside(looker.views(positions), scene, carried)
 
 
@@ -179,6 +179,11 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
         return -90.0, -90.0  # an airborne scanner, which looks down
     elevations = np.degrees(np.arcsin(np.clip(rays[facing, 2], -1, 1)))
     return float(elevations.min()), float(elevations.max())
+
+
+def _simple(scene: Scene, near: ArrayLike) -> Scene:
+    """Copy instances to their places, with fewer triangles far from local positions (k, 3)."""
+    return Drawn.of(scene, _SHEETS_MOST, [np.reshape(near, (-1, 3))]).scene
 
 
 def _looker(scene: Scene) -> Surroundings | None:
