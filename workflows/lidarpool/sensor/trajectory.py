@@ -13,6 +13,7 @@ from pydantic import Field
 from ..base.arguments import as_array, checked_fields, shown
 from ..base.declared import Angle, Triple, written_as
 from ..base.errors import LidarpoolError
+from .spline import Spline
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
@@ -220,9 +221,10 @@ class Track:
         float64 (k, 4): x, y, z, w of the rotations from the carrier's axes to the scene's, of unit
         length within 1e-3. None if the carrier is level and faces its direction of travel.
     smooth
-        Positions follow cubic Hermite curves (tangents through three poses, as Catmull and Rom,
-        1974), not straight lines. Rotations turn evenly about one axis from each pose to the
-        next in both cases (Shoemake, 1985).
+        Positions and rotations pass through every pose on curves with continuous velocities and
+        accelerations (cubic splines, of rotations those of quaternions). Between equal poses the
+        carrier stands still. Otherwise it goes straight and turns evenly about one axis from each
+        pose to the next (Shoemake, 1985).
     start_s
         Start of the station, by the same clock; by default the first time.
     duration_s
@@ -330,13 +332,14 @@ class Track:
             If a time is not within the trajectory.
         """
         segment, since, _ = self._at(times_ns)
+        if self.smooth:
+            values, _ = self._spline.at(segment, since, False)
+            turns = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
+            return values[:3].T, matrices(turns.T)
         if len(segment) and segment.max() == segment.min():
             segment = segment[:1]  # all are in one
-        way, turn, rates = self._segments
-        # By Horner; a straight path has only two coefficients.
-        positions = way[-1].take(segment, axis=1)
-        for coefficient in way[-2::-1]:
-            positions = positions * since + coefficient.take(segment, axis=1)
+        start, speed, turn, rates = self._segments
+        positions = speed.take(segment, axis=1) * since + start.take(segment, axis=1)
         angle = since * rates.take(segment)
         rotations = turn[0].take(segment, axis=1)
         for factor, table in ((np.sin(angle), turn[1]), (np.cos(angle), turn[2])):
@@ -354,11 +357,14 @@ class Track:
             If a time is not within the trajectory.
         """
         segment, since, within = self._at(times_ns)
-        way, _, _ = self._segments
-        linear = np.zeros((3, len(segment)))
-        for power in range(len(way) - 1, 0, -1):  # by Horner
-            linear = linear * since + power * way[power].take(segment, axis=1)
-        return (linear * within).T, (self._rates.take(segment, axis=1) * within).T
+        if not self.smooth:
+            speeds = self._segments[1].take(segment, axis=1)
+            return (speeds * within).T, (self._rates.take(segment, axis=1) * within).T
+        q, p = self._spline.at(segment, since, True)
+        # 2 p conjugate(q); the length of q may be any, and change.
+        turn = 2 * (q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0))
+        rates = turn / (q[3:] ** 2).sum(axis=0)
+        return (p[:3] * within).T, (rates * within).T
 
     def _at(
         self, times_ns: NDArray[np.float64]
@@ -381,6 +387,15 @@ class Track:
         return segment, at - times.take(segment), within
 
     @cached_property
+    def _spline(self) -> Spline:
+        """Positions and quaternions, of which a rotation has two: each the nearer to the last."""
+        turns = self.quaternions
+        assert turns is not None  # set above
+        flips = (turns[1:] * turns[:-1]).sum(axis=1) < 0
+        signs = 1.0 - 2 * np.append(0, np.cumsum(flips) % 2)
+        return Spline(self.times_s, self.positions.T, turns.T * signs)
+
+    @cached_property
     def _rates(self) -> NDArray[np.float64]:
         """Angular velocities of segments in the scene's axes, rad/s: (3, s)."""
         turns = self.quaternions
@@ -389,24 +404,14 @@ class Track:
         return np.ascontiguousarray((matrices(turns[:-1]) @ (axis * rates)[..., None])[..., 0].T)
 
     @cached_property
-    def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
-        """Coefficients of poses between two given ones, one column for each of s segments.
+    def _segments(self) -> tuple[NDArray[np.float64], ...]:
+        """Coefficients of poses on straight ways, one column for each of s segments.
 
-        Of the position's polynomial in seconds (3, s), the constant first; of the rotation
-        (3, 9, s), which is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the
-        angle since the segment began; and the rates of that angle (s,), radians a second.
+        Positions at their starts (3, s); velocities (3, s); of the rotation (3, 9, s), which is
+        ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the angle since the
+        segment began; and the rates of that angle (s,), radians a second.
         """
-        steps = np.diff(self.times_s)[:, None]
-        speeds = np.diff(self.positions, axis=0) / steps
-        way = [self.positions[:-1], speeds]
-        if self.smooth:
-            tangents = np.gradient(self.positions, self.times_s, axis=0)
-            first, last = tangents[:-1], tangents[1:]
-            way[1:] = [
-                first,
-                (3 * speeds - 2 * first - last) / steps,
-                (first + last - 2 * speeds) / steps**2,
-            ]
+        speeds = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
         turns = self.quaternions
         assert turns is not None  # set above
         axis, rates = _between(turns, self.times_s)
@@ -416,8 +421,8 @@ class Track:
         start = matrices(turns[:-1])
         square = start @ about @ about
         table = np.stack([start + square, start @ about, -square]).reshape(3, -1, 9)
-        columns = [np.ascontiguousarray(coefficient.T) for coefficient in way]
-        return columns, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0]
+        start, speed = (np.ascontiguousarray(part.T) for part in (self.positions[:-1], speeds))
+        return start, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0]
 
 
 def _between(
