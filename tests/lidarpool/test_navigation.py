@@ -36,7 +36,7 @@ from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.campaign import described_job
 from lidarpool.scenario.campaign import CampaignJob, Described
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.navigation import fixes, geodetic, imu_samples, navigation_notes
+from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
 from lidarpool.sensor.trajectory import Stations, matrices, quaternions_of, rotations_of
 
 GRAVITY = 9.80665
@@ -241,15 +241,6 @@ def test_an_imu_on_a_smooth_way_feels_the_derivatives_of_the_motion(motion):
     for name, truth, most in (("rates", rates, 2e-3), ("forces", forces, 0.02)):
         off = joined(samples, name) - truth
         assert np.sqrt((off**2).sum(axis=1).mean()) < most, name
-
-
-def test_an_imu_on_a_linear_way_is_told():
-    imu = Navigation(imu=Imu())
-    (note,) = navigation_notes(Moving(imu, tumbling(False), 1e9))
-    assert "interpolation: smooth" in note
-    straight = Track([0, 1], [[0, 0, 0], [1, 0, 0]])
-    others = (imu, tumbling(True)), (imu, straight), (Navigation(gnss=Gnss()), tumbling(False))
-    assert not any(navigation_notes(Moving(*one, 1e9)) for one in others)
 
 
 def test_a_carrier_that_stands_feels_gravity():

@@ -39,7 +39,6 @@ from ..scenario.sections import PoolSection
 from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
 from ..sensor import Survey
-from ..sensor.navigation import navigation_notes
 from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
@@ -117,7 +116,6 @@ def forecast(
             casters = len(casting)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
             notes += filter(None, [gpu_note(everybody, casting, backend)])
-    notes += navigation_notes(job.survey)
     estimate = None
     # Casting here needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:

@@ -36,7 +36,6 @@ from ..pipeline import (
 )
 from ..pipeline.task_book import TaskBook
 from ..plan import best
-from ..sensor.navigation import navigation_notes
 from ..simulator.memory import MB, scans_that_fit
 from .checks import check_memory, find_workers, gpu_note, want_nothing
 from .job import Job
@@ -394,7 +393,7 @@ def make_result(
         records=tuple(record for book in books for record in book.records),
         stages=tuple(totals for book in books for totals in book.stages.values()),
         resumed=store.resumed,
-        notes=(*navigation_notes(job.survey), *store.notes, *notes),
+        notes=(*store.notes, *notes),
         identity=store.identity,
         _hit_counts=store.hit_counts,
         sample_rays=store.sample_rays(),

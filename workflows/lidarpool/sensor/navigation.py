@@ -27,7 +27,7 @@ from ..base.arguments import checked_fields
 from ..base.declared import Seed, written_as
 from ..base.errors import LidarpoolError
 from .noise import normal
-from .trajectory import CENTRE, Pose, Track, Trajectory, velocities
+from .trajectory import CENTRE, Pose, Trajectory, velocities
 
 BLOCK = 1 << 14  # samples that are made at a time
 
@@ -220,18 +220,6 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
             f"Latitudes of navigation.gnss in EPSG:{epsg} need rasterio: pip install "
             '"lidarpool[geo]", or give navigation.gnss.origin.'
         )
-
-
-def navigation_notes(survey: Moving) -> list[str]:
-    """Return notes on samples that are not those of a carrier with a mass."""
-    path = getattr(survey.path, "base", survey.path)  # of the robot that has the carrier's link
-    jumps = isinstance(path, Track) and not path.smooth and len(path.times_s) > 2
-    if not jumps or survey.navigation is None or survey.navigation.imu is None:
-        return []
-    return [
-        "navigation.imu: the trajectory is linear, so that velocities jump at its poses and the "
-        "samples there have all of the jump: give the trajectory interpolation: smooth"
-    ]
 
 
 def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:

@@ -13,7 +13,7 @@ from pydantic import Field
 from ..base.arguments import as_array, checked_fields, shown
 from ..base.declared import Angle, Triple, written_as
 from ..base.errors import LidarpoolError
-from .spline import Spline
+from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
@@ -221,10 +221,9 @@ class Track:
         float64 (k, 4): x, y, z, w of the rotations from the carrier's axes to the scene's, of unit
         length within 1e-3. None if the carrier is level and faces its direction of travel.
     smooth
-        Positions and rotations pass through every pose on curves with continuous velocities and
-        accelerations (cubic splines, of rotations those of quaternions). Between equal poses the
-        carrier stands still. Otherwise it goes straight and turns evenly about one axis from each
-        pose to the next (Shoemake, 1985).
+        Positions and quaternions follow cubic splines, whose accelerations do not jump, and stand
+        still between equal poses. Otherwise positions follow straight lines, and rotations turn
+        evenly about one axis from each pose to the next (Shoemake, 1985).
     start_s
         Start of the station, by the same clock; by default the first time.
     duration_s
@@ -270,7 +269,8 @@ class Track:
         late = np.append(False, np.diff(times) <= 0)
         _refuse(late, "times must ascend, and that of pose {} does not come after the one before")
         if self.quaternions is None:
-            turns = _along(times, places)
+            slopes = np.gradient(places, times, axis=0).T
+            turns = _along(knots_of(times, places.T)[1] if self.smooth else slopes)
         else:
             turns = as_array("quaternions", self.quaternions).copy()
             if turns.shape != (len(times), 4):
@@ -333,12 +333,12 @@ class Track:
         """
         segment, since, _ = self._at(times_ns)
         if self.smooth:
-            values, _ = self._spline.at(segment, since, False)
+            values, _ = on_curve(*self._spline, segment, since)
             turns = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
             return values[:3].T, matrices(turns.T)
         if len(segment) and segment.max() == segment.min():
             segment = segment[:1]  # all are in one
-        start, speed, turn, rates = self._segments
+        start, speed, turn, rates, _ = self._segments
         positions = speed.take(segment, axis=1) * since + start.take(segment, axis=1)
         angle = since * rates.take(segment)
         rotations = turn[0].take(segment, axis=1)
@@ -357,14 +357,14 @@ class Track:
             If a time is not within the trajectory.
         """
         segment, since, within = self._at(times_ns)
-        if not self.smooth:
-            speeds = self._segments[1].take(segment, axis=1)
-            return (speeds * within).T, (self._rates.take(segment, axis=1) * within).T
-        q, p = self._spline.at(segment, since, True)
-        # 2 p conjugate(q); the length of q may be any, and change.
-        turn = 2 * (q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0))
-        rates = turn / (q[3:] ** 2).sum(axis=0)
-        return (p[:3] * within).T, (rates * within).T
+        if self.smooth:
+            q, p = on_curve(*self._spline, segment, since)
+            # 2 p conjugate(q); the length of q may be any, and change.
+            turn = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
+            speeds, rates = p[:3], 2 * turn / (q[3:] ** 2).sum(axis=0)
+        else:
+            speeds, rates = (self._segments[k].take(segment, axis=1) for k in (1, 4))
+        return (speeds * within).T, (rates * within).T
 
     def _at(
         self, times_ns: NDArray[np.float64]
@@ -387,29 +387,22 @@ class Track:
         return segment, at - times.take(segment), within
 
     @cached_property
-    def _spline(self) -> Spline:
-        """Positions and quaternions, of which a rotation has two: each the nearer to the last."""
+    def _spline(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Knots of positions and quaternions, of which each is the nearer to the last; steps."""
         turns = self.quaternions
         assert turns is not None  # set above
-        flips = (turns[1:] * turns[:-1]).sum(axis=1) < 0
-        signs = 1.0 - 2 * np.append(0, np.cumsum(flips) % 2)
-        return Spline(self.times_s, self.positions.T, turns.T * signs)
-
-    @cached_property
-    def _rates(self) -> NDArray[np.float64]:
-        """Angular velocities of segments in the scene's axes, rad/s: (3, s)."""
-        turns = self.quaternions
-        assert turns is not None  # set above
-        axis, rates = _between(turns, self.times_s)
-        return np.ascontiguousarray((matrices(turns[:-1]) @ (axis * rates)[..., None])[..., 0].T)
+        flips = np.cumsum((turns[1:] * turns[:-1]).sum(axis=1) < 0)
+        groups = self.positions.T, turns.T * (1.0 - 2 * np.append(0, flips % 2))
+        knots = [knots_of(self.times_s, group) for group in groups]
+        return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
     def _segments(self) -> tuple[NDArray[np.float64], ...]:
         """Coefficients of poses on straight ways, one column for each of s segments.
 
-        Positions at their starts (3, s); velocities (3, s); of the rotation (3, 9, s), which is
-        ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the angle since the
-        segment began; and the rates of that angle (s,), radians a second.
+        Positions at their starts and velocities (3, s); of the rotation (3, 9, s), which is
+        ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the angle since then;
+        and rates, radians a second, of that angle (s,) and about the scene's axes (3, s).
         """
         speeds = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
         turns = self.quaternions
@@ -421,8 +414,10 @@ class Track:
         start = matrices(turns[:-1])
         square = start @ about @ about
         table = np.stack([start + square, start @ about, -square]).reshape(3, -1, 9)
-        start, speed = (np.ascontiguousarray(part.T) for part in (self.positions[:-1], speeds))
-        return start, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0]
+        spins = (start @ (axis * rates)[..., None])[..., 0]
+        parts = self.positions[:-1], speeds, spins
+        begin, speed, spin = (np.ascontiguousarray(part.T) for part in parts)
+        return begin, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0], spin
 
 
 def _between(
@@ -466,16 +461,16 @@ def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
-def _along(times: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _along(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternions (k, 4) of a level carrier that faces its direction of travel.
 
     While it stands it keeps its direction; before it first moves it faces its first direction.
     """
-    x, y = (np.gradient(axis, times) for axis in (places[:, 0], places[:, 1]))
+    x, y, _ = slopes
     moving = np.flatnonzero(np.hypot(x, y) > 1e-9)
     if not len(moving):
         moving = np.zeros(1, np.intp)
-    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(times)), "right") - 1, 0)]
+    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(x)), "right") - 1, 0)]
     half = np.arctan2(y[last], x[last]) / 2
     return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
 
