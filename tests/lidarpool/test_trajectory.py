@@ -132,6 +132,10 @@ def test_without_angles_a_carrier_faces_its_way():
     track = Track([0, 1, 2, 3], [[0, 0, 0], [0, 0, 1], [0, 2, 1], [0, 2, 2]])
     assert [round(track.pose(0, t * 1e9).yaw_deg, 6) for t in (0, 1, 2, 3)] == [90] * 4
     assert Track([0, 1], [[0, 0, 0], [0, 0, 1]]).pose(0, 5e8).yaw_deg == 0
+    times = np.linspace(0, 2, 21)
+    circle = np.stack([20 * np.sin(times / 2), -20 * np.cos(times / 2), 0 * times], axis=1)
+    ends = [Track(times, circle, smooth=True).pose(0, t * 1e9).yaw_deg for t in (0, 2)]
+    assert np.allclose(ends, [0, np.degrees(1)], atol=0.01), "of the curve, not of its chords"
 
 
 @pytest.fixture
