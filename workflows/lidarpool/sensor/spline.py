@@ -54,8 +54,10 @@ def knots_of(times: Real, values: Real) -> Real:
     return np.array([values, first, second])
 
 
-def on_curve(knots: Real, steps: Real, segment: NDArray[np.intp], since: Real) -> tuple[Real, Real]:
-    """Return values and first derivatives (d, k), `since` (k,) after the knots `segment` (k,)."""
+def on_curve(
+    knots: Real, steps: Real, segment: NDArray[np.intp], since: Real, slopes: bool
+) -> tuple[Real, Real]:
+    """Values and, if asked for, slopes (d, k), `since` (k,) after the knots `segment` (k,)."""
     # Times mostly come in order: coefficients are computed once for all in one segment.
     begins = np.flatnonzero(np.diff(segment, prepend=-1))
     counts = np.diff(begins, append=len(segment))
@@ -70,6 +72,7 @@ def on_curve(knots: Real, steps: Real, segment: NDArray[np.intp], since: Real) -
     d = 8 * v + 7 * w + 3 * a - 2 * b - 15 * change
     e = 6 * change - 3 * (v + w) - a + b
     for term in (e, d, c, a, v, p):
-        slope = slope * share + value
+        if slopes:
+            slope = slope * share + value
         value = value * share + term.repeat(counts, axis=1)
     return value, slope / step.repeat(counts)

@@ -333,7 +333,7 @@ class Track:
         """
         segment, since, _ = self._at(times_ns)
         if self.smooth:
-            values, _ = on_curve(*self._spline, segment, since)
+            values, _ = on_curve(*self._spline, segment, since, False)
             turns = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
             return values[:3].T, matrices(turns.T)
         if len(segment) and segment.max() == segment.min():
@@ -358,7 +358,7 @@ class Track:
         """
         segment, since, within = self._at(times_ns)
         if self.smooth:
-            q, p = on_curve(*self._spline, segment, since)
+            q, p = on_curve(*self._spline, segment, since, True)
             # 2 p conjugate(q); the length of q may be any, and change.
             turn = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
             speeds, rates = p[:3], 2 * turn / (q[3:] ** 2).sum(axis=0)
