@@ -37,7 +37,7 @@ from lidarpool.run.campaign import described_job
 from lidarpool.scenario.campaign import CampaignJob, Described
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
-from lidarpool.sensor.trajectory import Stations, matrices
+from lidarpool.sensor.trajectory import Stations, matrices, quaternions_of, rotations_of
 
 GRAVITY = 9.80665
 
@@ -198,6 +198,50 @@ def test_dead_reckoning_finds_the_way_of_the_imu(smooth):
     # At each of 40 given poses the speed jumps, by up to 5 m/s, and a sample does not say when.
     assert worst < 0.05
     assert path.duration_ns == times[-1]
+
+
+def heading(t):
+    return 0 * t, 0 * t, 0 * t, 0.6 * np.sin(t), 0 * t, 0 * t
+
+
+def climbing_turn(t):
+    return 20 * np.cos(t / 2), 20 * np.sin(t / 2), 0.8 * t, t / 2, 0 * t - 0.1, 0.1 * np.sin(t)
+
+
+def tumble(t):
+    s = t + 0.3 * np.sin(1.3 * t)
+    turns = 0.9 * np.sin(s), 0.5 * np.sin(1.1 * s + 1), 0.7 * np.cos(0.8 * s)
+    return 5 * np.sin(s), 3 * np.cos(0.7 * s), np.sin(0.9 * t), *turns
+
+
+@pytest.mark.parametrize("motion", [heading, climbing_turn, tumble])
+def test_an_imu_on_a_smooth_way_feels_the_derivatives_of_the_motion(motion):
+    lever, hz, h = np.array([0.5, 0.0, 0.0]), 200.0, 1e-3
+
+    def at(t):
+        values = np.stack(motion(t), axis=1)
+        turns = rotations_of(np.degrees(values[:, 3:]))
+        return values[:, :3], turns, values[:, :3] + turns @ lever
+
+    poses = np.linspace(0, 20, 201)
+    places, turns, _ = at(poses)
+    path = Track(poses, places, quaternions_of(turns), smooth=True)
+    imu = Imu(rate_hz=hz, mount=Pose(tuple(lever)))
+    samples = list(imu_samples(Moving(Navigation(imu=imu), path, path.duration_ns)))
+    middles = joined(samples, "times_ns") / 1e9 - 0.5 / hz
+    # Central differences of the motion itself, to the fourth order.
+    (_, before, far), (_, turns, place), (_, after, near) = (
+        at(middles + k * h) for k in (-1, 0, 1)
+    )
+    (_, early, first), (_, late, last) = (at(middles + k * h) for k in (-2, 2))
+    slope = (8 * (after - before) - (late - early)) / (12 * h)
+    spin = np.einsum("nji,njk->nik", turns, slope)
+    rates = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
+    pull = (16 * (near + far) - 30 * place - first - last) / (12 * h * h) + [0, 0, GRAVITY]
+    forces = np.einsum("nji,nj->ni", turns, pull)
+    for name, truth, most in (("rates", rates, 2e-3), ("forces", forces, 0.02)):
+        off = joined(samples, name) - truth
+        assert np.sqrt((off**2).sum(axis=1).mean()) < most, name
 
 
 def test_a_carrier_that_stands_feels_gravity():

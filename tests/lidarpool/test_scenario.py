@@ -299,6 +299,21 @@ def test_settings_without_effect_are_in_the_advice(scenario, idle, used):
     assert both.advice(both.build_scene()) == []
 
 
+def test_an_imu_on_a_linear_trajectory_is_in_the_advice(scenario):
+    way = ", ".join(f"{{time_s: {k}, position: [0, {k}, {k * k}]}}" for k in range(3))
+    for instrument, kind, told in (
+        ("imu", "linear", True),
+        ("imu", "smooth", False),
+        ("gnss", "linear", False),
+    ):
+        read = scenario(
+            f"navigation: {{{instrument}: {{}}}}\n"
+            f"trajectory: {{interpolation: {kind}, points: [{way}]}}"
+        )
+        notes = " ".join(read.advice(read.build_scene()))
+        assert ("interpolation: smooth" in notes) == told
+
+
 YAML_VALUES = st.recursive(
     st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=8),
     lambda inner: (

@@ -239,6 +239,13 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     np.testing.assert_allclose(places[:, 2] + scene.origin[2] - z, [2.1, 1.84, 0.5], atol=1e-6)
     np.testing.assert_allclose(turns[:, :, 0], np.tile(-UPHILL, (3, 1)), atol=1e-6)
     np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-6)
+    stops = ((0, 18), (3, 10), (5, 10), (8, 2))
+    stop = [{"time_s": t, "position": [x + at, y + 5, 0.3]} for t, at in stops]
+    path = read(stop, interpolation="smooth").survey(scene).path
+    poses = path.times_s[1:-1, None] * 1e9 + [-10, 10]
+    speeds = path.velocities(0, poses.ravel())[0].reshape(-1, 2, 3)
+    np.testing.assert_allclose(speeds[:, 0], speeds[:, 1], atol=1e-5)
+    assert not path.velocities(0, np.linspace(3e9, 4.9e9, 20))[0].any()
     points[1]["position"] = [x + 30, y + 5, 0]
     points.insert(1, {"time_s": 4, "position": [x + 10, y + 5, 0.3]})
     assert read(points, duration_s=3).survey(scene).path.duration_ns == 3e9

@@ -9,7 +9,8 @@ import pytest
 
 from lidarpool import LidarpoolError, Mounted, Pose, Sensor, Survey, Track, load_trajectory
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.sensor.trajectory import matrices
+from lidarpool.sensor.trajectory import matrices, velocities
+from lidarpool.sensor.trajectory_files import quaternions_from_degrees
 
 RNG = np.random.default_rng(5)
 TIMES = np.cumsum(RNG.uniform(0.05, 0.4, 12)) + 1.4e9
@@ -35,8 +36,9 @@ def test_a_track_is_at_its_poses_and_evenly_turned_between(smooth):
     for part in (0.25, 0.5):
         at = since[:-1] + part * np.diff(since)
         places, turns = track.poses(0, at)
-        if not smooth:
-            assert np.allclose(places, PLACES[:-1] + part * np.diff(PLACES, axis=0), atol=1e-5)
+        if smooth:
+            continue
+        assert np.allclose(places, PLACES[:-1] + part * np.diff(PLACES, axis=0), atol=1e-5)
         for k, turn in enumerate(turns):
             a, b = matrices(TURNS[k : k + 2])
             assert np.isclose(angle(a, turn), part * angle(a, b), atol=1e-5)
@@ -44,21 +46,96 @@ def test_a_track_is_at_its_poses_and_evenly_turned_between(smooth):
             assert np.allclose(turn @ turn.T, np.eye(3), atol=1e-14)
 
 
-def test_a_smooth_way_has_no_corners_and_follows_a_parabola():
-    times = np.array([0, 1, 1.5, 3, 4.0])
-    places = np.stack([times, times**2, 0 * times], axis=1)
-    track = Track(times, places, smooth=True)
-    at = np.linspace(1, 3, 41)
-    found, _ = track.poses(0, at * 1e9)
-    assert np.allclose(found[:, 1], at**2, atol=1e-9), "tangents of three poses are exact there"
-    speeds = np.diff(track.poses(0, np.array([1.5 - 1e-6, 1.5, 1.5 + 1e-6]) * 1e9)[0], axis=0)
-    assert np.allclose(speeds[0], speeds[1], rtol=1e-4)
+def stopping():
+    """A smooth way of uneven steps with two stops, one of which it turns at."""
+    times, places, turns = TIMES - TIMES[0], PLACES.copy(), TURNS.copy()
+    places[4:6], turns[5], places[8:11] = places[4], turns[4], places[8]
+    return Track(times, places, turns, smooth=True)
+
+
+def test_a_smooth_way_has_no_jumps_of_velocity_and_acceleration():
+    track, step = stopping(), 1e-6
+    at = track.times_s[1:-1, None] + step * np.array([-2, -1, 0, 1, 2])
+    found = np.concatenate(velocities(track, 0, at.ravel() * 1e9), axis=1).reshape(*at.shape, 6)
+    before, after = (found[:, 2] - found[:, 0]) / 2, (found[:, 4] - found[:, 2]) / 2
+    for part in (slice(3), slice(3, 6)):
+        most = np.abs(before[..., part]).max()
+        assert most > 30 * step
+        assert np.abs(before - after)[..., part].max() < 0.01 * most
+
+
+def test_between_equal_poses_a_smooth_carrier_stands_still():
+    track = stopping()
+    poses, speeds = track.poses, track.velocities
+    for first, last, turns in ((4, 5, False), (8, 10, True)):
+        at = np.linspace(*track.times_s[[first, last]], 99) * 1e9
+        places, rotations = poses(0, at)
+        assert (places == track.positions[first]).all()
+        assert not speeds(0, at[:-1])[0].any()
+        assert (rotations == rotations[0]).all() != turns
+        assert speeds(0, at[:-1])[1].any() == turns
+    # It comes and goes without ringing: never past the place, and never back.
+    way = np.column_stack([[0, 6, 11, 15, 18, 19, 19, 19, 20, 23, 28.0], np.zeros((11, 2))])
+    track = Track(np.arange(11.0), way, np.tile([0, 0, 0, 1.0], (11, 1)), smooth=True)
+    speed, _ = track.velocities(0, np.linspace(0, 10e9, 2000))
+    assert speed[:, 0].min() == 0
+    assert speed[:, 0].max() < 6.7
+
+
+def test_few_poses_make_straight_ways_and_parabolas():
+    at = np.linspace(0, 4, 33)
+    for count in (2, 3, 5):
+        times = np.array([0, 1, 4, 1.5, 3])[:count]
+        times.sort()
+        degree = min(count - 1, 3)
+        places = np.stack([times, times**degree, 0 * times], axis=1)
+        found, _ = Track(times, places, smooth=True).poses(0, at[at <= times[-1]] * 1e9)
+        np.testing.assert_allclose(found[:, 1], found[:, 0] ** degree, atol=1e-12)
+
+
+def test_pieces_and_the_signs_of_quaternions_do_not_matter():
+    flips = np.where(RNG.random(len(TURNS)) < 0.5, -1.0, 1.0)
+    one, other = (Track(TIMES, PLACES, q, smooth=True) for q in (TURNS, TURNS * flips[:, None]))
+    at = RNG.permutation(np.linspace(0, one.duration_ns, 333))
+    for method in ("poses", "velocities"):
+        whole = getattr(one, method)(0, at)
+        pieces = [getattr(other, method)(0, at[k : k + 1]) for k in range(len(at))]
+        for values, parts in zip(whole, zip(*pieces, strict=True), strict=True):
+            assert values.tobytes() == np.concatenate(parts).tobytes()
+
+
+@pytest.mark.parametrize("degrees", [72, 90, 170])
+def test_a_smooth_carrier_spins_and_turns_by_large_angles(degrees):
+    angles = np.zeros((30, 3))
+    angles[:, 0] = degrees * np.arange(30)
+    spin = Track(np.arange(30) * 0.1, PLACES[[0] * 30], quaternions_from_degrees(angles), True)
+    _, rates = spin.velocities(0, np.linspace(1e9, 2e9, 500))
+    assert np.abs(rates[:, 2] / np.radians(10 * degrees) - 1).max() < 0.04
+    turn = Track(
+        [0, 1, 2, 3], PLACES[[0] * 4], quaternions_from_degrees(angles[[0, 0, 1, 1]]), True
+    )
+    _, rates = turn.velocities(0, np.linspace(0, 3e9, 500))
+    assert rates[:, 2].min() == 0
+    assert np.isclose(rates[:, 2].mean() * 3, np.radians(degrees), rtol=0.01)
+
+
+def test_a_smooth_carrier_stays_where_a_log_pauses():
+    # At 200 Hz, 1 cm of noise is 2 m/s: a minute of that would be metres.
+    times = np.append(np.arange(100) * 0.005, 60 + np.arange(100) * 0.005)
+    noise = np.random.default_rng(1).normal(0, 0.01, (200, 3))
+    track = Track(times, noise, np.tile([0, 0, 0, 1.0], (200, 1)), smooth=True)
+    places, _ = track.poses(0, np.linspace(0, track.duration_ns, 100_000))
+    assert np.abs(places).max() < 1.5 * np.abs(noise).max()
 
 
 def test_without_angles_a_carrier_faces_its_way():
     track = Track([0, 1, 2, 3], [[0, 0, 0], [0, 0, 1], [0, 2, 1], [0, 2, 2]])
     assert [round(track.pose(0, t * 1e9).yaw_deg, 6) for t in (0, 1, 2, 3)] == [90] * 4
     assert Track([0, 1], [[0, 0, 0], [0, 0, 1]]).pose(0, 5e8).yaw_deg == 0
+    times = np.linspace(0, 2, 21)
+    circle = np.stack([20 * np.sin(times / 2), -20 * np.cos(times / 2), 0 * times], axis=1)
+    ends = [Track(times, circle, smooth=True).pose(0, t * 1e9).yaw_deg for t in (0, 2)]
+    assert np.allclose(ends, [0, np.degrees(1)], atol=0.01), "of the curve, not of its chords"
 
 
 @pytest.fixture

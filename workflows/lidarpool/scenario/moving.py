@@ -93,7 +93,7 @@ class TrajectorySection(Section):
         told("instead of a file: time_s, position and angles, world metres"),
     ] = ()
     interpolation: Annotated[
-        Literal["linear", "smooth"], told("of positions; rotations are even")
+        Literal["linear", "smooth"], told("of positions and rotations; IMUs need smooth")
     ] = "linear"
     offset_s: Annotated[Seconds, told("added to all times")] = 0.0
     start_s: Annotated[

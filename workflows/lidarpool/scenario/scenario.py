@@ -378,6 +378,9 @@ class Scenario(Section):
             yield "weather.fog_lidar_ratio_sr without weather.visibility_km is no fog"
         if self.noise.stray_light and not any(entry.retro for entry in self.materials):
             yield "noise.stray_light needs materials with retro: true, and there are none"
+        way, imu = self.trajectory, self.navigation and self.navigation.imu
+        if imu and way and way.interpolation == "linear" and len(way.points) != 2:
+            yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
         if self.noise.velocity_m_s and VELOCITY not in self.cloud.columns:
             yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
 

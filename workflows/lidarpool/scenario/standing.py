@@ -169,7 +169,6 @@ def following(track: Track, standing: Standing) -> list[Track]:
             times_s=times[run],
             positions=places[run],
             quaternions=quaternions_of(axes[run]),
-            smooth=False,
         )
         for run in runs
     ]

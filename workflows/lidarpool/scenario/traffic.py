@@ -65,9 +65,9 @@ class TrafficSection(Section):
             min_length=1,
         ),
     ] = None
-    interpolation: Annotated[
-        Literal["linear", "smooth"], told("of positions between time steps")
-    ] = "linear"
+    interpolation: Annotated[Literal["linear", "smooth"], told("of poses between time steps")] = (
+        "linear"
+    )
 
     def shape_of(self, kind: str) -> VehicleSection:
         """Return the entry of a type; LidarpoolError if there is none."""

@@ -13,6 +13,7 @@ from pydantic import Field
 from ..base.arguments import as_array, checked_fields, shown
 from ..base.declared import Angle, Triple, written_as
 from ..base.errors import LidarpoolError
+from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # Times since 1970 are coarser than a nanosecond in double precision, and the beams of the last
@@ -220,9 +221,9 @@ class Track:
         float64 (k, 4): x, y, z, w of the rotations from the carrier's axes to the scene's, of unit
         length within 1e-3. None if the carrier is level and faces its direction of travel.
     smooth
-        Positions follow cubic Hermite curves (tangents through three poses, as Catmull and Rom,
-        1974), not straight lines. Rotations turn evenly about one axis from each pose to the
-        next in both cases (Shoemake, 1985).
+        Positions and quaternions follow cubic splines, whose accelerations do not jump, and stand
+        still between equal poses. Otherwise positions follow straight lines, and rotations turn
+        evenly about one axis from each pose to the next (Shoemake, 1985).
     start_s
         Start of the station, by the same clock; by default the first time.
     duration_s
@@ -268,7 +269,8 @@ class Track:
         late = np.append(False, np.diff(times) <= 0)
         _refuse(late, "times must ascend, and that of pose {} does not come after the one before")
         if self.quaternions is None:
-            turns = _along(times, places)
+            slopes = np.gradient(places, times, axis=0).T
+            turns = _along(knots_of(times, places.T)[1] if self.smooth else slopes)
         else:
             turns = as_array("quaternions", self.quaternions).copy()
             if turns.shape != (len(times), 4):
@@ -330,13 +332,14 @@ class Track:
             If a time is not within the trajectory.
         """
         segment, since, _ = self._at(times_ns)
+        if self.smooth:
+            values, _ = on_curve(*self._spline, segment, since, False)
+            turns = values[3:] / np.sqrt((values[3:] ** 2).sum(axis=0))
+            return values[:3].T, matrices(turns.T)
         if len(segment) and segment.max() == segment.min():
             segment = segment[:1]  # all are in one
-        way, turn, rates = self._segments
-        # By Horner; a straight path has only two coefficients.
-        positions = way[-1].take(segment, axis=1)
-        for coefficient in way[-2::-1]:
-            positions = positions * since + coefficient.take(segment, axis=1)
+        start, speed, turn, rates, _ = self._segments
+        positions = speed.take(segment, axis=1) * since + start.take(segment, axis=1)
         angle = since * rates.take(segment)
         rotations = turn[0].take(segment, axis=1)
         for factor, table in ((np.sin(angle), turn[1]), (np.cos(angle), turn[2])):
@@ -354,11 +357,14 @@ class Track:
             If a time is not within the trajectory.
         """
         segment, since, within = self._at(times_ns)
-        way, _, _ = self._segments
-        linear = np.zeros((3, len(segment)))
-        for power in range(len(way) - 1, 0, -1):  # by Horner
-            linear = linear * since + power * way[power].take(segment, axis=1)
-        return (linear * within).T, (self._rates.take(segment, axis=1) * within).T
+        if self.smooth:
+            q, p = on_curve(*self._spline, segment, since, True)
+            # 2 p conjugate(q); the length of q may be any, and change.
+            turn = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
+            speeds, rates = p[:3], 2 * turn / (q[3:] ** 2).sum(axis=0)
+        else:
+            speeds, rates = (self._segments[k].take(segment, axis=1) for k in (1, 4))
+        return (speeds * within).T, (rates * within).T
 
     def _at(
         self, times_ns: NDArray[np.float64]
@@ -381,32 +387,24 @@ class Track:
         return segment, at - times.take(segment), within
 
     @cached_property
-    def _rates(self) -> NDArray[np.float64]:
-        """Angular velocities of segments in the scene's axes, rad/s: (3, s)."""
+    def _spline(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Knots of positions and quaternions, of which each is the nearer to the last; steps."""
         turns = self.quaternions
         assert turns is not None  # set above
-        axis, rates = _between(turns, self.times_s)
-        return np.ascontiguousarray((matrices(turns[:-1]) @ (axis * rates)[..., None])[..., 0].T)
+        flips = np.cumsum((turns[1:] * turns[:-1]).sum(axis=1) < 0)
+        groups = self.positions.T, turns.T * (1.0 - 2 * np.append(0, flips % 2))
+        knots = [knots_of(self.times_s, group) for group in groups]
+        return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
-    def _segments(self) -> tuple[list[NDArray[np.float64]], NDArray[np.float64], Any]:
-        """Coefficients of poses between two given ones, one column for each of s segments.
+    def _segments(self) -> tuple[NDArray[np.float64], ...]:
+        """Coefficients of poses on straight ways, one column for each of s segments.
 
-        Of the position's polynomial in seconds (3, s), the constant first; of the rotation
-        (3, 9, s), which is ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the
-        angle since the segment began; and the rates of that angle (s,), radians a second.
+        Positions at their starts and velocities (3, s); of the rotation (3, 9, s), which is
+        ``turn[0] + sin(a) turn[1] + cos(a) turn[2]`` (Rodrigues, 1840), a the angle since then;
+        and rates, radians a second, of that angle (s,) and about the scene's axes (3, s).
         """
-        steps = np.diff(self.times_s)[:, None]
-        speeds = np.diff(self.positions, axis=0) / steps
-        way = [self.positions[:-1], speeds]
-        if self.smooth:
-            tangents = np.gradient(self.positions, self.times_s, axis=0)
-            first, last = tangents[:-1], tangents[1:]
-            way[1:] = [
-                first,
-                (3 * speeds - 2 * first - last) / steps,
-                (first + last - 2 * speeds) / steps**2,
-            ]
+        speeds = np.diff(self.positions, axis=0) / np.diff(self.times_s)[:, None]
         turns = self.quaternions
         assert turns is not None  # set above
         axis, rates = _between(turns, self.times_s)
@@ -416,8 +414,10 @@ class Track:
         start = matrices(turns[:-1])
         square = start @ about @ about
         table = np.stack([start + square, start @ about, -square]).reshape(3, -1, 9)
-        columns = [np.ascontiguousarray(coefficient.T) for coefficient in way]
-        return columns, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0]
+        spins = (start @ (axis * rates)[..., None])[..., 0]
+        parts = self.positions[:-1], speeds, spins
+        begin, speed, spin = (np.ascontiguousarray(part.T) for part in parts)
+        return begin, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0], spin
 
 
 def _between(
@@ -461,16 +461,16 @@ def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
     return found
 
 
-def _along(times: NDArray[np.float64], places: NDArray[np.float64]) -> NDArray[np.float64]:
+def _along(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
     """Quaternions (k, 4) of a level carrier that faces its direction of travel.
 
     While it stands it keeps its direction; before it first moves it faces its first direction.
     """
-    x, y = (np.gradient(axis, times) for axis in (places[:, 0], places[:, 1]))
+    x, y, _ = slopes
     moving = np.flatnonzero(np.hypot(x, y) > 1e-9)
     if not len(moving):
         moving = np.zeros(1, np.intp)
-    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(times)), "right") - 1, 0)]
+    last = moving[np.maximum(np.searchsorted(moving, np.arange(len(x)), "right") - 1, 0)]
     half = np.arctan2(y[last], x[last]) / 2
     return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
 
