@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,7 @@ class Boxes:
     """Boxes of all actors in a sweep, at the time of their points.
 
     An actor moves during a sweep. Its box is at its pose at the mean time of its points, by their
-    scans, or at the start of the sweep if it has none.
+    scans if the cloud has no times, or at the start of the sweep if it has none.
     """
 
     centres: Floats  # (a, 3): metres, world coordinates
@@ -34,18 +35,14 @@ class Boxes:
         actor = points["object"].astype(np.int64) - len(sweeps.objects)
         rows = np.flatnonzero(actor >= 0)
         counts = np.bincount(actor[rows], minlength=count)
-        scans = points["scan"][rows] + 0.5 - sweeps.scans[sweep]
-        passed = np.bincount(actor[rows], scans, count) / np.maximum(counts, 1)
-        # Poses are known where sweeps of the sensor begin; after the last as before it.
-        own = np.flatnonzero(sweeps.sensor == sweeps.sensor[sweep])
-        before = max(min(sweep, own[-1] - 1), own[0])
-        pair = [before, min(before + 1, own[-1])]
-        share = np.zeros((count, 1))
-        if len(own) > 1:
-            # A sweep without a following pause gives the duration of a scan.
-            scan_ns = (np.diff(sweeps.begins_ns[own]) / np.diff(sweeps.scans)[own[:-1]]).min()
-            since, apart = sweeps.begins_ns[[sweep, pair[1]]] - sweeps.begins_ns[before]
-            share = (since + passed[:, None] * scan_ns) / apart
+        begin, end = sweeps.begins_ns[sweep], sweeps.ends_ns[sweep]
+        if "time" in points.columns:
+            share = (points["time"][rows] - begin) / max(end - begin, 1.0)
+        else:
+            first, stop = sweeps.scans[sweep : sweep + 2]
+            share = (points["scan"][rows] + 0.5 - first) / (stop - first)
+        share = (np.bincount(actor[rows], share, count) / np.maximum(counts, 1))[:, None]
+        pair = [sweep, sweep + len(sweeps)]  # poses at its start and end
         places, turns = (
             np.array([getattr(pose, what)[pair] for pose in sweeps.actor_poses]).reshape(-1, 2, n)
             for what, n in (("positions", 3), ("quaternions", 4))
@@ -58,6 +55,27 @@ class Boxes:
         return cls(
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
         )
+
+    @classmethod
+    def joined(cls, each: Sequence[Boxes]) -> Boxes:
+        """Return the boxes at the mean time of the points of several sweeps, taken at once.
+
+        Where actors have no points they are those of the first sweep.
+        """
+        counts = np.stack([one.points for one in each])
+        points = counts.sum(axis=0)
+        weights = np.where(
+            points, counts / np.maximum(points, 1), np.arange(len(each))[:, None] == 0
+        )
+        turns = np.stack([one.quaternions for one in each])
+        turns *= np.where((turns * turns[0]).sum(axis=2, keepdims=True) < 0, -1, 1)
+        centre, turn = (
+            (weights[..., None] * values).sum(axis=0)
+            for values in (np.stack([one.centres for one in each]), turns)
+        )
+        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
+        there = np.any([one.there for one in each], axis=0)
+        return cls(centre, turn, each[0].sizes, points, there)
 
 
 def type_of(name: str) -> str:

@@ -41,7 +41,8 @@ class Pieces(pieces.Pieces):
     began, intensity (0 to 255), ring. NAME is that of the sensor, LIDAR_TOP where it has none. The
     first sensor's sweeps are the samples; of another sensor, the first sweep that begins in a
     sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
-    sensor's, at each sweep. Actors are annotated in each sample.
+    sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean time of
+    their points in its key frames.
 
     In a data set each job is a scene with its name, on a day of its own, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -81,11 +82,10 @@ class Pieces(pieces.Pieces):
     def _tables(self, made: Sequence[Boxes]) -> dict[str, list[dict[str, Any]]]:
         tables = _Tables(self.sweeps, self.entry)
         tables.add_frames(self.channels, self.sample, self.names)
-        samples = int((self.sweeps.sensor == 0).sum())
-        counts = np.zeros((samples, len(self.sweeps.actors)), np.int64)
-        for sweep in np.flatnonzero(self.first):
-            counts[self.sample[sweep]] += made[int(sweep)].points
-        tables.add_actors(list(made[:samples]), counts)
+        keys: dict[int, list[Boxes]] = {}  # of each sample
+        for sweep in np.flatnonzero(self.first).tolist():
+            keys.setdefault(int(self.sample[sweep]), []).append(made[sweep])
+        tables.add_actors([Boxes.joined(boxes) for boxes in keys.values()])
         return tables.rows
 
 
@@ -217,7 +217,7 @@ class _Tables:
                     is_key_frame=names[sweep].startswith("samples/"), **beside,
                 )  # fmt: skip
 
-    def add_actors(self, boxes: list[Boxes], counts: Any) -> None:
+    def add_actors(self, boxes: list[Boxes]) -> None:
         """Add what actors are, and where they were in each sample."""
         kinds = [type_of(name) for name in self.sweeps.actors]
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
@@ -245,5 +245,5 @@ class _Tables:
                     instance_token=self._token("instance", actor), visibility_token="",
                     attribute_tokens=[], translation=box.centres[actor].tolist(),
                     size=[width, length, height], rotation=[w, x, y, z],
-                    num_lidar_pts=int(counts[number, actor]), num_radar_pts=0, **beside,
+                    num_lidar_pts=int(box.points[actor]), num_radar_pts=0, **beside,
                 )  # fmt: skip

@@ -197,8 +197,9 @@ def page_server(
             (r"/[^/]+/job/\d+/(|\w[\w.]*\.(?:css|js))", _File, viewer),
             (r"/[^/]+/(.*)", _Question, asked),
         ]
-        known = {"page": made, "in_notebook": cell_display() is not None}
-        server = HTTPServer(Application(handlers, log_function=lambda _: None, **known))
+        application = Application(handlers, log_function=lambda _: None)
+        application.settings |= {"page": made, "in_notebook": cell_display() is not None}
+        server = HTTPServer(application)
         server.add_socket(bound)
         running.set_result(asyncio.get_running_loop())
         await ended.wait()
