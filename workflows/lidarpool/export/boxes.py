@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,27 +54,6 @@ class Boxes:
         return cls(
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
         )
-
-    @classmethod
-    def joined(cls, each: Sequence[Boxes]) -> Boxes:
-        """Return the boxes at the mean time of the points of several sweeps, taken at once.
-
-        Where actors have no points they are those of the first sweep.
-        """
-        counts = np.stack([one.points for one in each])
-        points = counts.sum(axis=0)
-        weights = np.where(
-            points, counts / np.maximum(points, 1), np.arange(len(each))[:, None] == 0
-        )
-        turns = np.stack([one.quaternions for one in each])
-        turns *= np.where((turns * turns[0]).sum(axis=2, keepdims=True) < 0, -1, 1)
-        centre, turn = (
-            (weights[..., None] * values).sum(axis=0)
-            for values in (np.stack([one.centres for one in each]), turns)
-        )
-        turn /= np.linalg.norm(turn, axis=1, keepdims=True)
-        there = np.any([one.there for one in each], axis=0)
-        return cls(centre, turn, each[0].sizes, points, there)
 
 
 def type_of(name: str) -> str:

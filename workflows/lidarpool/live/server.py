@@ -93,12 +93,11 @@ class _Guarded(RequestHandler):
     def prepare(self) -> None:
         """Answer 404 without the token, and lead there from an address that is good once."""
         page: PageServer = self.settings["page"]
-        token = self.request.path.split("/")[1].encode()
-        for once in [one for one in page.good_once if compare_digest(one.encode(), token)]:
-            page.good_once.remove(once)
+        token = self.request.path.split("/")[1]
+        if token in page.good_once:
+            page.good_once.remove(token)
             self.redirect(page.url)
-            return
-        if not compare_digest(page.token.encode(), token):
+        elif not compare_digest(page.token.encode(), token.encode()):
             raise HTTPError(404)
 
     def log_exception(self, *error: Any) -> None:
