@@ -135,8 +135,7 @@ def _camera(sweeps: Sweeps, sensor: int) -> Floats:
     if not left.any():  # it looks straight up or down, or turned over
         return _CAMERA
     axes = np.stack([np.cross(left, up), left, up])
-    level: Floats = _CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True))
-    return level
+    return np.asarray(_CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)))
 
 
 def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:

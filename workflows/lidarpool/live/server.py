@@ -25,7 +25,6 @@ from functools import partial
 from hmac import compare_digest
 from html import escape
 from importlib.resources import files
-from importlib.util import find_spec
 from typing import Any
 
 import click
@@ -237,19 +236,14 @@ def announced(page: PageServer, words: str, browser: bool) -> Iterator[None]:
         yield
         return
     url, words = page.url, escape(words)
-    hub = os.environ.get(_HUB)
-    if hub is not None and find_spec("jupyter_server_proxy"):
+    if hub := os.environ.get(_HUB):  # in a frame, 127.0.0.1 would be the reader's own machine
         url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
-        words = words.replace(page.url, url)
-        hub = None
+        words += (
+            " It is shown through jupyter-server-proxy; without that, connect with ssh -L "
+            f"{page.port}:{HOST}:{page.port} and the machine's name, and open the address."
+        )
     link = f'<a href="{url}" target="_blank">{words}</a>'
     below = f'<iframe src="{url}" style="width:100%;height:640px;border:0"></iframe>'
-    if hub is not None:  # a frame would show the reader's own machine
-        below = (
-            "This address is on the kernel's machine: install jupyter-server-proxy, which leads "
-            f"there, or connect with ssh -L {page.port}:{HOST}:{page.port} and the machine's "
-            "name, then open it."
-        )
     shown = display.display(display.HTML(f"{link}<br>{below}"), display_id=True)
     try:
         yield
