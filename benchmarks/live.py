@@ -78,7 +78,7 @@ def looking(url: str) -> Iterator[list[int]]:
     ended = threading.Event()
 
     def ask(what: str) -> bytes:
-        with urllib.request.urlopen(f"{url}/{what}", timeout=60) as answer:
+        with urllib.request.urlopen(f"{url}{what}", timeout=60) as answer:
             found: bytes = answer.read()
         taken.append(len(found))
         return found

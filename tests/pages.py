@@ -12,7 +12,7 @@ import numpy as np
 
 def ask(url: str, what: str, headers: dict[str, str] | None = None, **asked: Any) -> Any:
     """Return the answer: its JSON, with the arrays as {name: array} under "arrays"."""
-    request = urllib.request.Request(f"{url}/{what}?{urlencode(asked)}", headers=headers or {})
+    request = urllib.request.Request(f"{url}{what}?{urlencode(asked)}", headers=headers or {})
     with urllib.request.urlopen(request, timeout=120) as response:
         return unpacked(response.read())
 

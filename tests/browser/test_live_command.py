@@ -19,6 +19,6 @@ def test_a_run_with_a_page_ends_by_itself_where_it_is_not_to_stay(tmp_path):
         cwd=tmp_path, capture_output=True, text=True, timeout=180,
     )  # fmt: skip
     assert ended.returncode == 0, ended.stderr
-    assert re.search(r"live page: http://127\.0\.0\.1:\d+\n", ended.stderr)
+    assert re.search(r"live page: http://127\.0\.0\.1:\d+/[\w-]{43}/\n", ended.stderr)
     assert "stays" not in ended.stderr
     assert (tmp_path / "lidarpool-out" / "cloud.ply").exists()

@@ -110,7 +110,7 @@ def test_points_in_their_own_colours(new_tab, tmp_path):
             return enough and red.nonzero()[1].mean() < blue.nonzero()[1].mean()
 
         tab.wait_for(halves)
-        other = opened(new_tab, page, "/#colour=rgb")
+        other = opened(new_tab, page, "#colour=rgb")
         other.wait_for(lambda _: other.value("lidarpool.chosen.colour") == "rgb")
         assert tab.errors == other.errors == []
 
@@ -187,13 +187,13 @@ def test_points_are_clicked_at_measured_filtered_and_linked_to(served, new_tab, 
     for row, shift, words in ((10_000, False, "wetness"), (12_000, True, "distance")):
         tab.press(*tab.value(f"{place}({row})"), shift=shift)
         tab.wait_for(lambda text, words=words: re.search(rf"\b{words}\s\d", text))
-    tab.open(served.url + "/#filter=scan,100,149&colour=wetness&camera=20,-20,9;0,0,4")
+    tab.open(served.url + "#filter=scan,100,149&colour=wetness&camera=20,-20,9;0,0,4")
     tab.wait_for(lambda text: re.search("4,16. points of 30,000", text) and "wetness, %" in text)
     tab.key("t")  # from the top, without perspective
     tab.wait_for(lambda _: tab.value(f"{PICTURE}.isParallel"))
     tab.key("c")
     link = tab.wait_for(lambda _: tab.value("location.hash") if "link" in tab.text else None)
-    other = opened(new_tab, served, "/" + tab.value("(history.state, location.hash)"))
+    other = opened(new_tab, served, tab.value("(history.state, location.hash)"))
     other.wait_for(lambda text: re.search("4,16. points of 30,000", text))
     assert "parallel" in link and other.value(f"{PICTURE}.isParallel")
     both = [one.value(f"{PICTURE}.camera.position.toArray()") for one in (tab, other)]
@@ -239,3 +239,11 @@ def colourful(picture):
     """Count the pixels left of the panel that are of a colour."""
     part = picture[60:560, 80:900].astype(int)
     return int((part.max(axis=2) - part.min(axis=2) > 60).sum())
+
+
+def test_no_page_of_another_server_frames_it(served, view, new_tab):
+    with page_server(view.answer, port=0) as other:
+        tab = opened(new_tab, other)
+        frame = "Object.assign(document.createElement('iframe'), {src: '" + served.url + "'})"
+        tab.value(f"document.body.append({frame})")
+        tab.wait_for(lambda _: any("frame-ancestors" in error for error in tab.errors))

@@ -419,6 +419,43 @@ def test_a_thinned_result_has_no_lost_returns(written, tmp_path):
     assert "one of 5 hits" in repr(compare(tmp_path, folder))
 
 
+@pytest.mark.parametrize("told", ["time", "ray", "neither"])
+def test_results_with_the_same_rays_are_paired_by_ray(tmp_path, told):
+    """A carrier that moves sees one cell by several rays; two returns of a ray are told apart."""
+    rng, speed = np.random.default_rng(2), 8.0
+    track = lidarpool.Track([0, 1], [[0, 0, 1], [speed, 0, 1]])
+    survey = Survey(SENSOR, trajectory=track, steps=36, precision_m=1e-4)
+    sweeps = Sweeps.of(survey, Scene.seed())
+    ray = np.repeat(np.arange(360 * LAYERS), 2)  # two returns each
+    firing, channel = np.divmod(ray, LAYERS)
+    ranges = 10 + 20 * rng.integers(0, 2, len(ray) // 2)[:, None] + [0, 5]  # posts before walls
+    way = directions(firing, np.linspace(-30, 30, LAYERS)[channel])
+    start = np.array([0, 0, 1]) + firing[:, None] / 360 * [0.1 * speed, 0, 0]
+    columns = {"scan": firing // 10, "channel": channel, "object": 0 * ray, "intensity": 0.0 * ray}
+    if told != "neither":
+        columns[told] = ray % (10 * LAYERS) if told == "ray" else firing * 277_778
+    noise, there = 0.01 * rng.normal(size=len(ray)), rng.uniform(size=len(ray)) > 0.1
+    there |= np.arange(len(ray)) % 2 == 0  # of A's second returns, a tenth is lost
+    for name, errors, kept in (("a", noise, there), ("b", 0 * noise, there | True)):
+        (tmp_path / name).mkdir()
+        places = start + (ranges.ravel() + errors)[:, None] * way
+        made = Cloud(places, columns, sweeps=lambda: sweeps).part(np.flatnonzero(kept))
+        made.save(tmp_path / name / "cloud.ply")
+        sweeps.save(tmp_path / name / "sweeps.npz")
+    found = compare(tmp_path / "a", tmp_path / "b")
+    image = found.figures["range_image"]
+    assert found.figures["pairs"] == 1 and found.figures["notes"] == []
+    assert image["paired_by"] == ("cells" if told == "neither" else "rays")
+    assert f" {image['paired_by']} of 16 rings" in repr(found)
+    if told == "neither":
+        assert image["residual"]["rmse_m"] > 0.5
+        return
+    assert image["residual"]["rmse_m"] == pytest.approx(0.01, rel=0.05)
+    lost = image["no_return"]
+    assert (image["residual"]["cells"], lost["in_a_only"]) == (there.sum(), (~there).sum())
+    assert lost["in_b_only"] == 0
+
+
 # -- what is wrong --------------------------------------------------------------------------------
 
 

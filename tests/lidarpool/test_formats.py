@@ -567,7 +567,7 @@ def traffic(scene) -> tuple[Cloud, Sweeps]:
     }
     count = len(columns["scan"])
     columns |= {"channel": np.zeros(count), "intensity": np.ones(count), "class": np.ones(count)}
-    columns["time"] = np.zeros(count)
+    columns["time"] = np.rint([survey.begins_ns(scan) for scan in columns["scan"]])
     sweeps = Sweeps.of(survey, scene)
     places = np.concatenate([places for places, _, _ in clouds])
     return Cloud(places, columns, sweeps=lambda: sweeps), sweeps
@@ -581,21 +581,14 @@ def test_boxes_of_kitti_hold_the_points_of_their_actors(traffic, tmp_path):
     cloud, sweeps = traffic
     cloud.save(tmp_path / "kitti", format="kitti")
     folder = tmp_path / "kitti/sequences/00"
-    back = np.loadtxt(folder / "calib.txt", usecols=range(1, 13))[4].reshape(3, 4)[:, :3]
     for sweep in (0, 1):
-        points = np.fromfile(folder / f"velodyne/{sweep:06}.bin", "<f4").reshape(-1, 4)[:, :3]
-        instances = np.fromfile(folder / f"labels/{sweep:06}.label", "<u4") >> 16
         lines = (folder / f"label_2/{sweep:06}.txt").read_text().splitlines()
         assert [line.split()[0] for line in lines] == ["Car", "Car"]  # the third has no points
-        for actor, line in enumerate(lines):
-            height, width, length, *place, around = map(float, line.split()[8:])
-            camera = points[instances == len(sweeps.objects) + actor + 1] @ back.T
+        for actor in (0, 1):
+            camera, *box_ = in_camera(folder, sweep, len(sweeps.objects) + actor + 1)
             assert len(camera) == 200
-            turn = np.array([[np.cos(around), 0, np.sin(around)], [0, 1, 0],
-                             [-np.sin(around), 0, np.cos(around)]])  # fmt: skip
-            centre = np.array(place) - [0, height / 2, 0]
             # It moves by 0.6 m or less while it is hit, and turns.
-            assert inside_box(camera, centre, turn, (length, height, width), 0.45).all()
+            assert inside_box(camera, *box_, 0.45).all()
 
 
 def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
@@ -603,7 +596,7 @@ def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
     track = Track([0, 9], [[0, 0, 0], [90, 0, 0]])
     scene = replace(scene, actors=(Actor(box("Car", (4, 2, 1.5)), track),))
     car = len(scene.names)
-    for steps, sweep, scan, when_s in ((54, 1, 45, 0.125), (54, 3, 99, 0.275), (36, 0, 9, 0)):
+    for steps, sweep, scan, when_s in ((54, 1, 45, 0.125), (54, 3, 99, 0.275), (36, 0, 9, 0.026)):
         poses = [(0, 0, 0), (5, 0, 0)][: 1 + (steps == 54)]
         survey = Survey(Sensor.grid(360, 4), poses, steps=steps)
         sweeps = Sweeps.of(survey, scene)
@@ -611,6 +604,53 @@ def test_boxes_are_where_actors_are_though_a_sensor_pauses(scene):
         boxes = Boxes.of(sweeps, sweep, points)
         assert boxes.points.tolist() == [1]
         np.testing.assert_allclose(boxes.centres, [[10 * when_s, 0, 0.75]], atol=0.02)
+
+
+@pytest.mark.parametrize("timed", [True, False])
+def test_boxes_of_tilted_sensors_hold_the_points_of_one_turn(scene, tmp_path, timed):
+    """Within 2 cm: a tilted camera, or the time at which a sweep begins, is 10 cm to 1 m off."""
+    track = Track([0, 1], [[-5, 8, 0], [10, 8, 0]])
+    scene = replace(scene, actors=(Actor(box("Car 1", (4, 2, 1.5)), track),))
+    mounts = Pose((0, 1, 2), 20.0, 3.0, -2.0), Pose((0, 0, 2), -90.0, -4.0)
+    sensors = [
+        Mounted(Sensor.grid(360, 4), mount, name) for mount, name in zip(mounts, "ab", strict=True)
+    ]
+    survey = Survey(sensors=sensors, poses=[(0, 0, 0)], steps=36)
+    sweeps, rng, scan = Sweeps.of(survey, scene), np.random.default_rng(3), np.repeat([25, 61], 200)
+    when = np.rint([survey.begins_ns(one) for one in scan])
+    scan_ns = survey.begins_ns(1) - survey.begins_ns(0)
+    when += 0 if timed else scan_ns / 2  # the middle of the scan is all that is known
+    corners = rng.choice([-1, 1], (400, 3)) * [2, 1, 0.75] + [0, 0, 0.75]
+    columns = {"scan": scan, "object": np.full(400, len(scene.names)), "class": np.ones(400)}
+    columns |= {"channel": np.zeros(400), "intensity": np.ones(400)}
+    columns |= {"time": when} if timed else {}
+    cloud = Cloud(track.poses(0, when)[0] + corners, columns, sweeps=lambda: sweeps)
+    cloud.save(tmp_path / "kitti", format="kitti")
+    for sequence in ("00", "01"):
+        folder = tmp_path / "kitti/sequences" / sequence
+        camera, centre, turn, size = in_camera(folder, 0, len(sweeps.objects) + 1)
+        assert inside_box(camera, centre, turn, size, 0.02).all()
+    seen = cloud.part(slice(200, 400))  # by the second sensor alone
+    seen.save(tmp_path / "nuscenes", format="nuscenes")
+    (table,) = (tmp_path / "nuscenes").glob("v1.0-*/sample_annotation.json")
+    (row,) = json.loads(table.read_text())
+    assert row["num_lidar_pts"] == 200
+    assert inside_box(seen.positions, row["translation"], np.eye(3), (4, 2, 1.5), 0.02).all()
+
+
+def in_camera(folder, sweep, instance):
+    """Return an object's points in KITTI's camera, and the middle, axes and size of its box."""
+    back = np.loadtxt(folder / "calib.txt", usecols=range(1, 13))[4].reshape(3, 4)[:, :3]
+    np.testing.assert_allclose(back @ back.T, np.eye(3), atol=1e-9)
+    points = np.fromfile(folder / f"velodyne/{sweep:06}.bin", "<f4").reshape(-1, 4)[:, :3]
+    instances = np.fromfile(folder / f"labels/{sweep:06}.label", "<u4") >> 16
+    labels = (folder / f"label_2/{sweep:06}.txt").read_text().splitlines()
+    first = instances[instances > 0].min()
+    height, width, length, *place, around = map(float, labels[instance - first].split()[8:])
+    turn = np.array([[np.cos(around), 0, np.sin(around)], [0, 1, 0],
+                     [-np.sin(around), 0, np.cos(around)]])  # fmt: skip
+    centre = np.array(place) - [0, height / 2, 0]
+    return points[instances == instance] @ back.T, centre, turn, (length, height, width)
 
 
 def test_boxes_of_nuscenes_hold_the_points_of_their_actors(traffic, tmp_path):

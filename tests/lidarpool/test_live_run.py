@@ -171,8 +171,7 @@ def test_the_panel_tells_stages_pace_and_what_is_waited_for(live):
 
 def test_a_run_is_stopped_as_by_an_interrupt(live):
     live.on_progress(progress(1.0, 1))
-    order = {"X-Lidarpool": "1"}
-    request = urllib.request.Request(f"{live.page.url}/stop", data=b"", headers=order)
+    request = urllib.request.Request(f"{live.page.url}stop", data=b"")
     urllib.request.urlopen(request, timeout=LONG_S).close()
     assert news(live)[0]["stopping"]
     with pytest.raises(KeyboardInterrupt):

@@ -1,6 +1,9 @@
-"""The page is for this machine alone."""
+"""The page is for who knows its address alone."""
 
 import http.client
+import json
+import subprocess
+import sys
 import threading
 import time
 import types
@@ -12,27 +15,19 @@ import pytest
 from tests.pages import ask
 
 from lidarpool.live.points import Abandoned
-from lidarpool.live.server import announced, may_ask, page_server
+from lidarpool.live.server import announced, page_server
 
-# {(Host, Origin): whether it may ask}
-ASKED = {
-    ("127.0.0.1:8080", None): True,
-    ("127.0.0.1:8080", "http://127.0.0.1:8080"): True,
-    ("localhost:18080", "http://localhost:18080"): True,
-    ("LOCALHOST", "http://localhost"): True,
-    ("[::1]:80", "http://[::1]:80"): True,
-    ("[::1]", None): True,
-    ("example.com:8080", None): False,  # rebound to 127.0.0.1 by its own DNS server
-    ("example.com:8080", "http://example.com:8080"): False,
-    ("localhost.example.com:8080", None): False,
-    ("192.168.0.2:8080", None): False,
-    ("0.0.0.0:8080", None): False,
-    ("", None): False,
-    ("127.0.0.1:8080", "http://example.com"): False,
-    ("127.0.0.1:8080", "http://127.0.0.1:9090"): False,  # another server of this machine
-    ("127.0.0.1:8080", "null"): False,
-    ("127.0.0.1:8080", "file://"): False,
-}
+# Another user's process: asks for addresses, prints their status and whether it saw anything.
+STRANGER = """
+import encodings.idna, http.client, json, os, sys  # all, before it is a user who reads no files
+if os.getuid() == 0:
+    os.setgroups([]), os.setgid(65534), os.setuid(65534)
+for port, method, path in json.loads(sys.argv[1]):
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=120)
+    connection.request(method, path)
+    answer = connection.getresponse()
+    print(answer.status, b"secret" in answer.read())
+"""
 
 
 class Secrets:
@@ -68,19 +63,14 @@ def served():
         yield page, source
 
 
-def said(page, method, what, **headers):
+def said(page, method, what, path=None):
     """Return the status and the body of an answer."""
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=120)
-    connection.request(method, f"/{what}", headers=headers)
+    connection.request(method, f"/{page.token}/{what}" if path is None else path)
     answer = connection.getresponse()
     body = answer.read()
     connection.close()
     return answer.status, body
-
-
-@pytest.mark.parametrize(("host", "origin"), ASKED)
-def test_who_may_ask(host, origin):
-    assert may_ask(host, origin) == ASKED[host, origin]
 
 
 def test_questions_are_answered_with_words_and_arrays(served):
@@ -105,29 +95,55 @@ def test_the_page_is_there_and_asks_nobody_else(served):
         assert name == "three.min.js" or b"https://" not in text.replace(b"http://www.w3.org", b"")
 
 
-def test_a_stranger_sees_nothing_and_presses_nothing(served, caplog):
+def test_another_user_needs_the_token(served):
     page, source = served
-    port = page.port
-    strange = {"Host": f"example.com:{port}"}, {"Origin": "http://example.com:8080"}
-    for headers in strange:
-        for method, what in (("GET", ""), ("GET", "secret"), ("POST", "stop")):
-            headers = {**headers, "X-Lidarpool": "1"}
-            status, body = said(page, method, what, **headers)
-            assert (status, b"secret" in body) == (403, False)
-    assert "refused" in caplog.text
-    # A form of a strange page, in a browser that tells no origin, cannot set a header.
-    assert said(page, "POST", "stop")[0] == 403
+    wrong = page.token[:-1] + ("A" if page.token[-1] != "A" else "B")
+    begins = ("/", "//", f"/{wrong}/", f"/{page.token[:-1]}/", "/job/7/", f"/{wrong}/job/7/")
+    asked = [("GET", ""), ("GET", "secret"), ("GET", "page.js"), ("POST", "stop"), ("HEAD", "")]
+    strange = [(page.port, method, begin + what) for begin in begins for method, what in asked]
+    assert stranger(strange) == ["404 False"] * len(strange)
     assert source.ordered == []
-    own = {"Origin": page.url, "X-Lidarpool": "1"}
-    assert said(page, "POST", "stop", **own)[0] == 200
-    assert said(page, "POST", "nothing", **own)[0] == 404
+    own = [(page.port, *one) for one in (("GET", f"/{page.token}/secret"),
+                                         ("POST", f"/{page.token}/nothing"),
+                                         ("POST", f"/{page.token}/stop"))]  # fmt: skip
+    assert stranger(own) == ["200 True", "404 False", "200 False"]
     assert source.ordered == ["stop"]
+
+
+def stranger(asked):
+    """Return what a process of another user is answered."""
+    command = [sys.executable, "-I", "-c", STRANGER, json.dumps(asked)]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=True)
+    return done.stdout.splitlines()
+
+
+def test_what_a_browser_is_started_with_is_good_once(served):
+    """Other users see it in the list of processes."""
+    page, _ = served
+    once = page.once()
+    assert page.token not in once
+    with urllib.request.urlopen(once, timeout=120) as answer:
+        assert (answer.url, b"<!doctype html>" in answer.read()) == (page.url, True)
+    assert said(page, "GET", "", f"/{once.split('/')[-2]}/")[0] == 404
+
+
+@pytest.mark.parametrize("in_notebook", [False, True])
+def test_other_pages_frame_it_in_notebooks_only_and_learn_no_address(monkeypatch, in_notebook):
+    display = object() if in_notebook else None
+    monkeypatch.setattr("lidarpool.live.server.cell_display", lambda: display)
+    source = Secrets()
+    with page_server(source.answer, 0) as page:
+        for what in ("", "job/7/", "secret"):
+            with urllib.request.urlopen(page.url + what, timeout=120) as answer:
+                allowed = answer.headers["Content-Security-Policy"]
+                assert answer.headers["Referrer-Policy"] == "no-referrer"
+            assert allowed == (None if in_notebook else "frame-ancestors 'self'")
 
 
 def test_an_answer_that_nobody_waits_for_is_given_up(served):
     page, source = served
     connection = http.client.HTTPConnection("127.0.0.1", page.port, timeout=120)
-    connection.request("GET", "/slow")
+    connection.request("GET", f"/{page.token}/slow")
     assert source.asked.wait(120)
     connection.sock.close()
     connection.close()
@@ -151,30 +167,23 @@ def test_an_error_of_ours_is_logged_and_the_page_stays(served, caplog, monkeypat
     assert said(page, "GET", "")[0] == 200
 
 
-@pytest.mark.parametrize("hub", ["none", "a hub", "a hub with a proxy"])
-def test_a_cell_shows_the_page_or_says_how_to_reach_it(served, monkeypatch, hub):
+@pytest.mark.parametrize("hub", [False, True])
+def test_a_cell_shows_the_page_and_says_how_else_to_reach_it(served, monkeypatch, hub):
     """On a hub, 127.0.0.1 in a frame would be the reader's own machine."""
     cells = []
     cell = types.SimpleNamespace(update=cells.append)
     display = types.SimpleNamespace(HTML=str, display=lambda html, **_: cells.append(html) or cell)
     monkeypatch.setattr("lidarpool.live.server.cell_display", lambda: display)
-    monkeypatch.setattr(
-        "lidarpool.live.server.find_spec", lambda name: hub.endswith("proxy") or None
-    )
     monkeypatch.delenv("JUPYTERHUB_SERVICE_PREFIX", raising=False)
-    if hub != "none":
+    if hub:
         monkeypatch.setenv("JUPYTERHUB_SERVICE_PREFIX", "/user/ada/")
     page = served[0]
     with announced(page, f"live page: {page.url}", browser=True):
         (shown,) = cells
     assert cells == [shown, ""]
-    proxied = f"/user/ada/proxy/{page.port}/"
-    assert ("<iframe" in shown) == (hub != "a hub")
-    assert (f'src="{proxied}"' in shown) == hub.endswith("proxy")
-    assert (f"ssh -L {page.port}:127.0.0.1:{page.port}" in shown) == (hub == "a hub")
-    if hub != "none":  # through the hub's proxy, the page has the hub's name
-        headers = {"Host": "hub.example.com", "Origin": "https://hub.example.com"}
-        assert said(page, "GET", "secret", **headers)[0] == 200
+    proxied = f"/user/ada/proxy/{page.port}/{page.token}/"
+    assert f'<iframe src="{proxied if hub else page.url}"' in shown and page.url in shown
+    assert (f"ssh -L {page.port}:127.0.0.1:{page.port}" in shown) == hub
 
 
 def test_json_has_no_words_that_browsers_cannot_read(served, monkeypatch):

@@ -18,7 +18,7 @@ class Boxes:
     """Boxes of all actors in a sweep, at the time of their points.
 
     An actor moves during a sweep. Its box is at its pose at the mean time of its points, by their
-    scans, or at the start of the sweep if it has none.
+    scans if the cloud has no times, or at the start of the sweep if it has none.
     """
 
     centres: Floats  # (a, 3): metres, world coordinates
@@ -34,18 +34,14 @@ class Boxes:
         actor = points["object"].astype(np.int64) - len(sweeps.objects)
         rows = np.flatnonzero(actor >= 0)
         counts = np.bincount(actor[rows], minlength=count)
-        scans = points["scan"][rows] + 0.5 - sweeps.scans[sweep]
-        passed = np.bincount(actor[rows], scans, count) / np.maximum(counts, 1)
-        # Poses are known where sweeps of the sensor begin; after the last as before it.
-        own = np.flatnonzero(sweeps.sensor == sweeps.sensor[sweep])
-        before = max(min(sweep, own[-1] - 1), own[0])
-        pair = [before, min(before + 1, own[-1])]
-        share = np.zeros((count, 1))
-        if len(own) > 1:
-            # A sweep without a following pause gives the duration of a scan.
-            scan_ns = (np.diff(sweeps.begins_ns[own]) / np.diff(sweeps.scans)[own[:-1]]).min()
-            since, apart = sweeps.begins_ns[[sweep, pair[1]]] - sweeps.begins_ns[before]
-            share = (since + passed[:, None] * scan_ns) / apart
+        begin, end = sweeps.begins_ns[sweep], sweeps.ends_ns[sweep]
+        if "time" in points.columns:
+            share = (points["time"][rows] - begin) / max(end - begin, 1.0)
+        else:
+            first, stop = sweeps.scans[sweep : sweep + 2]
+            share = (points["scan"][rows] + 0.5 - first) / (stop - first)
+        share = (np.bincount(actor[rows], share, count) / np.maximum(counts, 1))[:, None]
+        pair = [sweep, sweep + len(sweeps)]  # poses at its start and end
         places, turns = (
             np.array([getattr(pose, what)[pair] for pose in sweeps.actor_poses]).reshape(-1, 2, n)
             for what, n in (("positions", 3), ("quaternions", 4))

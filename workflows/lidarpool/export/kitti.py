@@ -16,7 +16,7 @@ from .pieces import Data, Entry, as_data
 from .sweeps import Floats, Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
-# From the sensor's axes to KITTI's of a camera: x to the right, y down, z ahead.
+# From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
 
@@ -30,7 +30,8 @@ class Pieces(pieces.Pieces):
     number + 1), where there are actors `label_2/000000.txt` (boxes of those that have points),
     `poses.txt` (3 x 4, from the first), `times.txt` in seconds and `calib.txt`. Poses and boxes
     are in axes of a camera as KITTI's are, which sits where the sensor does; `Tr` leads to them.
-    KITTI's own tools look for the poses in `poses/00.txt`.
+    The camera is level where the sensor is tilted, in the mean over its sweeps, because KITTI turns
+    boxes about its vertical axis alone. KITTI's own tools look for the poses in `poses/00.txt`.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
@@ -43,6 +44,7 @@ class Pieces(pieces.Pieces):
         self.sequences = [f"sequences/{name}" for name in self.names]
         kinds = ("velodyne", "labels", *(["label_2"] if sweeps.actors else []))
         self.folders = [f"{folder}/{kind}" for folder in self.sequences for kind in kinds]
+        self.cameras = [_camera(sweeps, sensor) for sensor in range(len(sweeps.sensors))]
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes | None]:
         """Return the files of a sweep, and its boxes where there are actors."""
@@ -59,25 +61,26 @@ class Pieces(pieces.Pieces):
         if not sweeps.actors:
             return files, None
         boxes = Boxes.of(sweeps, number, points)
-        files[f"{folder}/label_2/{name}.txt"] = _labels(sweeps, number, boxes).encode()
+        camera = self.cameras[sweeps.sensor[number]]
+        files[f"{folder}/label_2/{name}.txt"] = _labels(sweeps, number, boxes, camera).encode()
         return files, boxes
 
     def others(self, made: Sequence[Boxes | None]) -> dict[str, bytes]:
         """Return poses, times and calibrations."""
         sweeps = self.sweeps
         files: dict[str, bytes] = {}
-        for sensor, folder in enumerate(self.sequences):
+        for sensor, (folder, camera) in enumerate(zip(self.sequences, self.cameras, strict=True)):
             own = sweeps.sensor == sensor
             turns, places = matrices(sweeps.pose.quaternions[own]), sweeps.pose.positions[own]
-            first = _CAMERA @ turns[0].T
+            first = camera @ turns[0].T
             rows = np.concatenate(
-                [first @ turns @ _CAMERA.T, ((places - places[0]) @ first.T)[..., None]], axis=2
+                [first @ turns @ camera.T, ((places - places[0]) @ first.T)[..., None]], axis=2
             )
             poses = _table(rows.reshape(-1, 12))
             files |= {f"{folder}/poses.txt": poses, f"poses/{self.names[sensor]}.txt": poses}
             files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[own] / 1e9)
-            lines = [f"P{camera}: {_row(np.eye(3))}\n" for camera in range(4)]
-            files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(_CAMERA)}\n"]).encode()
+            lines = [f"P{number}: {_row(np.eye(3))}\n" for number in range(4)]
+            files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(camera)}\n"]).encode()
         return files
 
 
@@ -125,16 +128,26 @@ def _row(turn: Floats) -> str:
     return " ".join(f"{value:.9e}" for value in np.column_stack([turn, np.zeros(3)]).ravel())
 
 
-def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes) -> str:
+def _camera(sweeps: Sweeps, sensor: int) -> Floats:
+    """Rotation (3, 3) from a sensor's axes to those of a level camera that looks where it does."""
+    up = matrices(sweeps.pose.quaternions[sweeps.sensor == sensor])[:, 2].sum(axis=0)
+    left = np.cross(up, [1, 0, 0])
+    if not left.any():  # it looks straight up or down, or turned over
+        return _CAMERA
+    axes = np.stack([np.cross(left, up), left, up])
+    return np.asarray(_CAMERA @ (axes / np.linalg.norm(axes, axis=1, keepdims=True)))
+
+
+def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
     """Lines of label_2, without a picture; truncation and occlusion are not computed.
 
     The place is the middle of the underside; boxes are turned about the camera's y alone.
     """
-    turn = matrices(sweeps.pose.quaternions[sweep, None])[0]
-    axes = turn.T @ matrices(boxes.quaternions)  # of the actors, in the sensor's
-    under = -axes[:, :, 2] * boxes.sizes[:, 2:] / 2
-    places = (sweeps.pose.inward(sweep, boxes.centres) + under) @ _CAMERA.T
-    around = _wrapped(-np.arctan2(axes[:, 1, 0], axes[:, 0, 0]) - np.pi / 2)
+    turn = camera @ matrices(sweeps.pose.quaternions[sweep, None])[0].T
+    ahead = (turn @ matrices(boxes.quaternions))[:, :, 0]  # of the actors
+    places = sweeps.pose.inward(sweep, boxes.centres) @ camera.T
+    places[:, 1] += boxes.sizes[:, 2] / 2
+    around = np.arctan2(-ahead[:, 2], ahead[:, 0])
     seen = _wrapped(around - np.arctan2(places[:, 0], places[:, 2]))
     lines = []
     for actor in np.flatnonzero(boxes.points):

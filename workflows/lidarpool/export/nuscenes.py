@@ -41,7 +41,8 @@ class Pieces(pieces.Pieces):
     began, intensity (0 to 255), ring. NAME is that of the sensor, LIDAR_TOP where it has none. The
     first sensor's sweeps are the samples; of another sensor, the first sweep that begins in a
     sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
-    sensor's, at each sweep. Actors are annotated in each sample.
+    sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean time of
+    their points in its key frames.
 
     In a data set each job is a scene with its name, on a day of its own, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -81,11 +82,10 @@ class Pieces(pieces.Pieces):
     def _tables(self, made: Sequence[Boxes]) -> dict[str, list[dict[str, Any]]]:
         tables = _Tables(self.sweeps, self.entry)
         tables.add_frames(self.channels, self.sample, self.names)
-        samples = int((self.sweeps.sensor == 0).sum())
-        counts = np.zeros((samples, len(self.sweeps.actors)), np.int64)
+        keys: list[list[Boxes]] = [[] for _ in range(int((self.sweeps.sensor == 0).sum()))]
         for sweep in np.flatnonzero(self.first):
-            counts[self.sample[sweep]] += made[int(sweep)].points
-        tables.add_actors(list(made[:samples]), counts)
+            keys[self.sample[sweep]].append(made[int(sweep)])
+        tables.add_actors(keys)
         return tables.rows
 
 
@@ -217,14 +217,14 @@ class _Tables:
                     is_key_frame=names[sweep].startswith("samples/"), **beside,
                 )  # fmt: skip
 
-    def add_actors(self, boxes: list[Boxes], counts: Any) -> None:
-        """Add what actors are, and where they were in each sample."""
+    def add_actors(self, boxes: list[list[Boxes]]) -> None:
+        """Add what actors are, and where they were in the key frames of each sample."""
         kinds = [type_of(name) for name in self.sweeps.actors]
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
         for kind in dict.fromkeys(kinds):
             self._add("category", kind, name=kind, description="")
         for actor, kind in enumerate(kinds):
-            there = [number for number, box in enumerate(boxes) if box.there[actor]]
+            there = [k for k, keys in enumerate(boxes) if any(box.there[actor] for box in keys)]
             if not there:
                 continue
             whats = [(actor, number) for number in there]
@@ -236,14 +236,17 @@ class _Tables:
             )  # fmt: skip
             chain = self._chain("sample_annotation", whats)
             for number, beside in zip(there, chain, strict=True):
-                box = boxes[number]
+                box = max(boxes[number], key=lambda one: one.points[actor])
+                counts = [one.points[actor] for one in boxes[number]]
+                centres = [one.centres[actor] for one in boxes[number]]
+                centre = np.average(centres, 0, counts) if any(counts) else box.centres[actor]
                 x, y, z, w = box.quaternions[actor].tolist()
                 length, width, height = box.sizes[actor].tolist()
                 self._add(
                     "sample_annotation", (actor, number),
                     sample_token=self._token("sample", number),
                     instance_token=self._token("instance", actor), visibility_token="",
-                    attribute_tokens=[], translation=box.centres[actor].tolist(),
+                    attribute_tokens=[], translation=centre.tolist(),
                     size=[width, length, height], rotation=[w, x, y, z],
-                    num_lidar_pts=int(counts[number, actor]), num_radar_pts=0, **beside,
+                    num_lidar_pts=int(sum(counts)), num_radar_pts=0, **beside,
                 )  # fmt: skip

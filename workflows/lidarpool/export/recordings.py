@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from ..base.allowance import check_fits
 from ..base.errors import LidarpoolError, prefixed
+from ..base.fingerprint import fingerprint
 from ..base.words import did_you_mean, printable
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
@@ -52,6 +53,7 @@ class Turn:
     points: Floats  # (n, 3): metres
     rings: NDArray[np.int64] | None = None  # (n,)
     light: Floats | None = None  # (n,): intensities, of any scale
+    rays: NDArray[np.int64] | None = None  # (n,): which ray and return; not of parts
 
     def __len__(self) -> int:
         return len(self.points)
@@ -90,6 +92,7 @@ class Recording:
     times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
     notes: tuple[str, ...] = ()
     thinned: bool = False  # whether hits were left out, so that gaps say nothing
+    firings: str = ""  # recordings with the same have the same rays; "" for unknown
 
     def turn(self, number: int, *, in_world: bool = False) -> Turn:
         """Read a sweep in its sensor's axes or the world's; LidarpoolError if it cannot be."""
@@ -120,6 +123,7 @@ class Recording:
             places,
             None if rings is None else np.asarray(rings).astype(np.int64),
             None if light is None else np.asarray(light).astype(np.float64),
+            _rays(columns)[there] if self.firings and not in_world else None,
         )
 
 
@@ -196,7 +200,23 @@ def _of_cloud(
         return there.in_sensor(at, points.positions), points.columns, pose
 
     times = there.begins_ns[numbers] + (there.start_ns or 0)
+    columns = {column.name for column in cloud.table}
+    if told := columns & {"time", "ray"}:
+        poses = there.pose.positions[numbers], there.pose.quaternions[numbers]
+        known = max(told), "return_number" in columns  # time rather than ray, as `_rays`
+        more["firings"] = fingerprint(known, there.scans[numbers], there.begins_ns[numbers], poses)
     return Recording(name, len(numbers), sweep, light, times=lambda: times, **more)
+
+
+def _rays(columns: Columns) -> NDArray[np.int64]:
+    """Return numbers (n,) that differ for all rays of a sweep, and for the returns of each."""
+    if "time" in columns:
+        rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
+    else:
+        rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
+    _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
+    order: NDArray[np.int64] = np.arange(len(rays)) - first[ray]  # returns of a ray are together
+    return rays << 8 | columns.get("return_number", order)
 
 
 def _of_ply(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:

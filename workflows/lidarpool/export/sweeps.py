@@ -32,9 +32,9 @@ MIXED_UP = (
     f"({SWEEPS_FILE}): give both of one run, and keep the order."
 )
 _PIECE = 250_000  # points that are read at a time: several threads or tasks have so many
-_FORMAT = 3
+_FORMAT = 4
 # Fields of `Sweeps` that a file holds under their names: as an array each, and as JSON.
-_ARRAYS = ("scans", "begins_ns", "sensor", "actor_bounds", "actor_there")
+_ARRAYS = ("scans", "begins_ns", "ends_ns", "sensor", "actor_bounds", "actor_there")
 _WORDS = ("sensors", "objects", "actors", "coordinates", "precision_m", "epsg", "start_ns")
 
 
@@ -67,13 +67,14 @@ class Sweeps:
 
     scans: NDArray[np.int64]  # (n + 1,): the first of each sweep, and one past the last of all
     begins_ns: Floats  # (n,): nanoseconds since the survey's start
+    ends_ns: Floats  # (n,): when the last firing of each begins
     sensor: NDArray[np.uint8]  # (n,): its number
     pose: Placed  # of the sensors
     mounts: Placed  # of each sensor in the carrier's axes
     sensors: tuple[str, ...]  # names
     objects: tuple[str, ...]
     actors: tuple[str, ...]  # they follow the objects in the column `object`
-    actor_poses: tuple[Placed, ...]  # of each actor
+    actor_poses: tuple[Placed, ...]  # of each actor (2n,): at starts of sweeps, then at their ends
     actor_bounds: Floats  # (a, 2, 3): corners of each actor's box in its own axes, metres
     actor_there: NDArray[np.bool_]  # (a, n): whether each actor is in the scene
     coordinates: str  # of the cloud's points, "world" or "sensor"
@@ -109,8 +110,8 @@ class Sweeps:
         """Return no sweeps, for points of an unknown survey, in steps of a millimetre."""
         none = Placed(np.empty((0, 3)), np.empty((0, 4)))
         return cls(
-            np.zeros(1, np.int64), np.empty(0), np.empty(0, np.uint8), none, none, (), (), (), (),
-            np.empty((0, 2, 3)), np.empty((0, 0), bool), "world", 0.001,
+            np.zeros(1, np.int64), np.empty(0), np.empty(0), np.empty(0, np.uint8), none, none,
+            (), (), (), (), np.empty((0, 2, 3)), np.empty((0, 0), bool), "world", 0.001,
         )  # fmt: skip
 
     @classmethod
@@ -118,11 +119,11 @@ class Sweeps:
         """Return the sweeps of a survey of a scene."""
         path = survey.path
         scans, begins, sensors, places, turns, mounts, done = [], [], [], [], [], [], 0
-        first_steps = []
+        first_steps, ends = [], []
         for number, (carried, steps) in enumerate(
             zip(survey.carried, survey.steps_each, strict=True)
         ):
-            firsts, since = _of_head(carried.sensor, steps)
+            firsts, since, until = _of_head(carried.sensor, steps)
             mount = carried.mount
             turned = np.eye(3) if mount.rotation is None else mount.rotation
             mounts.append((mount.position, turned))
@@ -132,15 +133,16 @@ class Sweeps:
                 places.append(positions + rotations @ np.array(mount.position))
                 turns.append(rotations @ turned)
                 begins.append(station * survey.station_ns + since)
+                ends.append(station * survey.station_ns + until)
                 scans.append(done + firsts)
                 first_steps.append(firsts)
                 done += steps
             sensors.append(np.full(len(since) * path.stations, number, np.uint8))
-        when = np.concatenate(begins)
+        when, end = np.concatenate(begins), np.concatenate(ends)
         actor_poses, there = [], []
         for actor in scene.actors:
-            at, turned_by = actor.trajectory.poses(0, when)
-            actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(when))))
+            at, turned_by = actor.trajectory.poses(0, np.append(when, end))
+            actor_poses.append(_placed(at + scene.origin, _full(turned_by, len(at))))
             appears, leaves = presence_ns(actor.trajectory)
             there.append((appears <= when) & (when <= leaves))
         bounds = [
@@ -155,6 +157,7 @@ class Sweeps:
         return cls(
             np.append(np.concatenate(scans), done),
             when,
+            end,
             np.concatenate(sensors),
             _placed(np.concatenate(places) + scene.origin, np.concatenate(turns)),
             _placed(*(np.array(part) for part in zip(*mounts, strict=True))),
@@ -278,11 +281,14 @@ def plain_names(names: Iterable[str]) -> list[str]:
     return out
 
 
-def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats]:
-    """First time step of each of so many sweeps, and their starts since that of the station."""
+def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats, Floats]:
+    """First time step of each of so many sweeps, their starts and ends since the station's."""
     firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
-    begins = sensor.begins_ns(np.array([sensor.firings(step)[0] for step in firsts.tolist()]))
-    return firsts, begins + sensor.lead_ns
+    lasts = np.append(firsts[1:], steps) - 1
+    firings = [[sensor.firings(step)[0] for step in firsts.tolist()]]
+    firings += [[sensor.firings(step)[1] - 1 for step in lasts.tolist()]]
+    begins, ends = (sensor.begins_ns(np.array(each)) + sensor.lead_ns for each in firings)
+    return firsts, begins, ends
 
 
 def _full(rotations: Floats | None, count: int) -> Floats:

@@ -1,7 +1,9 @@
 """Serves a page to browsers of this machine: files, and answers to what the page asks for.
 
-The page asks with GET and gives orders with POST. All addresses within it are relative, so that it
-also works behind a proxy.
+The page asks with GET and gives orders with POST. Its address holds a random token; other addresses
+are answered with 404, so that only who knows the token sees the page or orders anything: no other
+user of the machine, and no website. All addresses within the page are relative, so that it also
+works behind a proxy.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ import asyncio
 import json
 import logging
 import os
+import secrets
 import socket
 import sys
 import threading
@@ -17,11 +20,11 @@ import webbrowser
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import partial
+from hmac import compare_digest
 from html import escape
 from importlib.resources import files
-from importlib.util import find_spec
 from typing import Any
 
 import click
@@ -38,9 +41,6 @@ PORT = 8080  # or the next that is free
 VIEWER = "index.html"
 _PORTS_TRIED = 100
 
-# A browser reaches this machine by these names, also through a port forwarded by SSH, with any
-# number. A foreign DNS name that points here is not among them.
-OWN_NAMES = frozenset({"127.0.0.1", "localhost", "[::1]"})
 _HUB = "JUPYTERHUB_SERVICE_PREFIX"  # in the environment of kernels of a hub: where its user's is
 
 _ALIGNED = 8  # bytes, that arrays begin at multiples of
@@ -78,26 +78,26 @@ def bundle(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[b
 
 
 class _Guarded(RequestHandler):
-    """Answers pages of this machine."""
+    """Answers who knows the page's token."""
 
     def set_default_headers(self) -> None:
         self.clear_header("Server")
         self.set_header("Cache-Control", "no-store")
+        self.set_header("Referrer-Policy", "no-referrer")  # the address holds the token
+        # The page of a campaign frames those of its jobs. The cell of a notebook, whose address is
+        # unknown here, frames any of them.
+        if not self.settings["in_notebook"]:
+            self.set_header("Content-Security-Policy", "frame-ancestors 'self'")
 
     def prepare(self) -> None:
-        """Refuse pages from elsewhere.
-
-        That the server listens on the loopback interface does not help: the browser with a foreign
-        page is on this machine. Such a page cannot read answers, unless its own DNS name points
-        here; and a browser tells where an order comes from.
-        """
-        if _HUB in os.environ:  # its proxy has asked who it is, and no browser runs on its machine
-            return
-        host = self.request.headers.get("Host", "")
-        origin = self.request.headers.get("Origin")
-        if not may_ask(host, origin):
-            _LOGGER.warning("a page of %r asked %r: refused", origin, host)
-            raise HTTPError(403)
+        """Answer 404 without the token, and lead there from an address that is good once."""
+        page: PageServer = self.settings["page"]
+        token = self.request.path.split("/")[1]
+        if token in page.good_once:
+            page.good_once.remove(token)
+            self.redirect(page.url)
+        elif not compare_digest(page.token.encode(), token.encode()):
+            raise HTTPError(404)
 
     def log_exception(self, *error: Any) -> None:
         """Log what is our fault only."""
@@ -137,9 +137,6 @@ class _Question(_Guarded):
             return
 
     def post(self, what: str) -> None:
-        # A page from elsewhere cannot set this header (Fetch standard, 2.2.2).
-        if "X-Lidarpool" not in self.request.headers:
-            raise HTTPError(403)
         if what != "stop" or self._stop is None:
             raise HTTPError(404)
         self._stop()
@@ -148,32 +145,26 @@ class _Question(_Guarded):
         self._gone.set()
 
 
-def may_ask(host: str, origin: str | None) -> bool:
-    """Whether a request with these ``Host`` and ``Origin`` headers is of this machine's pages.
-
-    Examples
-    --------
-    >>> may_ask("localhost:8080", None), may_ask("127.0.0.1:8080", "http://127.0.0.1:8080")
-    (True, True)
-    >>> may_ask("example.com:8080", None), may_ask("localhost:8080", "http://example.com")
-    (False, False)
-    """
-    name = host.rsplit(":", 1)[0] if not host.endswith("]") else host
-    if name.lower() not in OWN_NAMES:
-        return False
-    return origin is None or origin.lower() in (f"http://{host.lower()}", f"https://{host.lower()}")
-
-
 @dataclass(frozen=True)
 class PageServer:
-    """A page that is served on 127.0.0.1, and its port."""
+    """A page that is served on 127.0.0.1."""
 
     port: int
+    token: str = field(default_factory=secrets.token_urlsafe, repr=False)
+    good_once: list[str] = field(default_factory=list, repr=False)  # tokens of single use
 
     @property
     def url(self) -> str:
-        """Its address."""
-        return f"http://{HOST}:{self.port}"
+        """Its address, which ends with "/"."""
+        return f"http://{HOST}:{self.port}/{self.token}/"
+
+    def once(self) -> str:
+        """Return an address that leads to the page once.
+
+        Other users of the machine see what a browser is started with.
+        """
+        self.good_once.append(secrets.token_urlsafe())
+        return f"http://{HOST}:{self.port}/{self.good_once[-1]}/"
 
 
 @contextmanager
@@ -194,16 +185,19 @@ def page_server(
     page, viewer = ({"path": folder, "default_filename": name} for name in (index, VIEWER))
     asked = {"source": source, "stop": stop, "threads": threads}
     bound.setblocking(False)
+    made = PageServer(bound.getsockname()[1])
     running: Future[asyncio.AbstractEventLoop] = Future()
     ended = asyncio.Event()
 
     async def serve() -> None:
         handlers: list[Any] = [
-            (r"/(|\w[\w.]*\.(?:css|js))", _File, page),
-            (r"/job/\d+/(|\w[\w.]*\.(?:css|js))", _File, viewer),
-            (r"/(.*)", _Question, asked),
+            (r"/[^/]+/(|\w[\w.]*\.(?:css|js))", _File, page),
+            (r"/[^/]+/job/\d+/(|\w[\w.]*\.(?:css|js))", _File, viewer),
+            (r"/[^/]+/(.*)", _Question, asked),
         ]
-        server = HTTPServer(Application(handlers, log_function=lambda _: None))
+        application = Application(handlers, log_function=lambda _: None)
+        application.settings |= {"page": made, "in_notebook": cell_display() is not None}
+        server = HTTPServer(application)
         server.add_socket(bound)
         running.set_result(asyncio.get_running_loop())
         await ended.wait()
@@ -214,7 +208,7 @@ def page_server(
     thread.start()
     loop = running.result()
     try:
-        yield PageServer(bound.getsockname()[1])
+        yield made
     finally:
         loop.call_soon_threadsafe(ended.set)
         thread.join()
@@ -238,23 +232,18 @@ def announced(page: PageServer, words: str, browser: bool) -> Iterator[None]:
     if display is None:
         click.echo(words, err=True)
         if browser:
-            open_browser(page.url)
+            open_browser(page.once())
         yield
         return
     url, words = page.url, escape(words)
-    hub = os.environ.get(_HUB)
-    if hub is not None and find_spec("jupyter_server_proxy"):
-        url = f"{hub.rstrip('/')}/proxy/{page.port}/"
-        words = words.replace(page.url, url)
-        hub = None
+    if hub := os.environ.get(_HUB):  # in a frame, 127.0.0.1 would be the reader's own machine
+        url = f"{hub.rstrip('/')}/proxy/{page.port}/{page.token}/"
+        words += (
+            " It is shown through jupyter-server-proxy; without that, connect with ssh -L "
+            f"{page.port}:{HOST}:{page.port} and the machine's name, and open the address."
+        )
     link = f'<a href="{url}" target="_blank">{words}</a>'
     below = f'<iframe src="{url}" style="width:100%;height:640px;border:0"></iframe>'
-    if hub is not None:  # a frame would show the reader's own machine
-        below = (
-            "This address is on the kernel's machine: install jupyter-server-proxy, which leads "
-            f"there, or connect with ssh -L {page.port}:{HOST}:{page.port} and the machine's "
-            "name, then open it."
-        )
     shown = display.display(display.HTML(f"{link}<br>{below}"), display_id=True)
     try:
         yield

@@ -23,10 +23,9 @@ from ..export.folder import result_folder, staging
 from ..export.recordings import Recording, Turn, open_recording
 from ..sensor.noise import Purpose, uniform
 from .page.words import millimetres, ratio
-from .range_image import RangeImages, range_images
+from .range_image import RangeImages, paired_images, range_images
 
 Floats = NDArray[np.float64]
-Reals = NDArray[np.float32]
 
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
@@ -43,7 +42,7 @@ class Comparison:
 
     figures: dict[str, Any]  # as in compare.json; lengths in metres, None for unknown
     images: RangeImages | None  # of the first pair of sweeps that has them
-    residuals: Reals  # of all cells with a return in both, or of a choice
+    residuals: Floats  # of all cells with a return in both, or of a choice
     distances: tuple[Floats, Floats]  # of A's points to B, and of B's to A
     lights: tuple[Floats, Floats]  # intensities of A and B that are compared
     above: tuple[Above, Above]  # of one pair of sweeps, or of all
@@ -242,18 +241,22 @@ class _Comparing:
                 found.append((distance, some.light, other.light[index]))
 
     def _add_images(self, a: Turn, b: Turn, budget: int) -> None:
-        names = self.recordings[0].name, self.recordings[1].name
+        first, second = self.recordings
+        same = first.firings and first.firings == second.firings
+        make = paired_images if same else range_images
         try:
-            images = range_images(a, b, names, self.azimuth_deg)
+            images = make(a, b, (first.name, second.name), self.azimuth_deg)
         except LidarpoolError as error:
             self.note(f"no range image: {error}")
             return
         for text in images.notes:
             self.note(text)
         self.images = self.images or images
-        in_a, in_b = images.there
-        states = in_a & in_b, ~in_a & ~in_b, ~in_a & in_b, in_a & ~in_b
-        counts = np.stack([state.sum(axis=1) for state in states], axis=1)
+        row, values = images.row, images.compared
+        in_a, in_b = np.isfinite(values[:, 0])
+        states = [row[state] for state in (in_a & in_b, ~in_a & in_b, in_a & ~in_b)]
+        states.insert(1, np.nonzero(~images.there[0] & ~images.there[1])[0])
+        counts = np.stack([np.bincount(s, minlength=len(images.rings)) for s in states], axis=1)
         for ring, elevation, count in zip(
             images.rings.tolist(), images.elevation_deg.tolist(), counts, strict=True
         ):
@@ -261,9 +264,8 @@ class _Comparing:
             self.rings[ring] = elevation, earlier + count
         where = np.flatnonzero(in_a & in_b)
         where = where[chosen(len(where), budget, len(self.cells))]
-        ring_of = np.repeat(images.rings, in_a.shape[1])
-        columns = (images.residual, ring_of, *images.lights)
-        self.cells.append(tuple(column.reshape(-1)[where] for column in columns))
+        (range_a, *of_a), (range_b, *of_b) = values[..., where]
+        self.cells.append((range_a - range_b, images.rings[row[where]], *of_a, *of_b))
 
     def result(self, pairs: int) -> Comparison:
         """Return all figures, of so many pairs of sweeps; 0 of whole clouds."""
@@ -275,12 +277,12 @@ class _Comparing:
         (to_b, *of_points), (to_a, *_) = (
             tuple(map(np.concatenate, zip(*found, strict=True))) for found in self.pairs
         )
-        residuals, image, of = np.empty(0, np.float32), None, "nearest points"
+        residuals, image, of = np.empty(0), None, "nearest points"
         mine, theirs = (light[to_b <= self.within[0]] for light in of_points)
         if self.images is not None:
             cells = tuple(map(np.concatenate, zip(*self.cells, strict=True)))
             residuals, rings, mine, theirs = cells
-            image, of = self._of_images(residuals, rings), "cells"
+            image, of = self._of_images(residuals, rings), self.images.paired_by
         known = np.isfinite(mine) & np.isfinite(theirs)
         lights = mine[known], theirs[known]
         correlation = rank_correlation(*lights)
@@ -309,11 +311,12 @@ class _Comparing:
         above = self.above[0], self.above[1]
         return Comparison(figures, self.images, residuals, (to_b, to_a), lights, above)
 
-    def _of_images(self, residuals: Reals, rings: NDArray[np.int64]) -> dict[str, Any]:
+    def _of_images(self, residuals: Floats, rings: NDArray[np.int64]) -> dict[str, Any]:
         images = self.images
         assert images is not None
         gaps = not any(one.thinned for one in self.recordings)
         return {
+            "paired_by": images.paired_by,
             "columns": images.ranges[0].shape[1],
             "azimuth_step_deg": images.step_deg,
             "hidden_points": dict(zip("ab", images.hidden, strict=True)),
@@ -364,7 +367,7 @@ def rank_correlation(a: NDArray[Any], b: NDArray[Any]) -> float | None:
     return float(ranks[0] @ ranks[1] / size) if size else None
 
 
-def _residuals(values: Reals) -> dict[str, Any]:
+def _residuals(values: Floats) -> dict[str, Any]:
     """Figures of residuals A - B; None where there are none."""
     if not len(values):
         names = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
@@ -418,16 +421,16 @@ def table(figures: dict[str, Any]) -> Iterator[str]:
         yield f"{name.upper():<9}{one['name']}: {counted(one['points'], 'point')}{sweeps}{told}"
     image, light, far = figures["range_image"], figures["intensity"], figures["distances"]
     if image is not None:
-        told = image["residual"]
+        told, by = image["residual"], image["paired_by"]
         yield (
-            f"ranges   A - B in {counted(told['cells'], 'cell')} of {len(image['rings'])} rings x "
+            f"ranges   A - B in {told['cells']:,} {by} of {len(image['rings'])} rings x "
             f"{image['columns']:,} columns of {image['azimuth_step_deg']:.4g} deg: "
             f"bias {millimetres(told['bias_m'])}, median {millimetres(told['median_m'])}, MAD "
             f"{millimetres(told['mad_m'])}, RMSE {millimetres(told['rmse_m'])}"
         )
         if (lost := image["no_return"]) is not None:
             yield (
-                f"no return {lost['in_both']:,} cells in both, {lost['in_a_only']:,} in A only, "
+                f"no return {lost['in_both']:,} {by} in both, {lost['in_a_only']:,} in A only, "
                 f"{lost['in_b_only']:,} in B only: precision {ratio(lost['precision'])}, recall "
                 f"{ratio(lost['recall'])}, F1 {ratio(lost['f1'])}"
             )

@@ -174,7 +174,7 @@ def draw_rings(found: Comparison) -> Page:
     rows = [row for row in image["rings"] if row["cells"]]
     height = 760
     page = Page((WIDTH, height))
-    page.title("Residuals by ring", f"A − B in {counted(image['residual']['cells'], 'cell')}")
+    page.title("Residuals by ring", f"A − B in {image['residual']['cells']:,} {image['paired_by']}")
     elevation = np.array([row["elevation_deg"] for row in rows])
     lows, middles, highs, means = (
         1000 * np.array([row[name] for row in rows])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,6 @@ from ..base.words import counted
 from ..export.recordings import Turn
 
 Floats = NDArray[np.float64]
-Reals = NDArray[np.float32]
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
 _SAME = 0.15  # by how much single steps may differ from their mean
@@ -28,16 +27,18 @@ _FINEST_DEG = 1e-3  # points nearer in azimuth are of one pulse
 
 @dataclass(frozen=True, eq=False)
 class RangeImages:
-    """Ranges and intensities of two sweeps in the same cells, (rings, columns)."""
+    """Ranges of two sweeps in the same cells, (rings, columns)."""
 
     rings: NDArray[np.int64]  # (r,): as B numbers them, the highest first
     elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
     begin_deg: float  # azimuth of the first
-    ranges: tuple[Reals, Reals]  # of A and B, metres; NaN without a return
-    lights: tuple[Reals, Reals]  # intensities; NaN where unknown
+    ranges: Floats  # (2, r, c): of A and B, metres; NaN without a return
     hidden: tuple[float, float]  # shares of points of A and B that others in their cells hide
     notes: tuple[str, ...]
+    row: NDArray[np.int64]  # (k,): of all cells, or of all rays that have a return
+    compared: Floats  # (2, 2, k): range and intensity of these in A and in B, NaN where unknown
+    paired_by: str = "cells"  # or "rays"
 
     @property
     def there(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
@@ -45,7 +46,7 @@ class RangeImages:
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 
     @property
-    def residual(self) -> Reals:
+    def residual(self) -> Floats:
         """Range of A minus that of B, metres; NaN where one has no return."""
         return self.ranges[0] - self.ranges[1]
 
@@ -125,8 +126,8 @@ class _Polar:
 
     def image(
         self, rows: NDArray[np.int64], phases: Floats, step: float, shape: tuple[int, int]
-    ) -> tuple[Reals, Reals, float]:
-        """Ranges and lights of cells, and the share of points that others in their cells hide.
+    ) -> tuple[Floats, float]:
+        """Ranges and lights of cells (2, *shape), and the share of points that others there hide.
 
         `rows` (r,) are those of its rings, `phases` as the method gives them. Of several points in
         a cell, the one nearest to the middle is taken, and of several returns of a pulse the
@@ -138,11 +139,11 @@ class _Polar:
         cell = rows[self.ring] * shape[1] + column.astype(np.int64) % shape[1]
         order = np.lexsort((self.ranges, off, cell))
         chosen = order[np.diff(cell[order], prepend=-1) > 0]
-        ranges, light = np.full((2, *shape), np.nan, np.float32)
-        ranges.reshape(-1)[cell[chosen]] = self.ranges[chosen]
+        image = np.full((2, shape[0] * shape[1]), np.nan)
+        image[0, cell[chosen]] = self.ranges[chosen]
         if self.light is not None:
-            light.reshape(-1)[cell[chosen]] = self.light[chosen]
-        return ranges, light, 1 - len(chosen) / len(cell)
+            image[1, cell[chosen]] = self.light[chosen]
+        return image.reshape(2, *shape), 1 - len(chosen) / len(cell)
 
 
 def range_images(
@@ -183,15 +184,39 @@ def range_images(
     phases_a = middle + apart if alike and abs(step / steps[1] - 1) < _SAME else middle
     columns = max(round(360 / step - float(np.median(middle[:, -1] - middle[:, 0]))), 1)
     shape = count, columns
-    image_a, light_a, hidden_a = first.image(rows_a, phases_a, step, shape)
-    image_b, light_b, hidden_b = second.image(rows_b, middle, step, shape)
-    seen = np.flatnonzero((np.isfinite(image_a) | np.isfinite(image_b)).any(axis=0))
+    image_a, hidden_a = first.image(rows_a, phases_a, step, shape)
+    image_b, hidden_b = second.image(rows_b, middle, step, shape)
+    images = np.stack([image_a, image_b])
+    seen = np.flatnonzero(np.isfinite(images[:, 0]).any(axis=(0, 1)))
     order, begin = _field(seen, columns, step)
+    images = images[..., order]
     return RangeImages(
-        common.rings, common.elevation, step, begin,
-        (image_a[:, order], image_b[:, order]), (light_a[:, order], light_b[:, order]),
-        (hidden_a, hidden_b), common.notes,
+        common.rings, common.elevation, step, begin, images[:, 0], (hidden_a, hidden_b),
+        common.notes, np.repeat(np.arange(count), len(order)), images.reshape(2, 2, -1),
     )  # fmt: skip
+
+
+def paired_images(
+    a: Turn, b: Turn, names: tuple[str, str], azimuth_deg: float | None = None
+) -> RangeImages:
+    """Pair the ranges of each ray of two sweeps with the same rays; otherwise as `range_images`.
+
+    Pulses that look into the same cell are often not of the same ray where the sensor moves.
+    """
+    assert a.rays is not None and b.rays is not None and a.rings is not None and b.rings is not None
+    _common(_Polar.of(a, names[0]), _Polar.of(b, names[1]), names)  # refuses another sensor
+    _, first, ray = np.unique(np.append(a.rays, b.rays), return_index=True, return_inverse=True)
+    values = np.full((2, 2, len(first) + 1), np.nan)  # the last is of no ray
+    for k, turn, own in ((0, a, ray[: len(a)]), (1, b, ray[len(a) :])):
+        values[k, 0, own] = np.linalg.norm(turn.points, axis=1)
+        values[k, 1, own] = np.nan if turn.light is None else turn.light
+    points, rings = np.concatenate([a.points, b.points])[first], np.append(a.rings, b.rings)[first]
+    every = Turn(points, rings, np.arange(len(first), dtype=np.float64))
+    found = range_images(every, every, names, azimuth_deg)
+    shown = np.nan_to_num(found.compared[0, 1], nan=-1).astype(int).reshape(found.ranges[0].shape)
+    row = (rings[:, None] == found.rings).argmax(axis=1)
+    ranges, compared = values[:, 0, shown], values[..., :-1]
+    return replace(found, ranges=ranges, row=row, compared=compared, paired_by="rays")
 
 
 def _spacing(elevation: Floats) -> float:

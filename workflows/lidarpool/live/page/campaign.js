@@ -140,7 +140,7 @@ function showCloud(newest) {
 // -- news --------------------------------------------------------------------------------
 
 const stop = element("button", { type: "button", className: "stop", textContent: "Stop" });
-stop.onclick = () => fetch("stop", { method: "POST", headers: { "X-Lidarpool": "1" } });
+stop.onclick = () => fetch("stop", { method: "POST" });
 
 async function begin() {
   setTheme();

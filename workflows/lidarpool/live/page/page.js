@@ -759,7 +759,7 @@ async function news() {
 
 function follow() {
   panel.stop = element("button", { type: "button", className: "stop", textContent: "Stop", style: { margin: "0 12px 8px" } });
-  panel.stop.onclick = () => fetch("stop", { method: "POST", headers: { "X-Lidarpool": "1" } }).catch(failed);
+  panel.stop.onclick = () => fetch("stop", { method: "POST" }).catch(failed);
   panel.progress.after(panel.stop);
   news().catch((error) => {
     failed(error);
