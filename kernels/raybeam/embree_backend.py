@@ -81,7 +81,8 @@ class EmbreeBackend(Backend):
         proposers = [embree_kernels.propose] * 2
         if not (scene.nested or self._masked):
             proposers = [embree_kernels.plain_proposer(n) for n in (self._width, 1)]
-        filters = [filter_.address for filter_ in (*proposers, embree_kernels.decide)]
+        called = (*proposers, embree_kernels.decide, embree_kernels.nearby)
+        filters = [function.address for function in called]
         self._filters = np.array(filters, np.int64)
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         self.place(scene)

@@ -34,10 +34,11 @@ SIZE = 808
 _MESH, _INSTANCES, _MASKED, _T_MIN, _T_MAX, _LANE = 8, 9, 10, 11, 12, 13
 _OX, _OY, _OZ, _DX, _DY, _DZ = 16, 32, 48, 64, 80, 96
 _ENTRY = 112  # distance of the start that Embree sees from the origin
-# Closest triangle that the ray passes inside, and closest that only float32 takes for hit, by key:
-# row of the mesh's corners, and `_NUMBER` times the instance's number.
+# Closest triangle that the ray hits, by key: row of the mesh's corners, and `_NUMBER` times the
+# instance's number. Of equally close ones that of the lowest key.
 _T, _KEY = 128, 144
-_SOFT_T, _SOFT_KEY = 160, 176
+# Of `decide`: addresses of the RTCScene and of `nearby`; RTCPointQuery and its context.
+_SCENE, _NEARBY, _QUERY, _CONTEXT = 14, 15, 160, 164
 _ARGUMENTS = 192  # RTCIntersectArguments
 _VALID = 200  # int32 [16]
 _SINGLE = 208  # RTCRayHit
@@ -67,6 +68,10 @@ _COHERENT, _CALL_FILTER = 1 << 16, 1 << 1  # RTCRayQueryFlags
 _MARGIN = 2.0**-19
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 _FAR = 8.0  # more than the diagonal of any scene
+
+_NARROW = 2.0**-10  # least sine of the angle to a triangle that `decide` allows for
+_RIM = 2.0**-20  # share of a triangle's height: far more than what float64 rounds
+_STRAIGHT = 1 - 2.0**-40  # least component of a direction along an axis
 
 _inline = njit(forceinline=True, error_model="numpy")
 _seldom = njit(error_model="numpy")  # called so seldom that a copy at each call is not worth it
@@ -110,6 +115,10 @@ _intersect_4, _intersect_8, _intersect_16 = (
         f"rtcIntersect{width}", types.void(types.intp, types.intp, types.intp, types.intp)
     )
     for width in (4, 8, 16)
+)
+
+_point_query = types.ExternalFunction(
+    "rtcPointQuery", types.boolean(types.intp, types.intp, types.intp, types.intp, types.intp)
 )
 
 
@@ -217,6 +226,13 @@ def _inside(a, b, c):  # type: ignore[no-untyped-def]
     return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
 
 
+@_inline
+def _clearly(a, b, c, det):  # type: ignore[no-untyped-def]
+    """Whether a ray passes inside, and not at an edge or a corner, which others may share."""
+    rim = _RIM * det * det
+    return (a * det > rim) & (b * det > rim) & (c * det > rim)
+
+
 @_seldom
 def _stopped(mesh, place, a, b, c, det):  # type: ignore[no-untyped-def]
     """Whether the mask of a mesh stops a ray in a triangle, as `Masks.opaque`."""
@@ -321,31 +337,82 @@ def propose(arguments):  # type: ignore[no-untyped-def]
             valid[k] = 0
 
 
+@_seldom
+def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
+    """Keep a triangle if the ray hits it and no other before; areas of `_tested`, and their sum."""
+    numbers, floats = _int64s(scratch), _float64s(scratch)
+    mesh, instances = numbers[_MESH], numbers[_INSTANCES]
+    a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
+    nearest = floats[_T + lane]
+    if (
+        det != 0
+        and _inside(a, b, c)
+        and floats[_T_MIN] <= t <= floats[_T_MAX]
+        and (t < nearest or (t == nearest and key < numbers[_KEY + lane]))
+        and not (numbers[_MASKED] and _transparent(mesh, instances, numbers, floats, lane, key))
+    ):
+        floats[_T + lane], numbers[_KEY + lane] = t, key
+    return a, b, c, det
+
+
+@cfunc(types.boolean(types.CPointer(types.int64)), **_OPTIONS)
+def nearby(arguments):  # type: ignore[no-untyped-def]
+    """Consider a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
+    scratch, number = arguments[1], _int32s(arguments[3])[32]
+    numbers = _int64s(scratch)
+    key = arguments[2] & (_NUMBER - 1)
+    if numbers[_INSTANCES] != 0:
+        key += _NUMBER * number
+    _consider(scratch, numbers[_LANE], key)
+    return False
+
+
+@_seldom
+def _ask_around(scratch, lane, along, reach):  # type: ignore[no-untyped-def]
+    """Consider all triangles that are within a reach of a point of the ray."""
+    numbers, floats = _int64s(scratch), _float64s(scratch)
+    query = _float32s(scratch + 8 * _QUERY)
+    query[0] = np.float32(floats[_OX + lane] + along * floats[_DX + lane])
+    query[1] = np.float32(floats[_OY + lane] + along * floats[_DY + lane])
+    query[2] = np.float32(floats[_OZ + lane] + along * floats[_DZ + lane])
+    query[3], query[4] = np.float32(0), np.float32(reach)
+    _int32s(scratch + 8 * _CONTEXT)[34] = 0  # instances around it
+    place, context = scratch + 8 * _QUERY, scratch + 8 * _CONTEXT
+    _point_query(numbers[_SCENE], place, context, numbers[_NEARBY], scratch)
+
+
+@_seldom
+def _blur(mesh, instances, numbers, floats, lane, key, det):  # type: ignore[no-untyped-def]
+    """How far along the ray float32 may be off where it meets a triangle's plane."""
+    table = _float64s(_int64s(_mesh_of(mesh, instances, numbers, floats, lane, key))[0])
+    p, q, r = _corners(table, key & (_NUMBER - 1), 2)
+    e, f, g = q[0] - p[0], q[1] - p[1], q[2] - p[2]
+    h, i, j = r[0] - p[0], r[1] - p[1], r[2] - p[2]
+    x, y, z = f * j - g * i, g * h - e * j, e * i - f * h
+    sine = abs(det) / (np.sqrt((x * x + y * y) + z * z) * abs(floats[_SZ + lane]))
+    return 2 * _MARGIN / max(sine, _NARROW)
+
+
 @cfunc(types.void(types.CPointer(types.int64)), **_OPTIONS)
 def decide(arguments):  # type: ignore[no-untyped-def]
-    """Filter function: accept what is closer in float64; otherwise as `propose`."""
+    """Filter function for single rays: accept what is closer in float64.
+
+    Float32 may take the triangle beside one for it, and proposes one of several that share an
+    edge or a corner. So at an edge, all triangles that are near are considered.
+    """
     valid, scratch = _int32s(arguments[0]), arguments[2]
     rays, hits = _float32s(arguments[3]), _int32s(arguments[4])
-    count = arguments[5] & 0xFFFFFFFF
     numbers, floats = _int64s(scratch), _float64s(scratch)
-    mesh, instances, masked = numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED]
-    for k in range(count):
-        if valid[k] == 0:
-            continue
-        lane, key = numbers[_LANE] + k, _key(hits, count, k, instances)
-        a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
-        best, which = (_T, _KEY) if _inside(a, b, c) else (_SOFT_T, _SOFT_KEY)
-        nearest = floats[best + lane]
-        if (
-            det != 0
-            and floats[_T_MIN] <= t <= floats[_T_MAX]
-            and (t < nearest or (t == nearest and key < numbers[which + lane]))
-            and not (masked and _transparent(mesh, instances, numbers, floats, lane, key))
-        ):
-            floats[best + lane], numbers[which + lane] = t, key
-            rays[8 * count + k] = np.float32(t - floats[_ENTRY + lane] + _MARGIN)
-        else:
-            valid[k] = 0
+    mesh, instances, lane = numbers[_MESH], numbers[_INSTANCES], numbers[_LANE]
+    nearest, key = floats[_T + lane], _key(hits, 1, 0, instances)
+    a, b, c, det = _consider(scratch, lane, key)
+    blur = _blur(mesh, instances, numbers, floats, lane, key, det)
+    if not _clearly(a, b, c, det):
+        _ask_around(scratch, lane, floats[_ENTRY + lane] + rays[8], blur)
+    if floats[_T + lane] < nearest:
+        rays[8] = np.float32(floats[_T + lane] - floats[_ENTRY + lane] + blur)
+    else:
+        valid[0] = 0
 
 
 @_inline
@@ -353,7 +420,7 @@ def _verify(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-unt
     """Distance at which a ray hits a triangle, and whether that is as float32 has it."""
     a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
     off = abs(t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
-    sure = det != 0 and _inside(a, b, c) and t >= floats[_T_MIN] and off <= 1.5 * _MARGIN
+    sure = _clearly(a, b, c, det) and t >= floats[_T_MIN] and off <= 1.5 * _MARGIN
     return t, sure
 
 
@@ -380,7 +447,7 @@ def _verify_plain(table, numbers, floats, lanes):  # type: ignore[no-untyped-def
         r = floats[at + 6 * LANES], floats[at + 7 * LANES], floats[at + 8 * LANES]
         a, b, c, det, t = _areas((p, q, r), _lane(floats, lane))
         off = abs(t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
-        sure = (det != 0) & _inside(a, b, c) & (t >= floats[_T_MIN]) & (off <= 1.5 * _MARGIN)
+        sure = _clearly(a, b, c, det) & (t >= floats[_T_MIN]) & (off <= 1.5 * _MARGIN)
         floats[_T + lane], numbers[_KEY + lane] = t, np.int64(sure)
 
 
@@ -509,15 +576,16 @@ def _next(row, pose, within, step, rows, each):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _prepare(scratch, mesh, instances, masked, filter_address, t_min, t_max):  # type: ignore[no-untyped-def]
+def _prepare(scene, scratch, mesh, instances, masked, filters, t_min, t_max):  # type: ignore[no-untyped-def]
     """Write to the scratch memory what all rays share."""
     numbers, floats = _int64s(scratch), _float64s(scratch)
     numbers[0] = -1  # no instance
     numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED] = mesh, instances, masked
     floats[_T_MIN], floats[_T_MAX] = t_min, t_max
+    numbers[_SCENE], numbers[_NEARBY] = scene, filters[3]
     numbers[_ARGUMENTS] = np.int64(-1) << 32  # flags are set later; all features
     numbers[_ARGUMENTS + 1] = scratch
-    numbers[_ARGUMENTS + 2] = filter_address
+    numbers[_ARGUMENTS + 2] = filters[0]
     numbers[_ARGUMENTS + 3] = numbers[_ARGUMENTS + 4] = 0
 
 
@@ -538,8 +606,8 @@ def _shear_all(numbers, floats, lanes):  # type: ignore[no-untyped-def]
 
 
 @_seldom
-def _single(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
-    """Cast one ray of a packet by itself."""
+def _single(scene, scratch, lane, reach, aside=0.0, up=0.0):  # type: ignore[no-untyped-def]
+    """Cast one ray of a packet by itself; or what Embree sees of one along an axis, moved."""
     numbers, floats = _int64s(scratch), _float64s(scratch)
     ray, entry = _float32s(scratch + 8 * _SINGLE), floats[_ENTRY + lane]
     ray[0] = _begun(floats[_OX + lane], floats[_DX + lane], entry)
@@ -549,6 +617,9 @@ def _single(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
     ray[4], ray[5] = np.float32(floats[_DX + lane]), np.float32(floats[_DY + lane])
     ray[6], ray[7] = np.float32(floats[_DZ + lane]), np.float32(0)
     ray[8] = np.float32(min(reach - entry + _MARGIN, _FAR))
+    axis = 0 if abs(ray[4]) > 0.5 else (1 if abs(ray[5]) > 0.5 else 2)
+    ray[(axis + 1) % 3] += np.float32(aside)
+    ray[(axis + 2) % 3] += np.float32(up)
     whole = _int32s(scratch + 8 * _SINGLE)
     whole[9], whole[10], whole[11], whole[18], whole[19], whole[20] = -1, 0, 0, -1, -1, -1
     numbers[_LANE] = lane
@@ -558,18 +629,31 @@ def _single(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
 
 @_seldom
 def _decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
-    """Distance and triangle of a ray of which `propose` could not be sure."""
+    """Distance and triangle of a ray of which `propose` could not be sure.
+
+    Embree does not see what touches a ray along an axis with the upper side of its box. So it
+    is shown eight such rays around it, too.
+    """
     numbers, floats = _int64s(scratch), _float64s(scratch)
     flags = _int32s(scratch + 8 * _ARGUMENTS)
-    floats[_T + lane] = floats[_SOFT_T + lane] = np.inf
-    numbers[_KEY + lane] = numbers[_SOFT_KEY + lane] = -1
+    floats[_T + lane], numbers[_KEY + lane] = np.inf, -1
     flags[0] = _CALL_FILTER
     _single(scene, scratch, lane, reach)
+    if _along(floats, lane):
+        for k in range(8):
+            one = _MARGIN if k & 1 else -_MARGIN
+            other = 0.4 * (_MARGIN if k & 2 else -_MARGIN)
+            aside, up = (one, other) if k & 4 else (other, one)
+            _single(scene, scratch, lane, reach, aside, up)
     flags[0] = _CALL_FILTER | _COHERENT
-    t, soft = floats[_T + lane], floats[_SOFT_T + lane]
-    if t <= soft + _MARGIN:
-        return t, numbers[_KEY + lane]
-    return soft, numbers[_SOFT_KEY + lane]
+    return floats[_T + lane], numbers[_KEY + lane]
+
+
+@_inline
+def _along(floats, lane):  # type: ignore[no-untyped-def]
+    """Whether a ray is along an axis."""
+    x, y, z = abs(floats[_DX + lane]), abs(floats[_DY + lane]), abs(floats[_DZ + lane])
+    return (x > _STRAIGHT) | (y > _STRAIGHT) | (z > _STRAIGHT)
 
 
 @_inline
@@ -602,7 +686,7 @@ def trace(  # type: ignore[no-untyped-def]
     masked
         Whether any mesh has an opacity.
     filters
-        int64 (3,): addresses of the filters for packets, for single rays, and of `decide`.
+        int64 (4,): addresses of the filters for packets, for single rays, of `decide` and `nearby`.
     addresses
         int64 (8,): of arrays (float64, contiguous), 0 for those that there are not: directions
         and origins of the pattern (3, rows), positions (k, 3), rotations (k, 3, 3), delays
@@ -626,7 +710,7 @@ def trace(  # type: ignore[no-untyped-def]
     rays, whole = _float32s(scratch + 8 * _PACKET), _int32s(scratch + 8 * _PACKET)
     valid = _int32s(scratch + 8 * _VALID)
     flags = _int32s(scratch + 8 * _ARGUMENTS)
-    _prepare(scratch, mesh, instances, masked, filters[0], t_min, t_max)
+    _prepare(scene, scratch, mesh, instances, masked, filters, t_min, t_max)
     flags[0] = _CALL_FILTER | _COHERENT
     numbers[_LANE] = 0
     for lane in range(width):
@@ -716,8 +800,11 @@ def trace(  # type: ignore[no-untyped-def]
                     _intersect_4(
                         scratch + 8 * _VALID, scene, scratch + 8 * _PACKET, scratch + 8 * _ARGUMENTS
                     )
+            straight = 0
+            for lane in range(lanes):
+                straight += _along(floats, lane)
             if plain:
-                found = 0
+                found = straight
                 for lane in range(lanes):
                     floats[_ROUGH + lane] = rough[lane]
                     numbers[_FIRST + lane], numbers[_OTHER + lane] = firsts[lane], others[lane]
@@ -727,7 +814,8 @@ def trace(  # type: ignore[no-untyped-def]
                     _verify_plain(table, numbers, floats, lanes)
             at = ray - start
             for lane in range(lanes):
-                one, other, t = numbers[_FIRST + lane], numbers[_OTHER + lane], np.inf
+                one, other = numbers[_FIRST + lane], numbers[_OTHER + lane]
+                t, sure = np.inf, True
                 if one >= 0:
                     if plain:
                         t, sure = floats[_T + lane], numbers[_KEY + lane] == 1
@@ -738,12 +826,14 @@ def trace(  # type: ignore[no-untyped-def]
                         sure = sure and sure_2
                         if t_2 < t or (t_2 == t and other < one):
                             t, one = t_2, other
-                    if not sure or other == -2:
-                        numbers[_ARGUMENTS + 2] = filters[2]
-                        t, one = _decided(scene, scratch, lane, t_max)
-                        numbers[_ARGUMENTS + 2] = filters[0]
-                    if t > t_max:
-                        t, one = np.inf, np.int64(-1)
+                    if other == -2:
+                        sure = False
+                if not sure or (straight and _along(floats, lane)):
+                    numbers[_ARGUMENTS + 2] = filters[2]
+                    t, one = _decided(scene, scratch, lane, t_max)
+                    numbers[_ARGUMENTS + 2] = filters[0]
+                if t > t_max:
+                    t, one = np.inf, np.int64(-1)
                 if instances != 0 and one >= 0:
                     number = one // _NUMBER
                     record = _int64s(instances + 8 * RECORD * number)
