@@ -3,11 +3,12 @@
 Embree proposes, float64 decides. A filter function, which Embree calls for each triangle that it
 finds in float32, notes the closest and another that float32 cannot tell from it (`propose`); both
 then pass the watertight test of triangle.py. Embree is told of a distance that is a little farther
-than the closest, so it goes on to propose such triangles. A ray of which that says too little is
-cast again by itself, and the test is applied to every triangle that is proposed (`decide`). So a
-ray's result does not depend on the rays that share its packet, and has the bits of the other
-backends. At an instance, the test takes the ray to the mesh's coordinates in float64 itself, as
-instances.py says.
+than the closest, so it goes on to propose such triangles. A ray of which that says too little, or
+that passes at an edge, is cast again by itself, and the test is applied to every triangle that is
+proposed, and at an edge to all that are near (`decide`). Of equally close triangles the lowest
+wins. So a ray's result does not depend on the rays that share its packet, nor on the processor's
+instructions, and has the bits of the other backends. At an instance, the test takes the ray to the
+mesh's coordinates in float64 itself, as instances.py says.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ _ENTRY = 112  # distance of the start that Embree sees from the origin
 # Closest triangle that the ray hits, by key: row of the mesh's corners, and `_NUMBER` times the
 # instance's number. Of equally close ones that of the lowest key.
 _T, _KEY = 128, 144
-# Of `decide`: addresses of the RTCScene and of `nearby`; RTCPointQuery and its context.
+# Of `decide`: addresses of the RTCScene and of `nearby`; RTCPointQuery, and its context: zeros.
 _SCENE, _NEARBY, _QUERY, _CONTEXT = 14, 15, 160, 164
 _ARGUMENTS = 192  # RTCIntersectArguments
 _VALID = 200  # int32 [16]
@@ -69,7 +70,7 @@ _MARGIN = 2.0**-19
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 _FAR = 8.0  # more than the diagonal of any scene
 
-_NARROW = 2.0**-10  # least sine of the angle to a triangle that `decide` allows for
+_GRAZES = 2.0**-10  # sine of the least angle to a triangle that `decide` allows for
 _RIM = 2.0**-20  # share of a triangle's height: far more than what float64 rounds
 _STRAIGHT = 1 - 2.0**-40  # least component of a direction along an axis
 
@@ -339,7 +340,7 @@ def propose(arguments):  # type: ignore[no-untyped-def]
 
 @_seldom
 def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
-    """Keep a triangle if the ray hits it and no other before; areas of `_tested`, and their sum."""
+    """Keep a triangle if it is the closest hit so far; whether the ray clearly passes inside."""
     numbers, floats = _int64s(scratch), _float64s(scratch)
     mesh, instances = numbers[_MESH], numbers[_INSTANCES]
     a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
@@ -352,65 +353,48 @@ def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
         and not (numbers[_MASKED] and _transparent(mesh, instances, numbers, floats, lane, key))
     ):
         floats[_T + lane], numbers[_KEY + lane] = t, key
-    return a, b, c, det
+    return _clearly(a, b, c, det)
 
 
 @cfunc(types.boolean(types.CPointer(types.int64)), **_OPTIONS)
 def nearby(arguments):  # type: ignore[no-untyped-def]
     """Consider a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
-    scratch, number = arguments[1], _int32s(arguments[3])[32]
-    numbers = _int64s(scratch)
-    key = arguments[2] & (_NUMBER - 1)
+    scratch, instance = arguments[1], _int32s(arguments[3])[32]
+    numbers, key = _int64s(scratch), arguments[2] & (_NUMBER - 1)
     if numbers[_INSTANCES] != 0:
-        key += _NUMBER * number
+        key += _NUMBER * instance
     _consider(scratch, numbers[_LANE], key)
-    return False
-
-
-@_seldom
-def _ask_around(scratch, lane, along, reach):  # type: ignore[no-untyped-def]
-    """Consider all triangles that are within a reach of a point of the ray."""
-    numbers, floats = _int64s(scratch), _float64s(scratch)
-    query = _float32s(scratch + 8 * _QUERY)
-    query[0] = np.float32(floats[_OX + lane] + along * floats[_DX + lane])
-    query[1] = np.float32(floats[_OY + lane] + along * floats[_DY + lane])
-    query[2] = np.float32(floats[_OZ + lane] + along * floats[_DZ + lane])
-    query[3], query[4] = np.float32(0), np.float32(reach)
-    _int32s(scratch + 8 * _CONTEXT)[34] = 0  # instances around it
-    place, context = scratch + 8 * _QUERY, scratch + 8 * _CONTEXT
-    _point_query(numbers[_SCENE], place, context, numbers[_NEARBY], scratch)
-
-
-@_seldom
-def _blur(mesh, instances, numbers, floats, lane, key, det):  # type: ignore[no-untyped-def]
-    """How far along the ray float32 may be off where it meets a triangle's plane."""
-    table = _float64s(_int64s(_mesh_of(mesh, instances, numbers, floats, lane, key))[0])
-    p, q, r = _corners(table, key & (_NUMBER - 1), 2)
-    e, f, g = q[0] - p[0], q[1] - p[1], q[2] - p[2]
-    h, i, j = r[0] - p[0], r[1] - p[1], r[2] - p[2]
-    x, y, z = f * j - g * i, g * h - e * j, e * i - f * h
-    sine = abs(det) / (np.sqrt((x * x + y * y) + z * z) * abs(floats[_SZ + lane]))
-    return 2 * _MARGIN / max(sine, _NARROW)
+    return False  # the distance of interest stays
 
 
 @cfunc(types.void(types.CPointer(types.int64)), **_OPTIONS)
 def decide(arguments):  # type: ignore[no-untyped-def]
     """Filter function for single rays: accept what is closer in float64.
 
-    Float32 may take the triangle beside one for it, and proposes one of several that share an
-    edge or a corner. So at an edge, all triangles that are near are considered.
+    At an edge, Embree may propose any one of the triangles that share it, or one that float64 has
+    beside the ray. Then all triangles that are near that point are considered.
     """
     valid, scratch = _int32s(arguments[0]), arguments[2]
-    rays, hits = _float32s(arguments[3]), _int32s(arguments[4])
+    ray, hit, normal = _float32s(arguments[3]), _int32s(arguments[4]), _float32s(arguments[4])
     numbers, floats = _int64s(scratch), _float64s(scratch)
-    mesh, instances, lane = numbers[_MESH], numbers[_INSTANCES], numbers[_LANE]
-    nearest, key = floats[_T + lane], _key(hits, 1, 0, instances)
-    a, b, c, det = _consider(scratch, lane, key)
-    blur = _blur(mesh, instances, numbers, floats, lane, key, det)
-    if not _clearly(a, b, c, det):
-        _ask_around(scratch, lane, floats[_ENTRY + lane] + rays[8], blur)
+    lane, entry = numbers[_LANE], floats[_ENTRY + numbers[_LANE]]
+    nearest = floats[_T + lane]
+    clear = _consider(scratch, lane, _key(hit, 1, 0, numbers[_INSTANCES]))
+    # Float32 is so far off along the ray: more where it grazes.
+    x, y, z, dx, dy, dz = normal[0], normal[1], normal[2], ray[4], ray[5], ray[6]
+    steep = abs(x * dx + y * dy + z * dz)
+    full = np.sqrt((x * x + y * y + z * z) * (dx * dx + dy * dy + dz * dz))
+    off = 2 * _MARGIN * (max(full / steep, 1.0) if steep > _GRAZES * full else 1 / _GRAZES)
+    if not clear:
+        query, along = _float32s(scratch + 8 * _QUERY), entry + ray[8]
+        query[0] = np.float32(floats[_OX + lane] + along * floats[_DX + lane])
+        query[1] = np.float32(floats[_OY + lane] + along * floats[_DY + lane])
+        query[2] = np.float32(floats[_OZ + lane] + along * floats[_DZ + lane])
+        query[4] = np.float32(off)
+        where, context = scratch + 8 * _QUERY, scratch + 8 * _CONTEXT
+        _point_query(numbers[_SCENE], where, context, numbers[_NEARBY], scratch)
     if floats[_T + lane] < nearest:
-        rays[8] = np.float32(floats[_T + lane] - floats[_ENTRY + lane] + blur)
+        ray[8] = np.float32(floats[_T + lane] - entry + off)
     else:
         valid[0] = 0
 

@@ -60,6 +60,7 @@ SCAN_BYTES = 64  # in the driver
 WAY_POSES = 1000  # that the length of a way is measured by
 SUMMARY_BYTES = 28  # of a scan, in the database
 FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most: LAS
+_FINE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
 # Rays that are cast at most, whole scans of them, and the least and most scans.
 SAMPLE_RAYS, SAMPLE_SCANS = 500_000, (16, 500)
@@ -122,6 +123,8 @@ def forecast(
         estimate = sample_survey(job.scene, job.survey)
         if not estimate["hits"]:
             notes.append(no_hits(job))
+    if backend == "embree":
+        notes += _of_fine_triangles(job.scene)
     # Without an estimate every ray may hit.
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     # Scans of the largest batches; small ones take less.
@@ -250,6 +253,23 @@ def _slots(
 def _existing(out: Path) -> Path:
     """Return the folder itself, or its innermost existing parent."""
     return next(path for path in (out, *out.absolute().parents) if path.exists())
+
+
+def _of_fine_triangles(scene: Scene) -> list[str]:
+    """Return a note on triangles that Embree may miss, since it finds them in float32."""
+    count = 0
+    for mesh in (scene, *(scene.instances.parts if scene.instances else ())):
+        if len(mesh.faces):
+            corners = mesh.vertices[mesh.faces.T]
+            edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=2).min(axis=0)
+            size = np.ptp(mesh.vertices, axis=0).max()
+            # A triangle with an edge of no length has no area: it is left out everywhere.
+            count += np.count_nonzero((edges > 0) & (edges < _FINE * size))
+    note = (
+        f"{count:,} triangles have an edge below a millionth of their mesh's size, and embree may "
+        "miss them: backend: numpy does not"
+    )
+    return [note] if count else []
 
 
 def _look_at_folder(out: Path | Storage) -> list[str]:
