@@ -33,7 +33,8 @@ class EmbreeBackend(Backend):
     """Embree's candidates, of which the watertight test in float64 takes the closest.
 
     A triangle that Embree does not propose is not found. It decides in float32, and does not see
-    surfaces that are nearer to the ray's start than about 1e-6 of the scene's size. Casting and
+    surfaces that are nearer to the ray's start than about 1e-6 of the scene's size, nor some of
+    those whose rim a ray meets within that. Casting and
     building the tree use the given number of threads.
     """
 

@@ -152,6 +152,13 @@ def _entered(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @_inline
+def _given(floats, lane):  # type: ignore[no-untyped-def]
+    """Origin and direction of a ray, local to the scene."""
+    x, y, z = floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane]
+    return x, y, z, floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+
+
+@_inline
 def _keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     axis, u, v, w, sx, sy, sz = _shear(ox, oy, oz, dx, dy, dz)
     numbers[_AXIS + lane] = axis
@@ -167,15 +174,8 @@ def _mesh_of(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-un
     number = key // _NUMBER
     address = instances + 8 * RECORD * number
     if numbers[_INSIDE + lane] != number:
-        ox, oy, oz, dx, dy, dz, length = _entered(
-            _float64s(address),
-            floats[_OX + lane],
-            floats[_OY + lane],
-            floats[_OZ + lane],
-            floats[_DX + lane],
-            floats[_DY + lane],
-            floats[_DZ + lane],
-        )
+        matrix, ray = _float64s(address), _given(floats, lane)
+        ox, oy, oz, dx, dy, dz, length = _entered(matrix, *ray)
         _keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz)
         floats[_LENGTH + lane], numbers[_INSIDE + lane] = length, number
     return _int64s(address)[_MESH_OF]
@@ -387,9 +387,8 @@ def decide(arguments):  # type: ignore[no-untyped-def]
     off = 2 * _MARGIN * (max(full / steep, 1.0) if steep > _GRAZES * full else 1 / _GRAZES)
     if not clear:
         query, along = _float32s(scratch + 8 * _QUERY), entry + ray[8]
-        query[0] = np.float32(floats[_OX + lane] + along * floats[_DX + lane])
-        query[1] = np.float32(floats[_OY + lane] + along * floats[_DY + lane])
-        query[2] = np.float32(floats[_OZ + lane] + along * floats[_DZ + lane])
+        for axis in range(lane, lane + 3 * LANES, LANES):
+            query[axis // LANES] = np.float32(floats[_OX + axis] + along * floats[_DX + axis])
         query[4] = np.float32(off)
         where, context = scratch + 8 * _QUERY, scratch + 8 * _CONTEXT
         _point_query(numbers[_SCENE], where, context, numbers[_NEARBY], scratch)
@@ -576,17 +575,7 @@ def _prepare(scene, scratch, mesh, instances, masked, filters, t_min, t_max):  #
 @_inline
 def _shear_all(numbers, floats, lanes):  # type: ignore[no-untyped-def]
     for lane in range(lanes):
-        _keep_sheared(
-            numbers,
-            floats,
-            lane,
-            floats[_OX + lane],
-            floats[_OY + lane],
-            floats[_OZ + lane],
-            floats[_DX + lane],
-            floats[_DY + lane],
-            floats[_DZ + lane],
-        )
+        _keep_sheared(numbers, floats, lane, *_given(floats, lane))
 
 
 @_seldom
@@ -636,8 +625,8 @@ def _decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
 @_inline
 def _along(floats, lane):  # type: ignore[no-untyped-def]
     """Whether a ray is along an axis."""
-    x, y, z = abs(floats[_DX + lane]), abs(floats[_DY + lane]), abs(floats[_DZ + lane])
-    return (x > _STRAIGHT) | (y > _STRAIGHT) | (z > _STRAIGHT)
+    _, _, _, x, y, z = _given(floats, lane)
+    return (abs(x) > _STRAIGHT) | (abs(y) > _STRAIGHT) | (abs(z) > _STRAIGHT)
 
 
 @_inline
@@ -737,15 +726,7 @@ def trace(  # type: ignore[no-untyped-def]
                     row, pose, within = _next(row, pose, within, step, rows, each)
             if not near:
                 for lane in range(lanes):
-                    floats[_ENTRY + lane] = _entry(
-                        frame,
-                        floats[_OX + lane],
-                        floats[_OY + lane],
-                        floats[_OZ + lane],
-                        floats[_DX + lane],
-                        floats[_DY + lane],
-                        floats[_DZ + lane],
-                    )
+                    floats[_ENTRY + lane] = _entry(frame, *_given(floats, lane))
             for lane in range(lanes):
                 floats[_ROUGH + lane], numbers[_INSIDE + lane] = np.inf, -1
                 numbers[_FIRST + lane] = numbers[_OTHER + lane] = -1

@@ -22,6 +22,7 @@ from raybeam import available_backends
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.storage import Storage
+from ..base.words import counted
 from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
 from ..export.navigation import instrument_bytes
@@ -257,19 +258,15 @@ def _existing(out: Path) -> Path:
 
 def _of_fine_triangles(scene: Scene) -> list[str]:
     """Return a note on triangles that Embree may miss, since it finds them in float32."""
-    count = 0
-    for mesh in (scene, *(scene.instances.parts if scene.instances else ())):
-        if len(mesh.faces):
-            corners = mesh.vertices[mesh.faces.T]
-            edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=2).min(axis=0)
-            size = np.ptp(mesh.vertices, axis=0).max()
-            # A triangle with an edge of no length has no area: it is left out everywhere.
-            count += np.count_nonzero((edges > 0) & (edges < _FINE * size))
-    note = (
-        f"{count:,} triangles have an edge below a millionth of their mesh's size, and embree may "
-        "miss them: backend: numpy does not"
-    )
-    return [note] if count else []
+    count, least = 0, _FINE * np.ptp(scene.bounds, axis=0).max()
+    parts = scene.instances.parts if scene.instances else ()
+    for points, faces in ((scene.vertices, scene.faces), *((p.vertices, p.faces) for p in parts)):
+        corners = points[faces.T]
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=2).min(axis=0)
+        # Without an area no backend hits them.
+        count += int(((edges > 0) & (edges < least)).sum())
+    note = "with an edge below a millionth of the scene may be missed by embree, not by numpy"
+    return [f"{counted(count, 'triangle')} {note}"] if count else []
 
 
 def _look_at_folder(out: Path | Storage) -> list[str]:
