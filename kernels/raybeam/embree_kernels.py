@@ -72,7 +72,7 @@ _FAR = 8.0  # more than the diagonal of any scene
 
 _GRAZES = 2.0**-10  # sine of the least angle to a triangle that `decide` allows for
 _RIM = 2.0**-20  # share of a triangle's height: far more than what float64 rounds
-_STRAIGHT = 1 - 2.0**-40  # least component of a direction along an axis
+_STRAIGHT = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
 
 _inline = njit(forceinline=True, error_model="numpy")
 _seldom = njit(error_model="numpy")  # called so seldom that a copy at each call is not worth it
@@ -626,7 +626,7 @@ def _decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
 def _along(floats, lane):  # type: ignore[no-untyped-def]
     """Whether a ray is along an axis."""
     _, _, _, x, y, z = _given(floats, lane)
-    return (abs(x) > _STRAIGHT) | (abs(y) > _STRAIGHT) | (abs(z) > _STRAIGHT)
+    return (abs(x) + abs(y)) + abs(z) < _STRAIGHT
 
 
 @_inline
