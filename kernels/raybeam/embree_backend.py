@@ -33,7 +33,8 @@ class EmbreeBackend(Backend):
     """Embree's candidates, of which the watertight test in float64 takes the closest.
 
     A triangle that Embree does not propose is not found. It decides in float32, and does not see
-    surfaces that are nearer to the ray's start than about 1e-6 of the scene's size. Casting and
+    surfaces that are nearer to the ray's start than about 1e-6 of the scene's size, nor some of
+    those whose rim a ray meets within that. Casting and
     building the tree use the given number of threads.
     """
 
@@ -81,7 +82,8 @@ class EmbreeBackend(Backend):
         proposers = [embree_kernels.propose] * 2
         if not (scene.nested or self._masked):
             proposers = [embree_kernels.plain_proposer(n) for n in (self._width, 1)]
-        filters = [filter_.address for filter_ in (*proposers, embree_kernels.decide)]
+        called = (*proposers, embree_kernels.decide, embree_kernels.nearby)
+        filters = [function.address for function in called]
         self._filters = np.array(filters, np.int64)
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
         self.place(scene)

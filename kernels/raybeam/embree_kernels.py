@@ -3,11 +3,12 @@
 Embree proposes, float64 decides. A filter function, which Embree calls for each triangle that it
 finds in float32, notes the closest and another that float32 cannot tell from it (`propose`); both
 then pass the watertight test of triangle.py. Embree is told of a distance that is a little farther
-than the closest, so it goes on to propose such triangles. A ray of which that says too little is
-cast again by itself, and the test is applied to every triangle that is proposed (`decide`). So a
-ray's result does not depend on the rays that share its packet, and has the bits of the other
-backends. At an instance, the test takes the ray to the mesh's coordinates in float64 itself, as
-instances.py says.
+than the closest, so it goes on to propose such triangles. A ray of which that says too little, or
+that passes at an edge, is cast again by itself, and the test is applied to every triangle that is
+proposed, and at an edge to all that are near (`decide`). Of equally close triangles the lowest
+wins. So a ray's result does not depend on the rays that share its packet, nor on the processor's
+instructions, and has the bits of the other backends. At an instance, the test takes the ray to the
+mesh's coordinates in float64 itself, as instances.py says.
 """
 
 from __future__ import annotations
@@ -34,10 +35,11 @@ SIZE = 808
 _MESH, _INSTANCES, _MASKED, _T_MIN, _T_MAX, _LANE = 8, 9, 10, 11, 12, 13
 _OX, _OY, _OZ, _DX, _DY, _DZ = 16, 32, 48, 64, 80, 96
 _ENTRY = 112  # distance of the start that Embree sees from the origin
-# Closest triangle that the ray passes inside, and closest that only float32 takes for hit, by key:
-# row of the mesh's corners, and `_NUMBER` times the instance's number.
+# Closest triangle that the ray hits, by key: row of the mesh's corners, and `_NUMBER` times the
+# instance's number. Of equally close ones that of the lowest key.
 _T, _KEY = 128, 144
-_SOFT_T, _SOFT_KEY = 160, 176
+# Of `decide`: addresses of the RTCScene and of `nearby`; RTCPointQuery, and its context: zeros.
+_SCENE, _NEARBY, _QUERY, _CONTEXT = 14, 15, 160, 164
 _ARGUMENTS = 192  # RTCIntersectArguments
 _VALID = 200  # int32 [16]
 _SINGLE = 208  # RTCRayHit
@@ -67,6 +69,10 @@ _COHERENT, _CALL_FILTER = 1 << 16, 1 << 1  # RTCRayQueryFlags
 _MARGIN = 2.0**-19
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 _FAR = 8.0  # more than the diagonal of any scene
+
+_GRAZES = 2.0**-10  # sine of the least angle to a triangle that `decide` allows for
+_RIM = 2.0**-20  # share of a triangle's height: far more than what float64 rounds
+_STRAIGHT = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
 
 _inline = njit(forceinline=True, error_model="numpy")
 _seldom = njit(error_model="numpy")  # called so seldom that a copy at each call is not worth it
@@ -112,6 +118,10 @@ _intersect_4, _intersect_8, _intersect_16 = (
     for width in (4, 8, 16)
 )
 
+_point_query = types.ExternalFunction(
+    "rtcPointQuery", types.boolean(types.intp, types.intp, types.intp, types.intp, types.intp)
+)
+
 
 @_inline
 def _shear(ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
@@ -142,6 +152,13 @@ def _entered(m, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
 
 
 @_inline
+def _given(floats, lane):  # type: ignore[no-untyped-def]
+    """Origin and direction of a ray, local to the scene."""
+    x, y, z = floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane]
+    return x, y, z, floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+
+
+@_inline
 def _keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz):  # type: ignore[no-untyped-def]
     axis, u, v, w, sx, sy, sz = _shear(ox, oy, oz, dx, dy, dz)
     numbers[_AXIS + lane] = axis
@@ -157,15 +174,8 @@ def _mesh_of(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-un
     number = key // _NUMBER
     address = instances + 8 * RECORD * number
     if numbers[_INSIDE + lane] != number:
-        ox, oy, oz, dx, dy, dz, length = _entered(
-            _float64s(address),
-            floats[_OX + lane],
-            floats[_OY + lane],
-            floats[_OZ + lane],
-            floats[_DX + lane],
-            floats[_DY + lane],
-            floats[_DZ + lane],
-        )
+        matrix, ray = _float64s(address), _given(floats, lane)
+        ox, oy, oz, dx, dy, dz, length = _entered(matrix, *ray)
         _keep_sheared(numbers, floats, lane, ox, oy, oz, dx, dy, dz)
         floats[_LENGTH + lane], numbers[_INSIDE + lane] = length, number
     return _int64s(address)[_MESH_OF]
@@ -215,6 +225,13 @@ def _lane(floats, lane):  # type: ignore[no-untyped-def]
 @_inline
 def _inside(a, b, c):  # type: ignore[no-untyped-def]
     return ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
+
+
+@_inline
+def _clearly(a, b, c, det):  # type: ignore[no-untyped-def]
+    """Whether a ray passes inside, and not at an edge or a corner, which others may share."""
+    rim = _RIM * det * det
+    return (a * det > rim) & (b * det > rim) & (c * det > rim)
 
 
 @_seldom
@@ -321,31 +338,64 @@ def propose(arguments):  # type: ignore[no-untyped-def]
             valid[k] = 0
 
 
+@_seldom
+def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
+    """Keep a triangle if it is the closest hit so far; whether the ray clearly passes inside."""
+    numbers, floats = _int64s(scratch), _float64s(scratch)
+    mesh, instances = numbers[_MESH], numbers[_INSTANCES]
+    a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
+    nearest = floats[_T + lane]
+    if (
+        det != 0
+        and _inside(a, b, c)
+        and floats[_T_MIN] <= t <= floats[_T_MAX]
+        and (t < nearest or (t == nearest and key < numbers[_KEY + lane]))
+        and not (numbers[_MASKED] and _transparent(mesh, instances, numbers, floats, lane, key))
+    ):
+        floats[_T + lane], numbers[_KEY + lane] = t, key
+    return _clearly(a, b, c, det)
+
+
+@cfunc(types.boolean(types.CPointer(types.int64)), **_OPTIONS)
+def nearby(arguments):  # type: ignore[no-untyped-def]
+    """Consider a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
+    scratch, instance = arguments[1], _int32s(arguments[3])[32]
+    numbers, key = _int64s(scratch), arguments[2] & (_NUMBER - 1)
+    if numbers[_INSTANCES] != 0:
+        key += _NUMBER * instance
+    _consider(scratch, numbers[_LANE], key)
+    return False  # the distance of interest stays
+
+
 @cfunc(types.void(types.CPointer(types.int64)), **_OPTIONS)
 def decide(arguments):  # type: ignore[no-untyped-def]
-    """Filter function: accept what is closer in float64; otherwise as `propose`."""
+    """Filter function for single rays: accept what is closer in float64.
+
+    At an edge, Embree may propose any one of the triangles that share it, or one that float64 has
+    beside the ray. Then all triangles that are near that point are considered.
+    """
     valid, scratch = _int32s(arguments[0]), arguments[2]
-    rays, hits = _float32s(arguments[3]), _int32s(arguments[4])
-    count = arguments[5] & 0xFFFFFFFF
+    ray, hit, normal = _float32s(arguments[3]), _int32s(arguments[4]), _float32s(arguments[4])
     numbers, floats = _int64s(scratch), _float64s(scratch)
-    mesh, instances, masked = numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED]
-    for k in range(count):
-        if valid[k] == 0:
-            continue
-        lane, key = numbers[_LANE] + k, _key(hits, count, k, instances)
-        a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
-        best, which = (_T, _KEY) if _inside(a, b, c) else (_SOFT_T, _SOFT_KEY)
-        nearest = floats[best + lane]
-        if (
-            det != 0
-            and floats[_T_MIN] <= t <= floats[_T_MAX]
-            and (t < nearest or (t == nearest and key < numbers[which + lane]))
-            and not (masked and _transparent(mesh, instances, numbers, floats, lane, key))
-        ):
-            floats[best + lane], numbers[which + lane] = t, key
-            rays[8 * count + k] = np.float32(t - floats[_ENTRY + lane] + _MARGIN)
-        else:
-            valid[k] = 0
+    lane, entry = numbers[_LANE], floats[_ENTRY + numbers[_LANE]]
+    nearest = floats[_T + lane]
+    clear = _consider(scratch, lane, _key(hit, 1, 0, numbers[_INSTANCES]))
+    # Float32 is so far off along the ray: more where it grazes.
+    x, y, z, dx, dy, dz = normal[0], normal[1], normal[2], ray[4], ray[5], ray[6]
+    steep = abs(x * dx + y * dy + z * dz)
+    full = np.sqrt((x * x + y * y + z * z) * (dx * dx + dy * dy + dz * dz))
+    off = 2 * _MARGIN * (max(full / steep, 1.0) if steep > _GRAZES * full else 1 / _GRAZES)
+    if not clear:
+        query, along = _float32s(scratch + 8 * _QUERY), entry + ray[8]
+        for axis in range(lane, lane + 3 * LANES, LANES):
+            query[axis // LANES] = np.float32(floats[_OX + axis] + along * floats[_DX + axis])
+        query[4] = np.float32(off)
+        where, context = scratch + 8 * _QUERY, scratch + 8 * _CONTEXT
+        _point_query(numbers[_SCENE], where, context, numbers[_NEARBY], scratch)
+    if floats[_T + lane] < nearest:
+        ray[8] = np.float32(floats[_T + lane] - entry + off)
+    else:
+        valid[0] = 0
 
 
 @_inline
@@ -353,7 +403,7 @@ def _verify(mesh, instances, numbers, floats, lane, key):  # type: ignore[no-unt
     """Distance at which a ray hits a triangle, and whether that is as float32 has it."""
     a, b, c, det, t, _ = _tested(mesh, instances, numbers, floats, lane, key)
     off = abs(t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
-    sure = det != 0 and _inside(a, b, c) and t >= floats[_T_MIN] and off <= 1.5 * _MARGIN
+    sure = _clearly(a, b, c, det) and t >= floats[_T_MIN] and off <= 1.5 * _MARGIN
     return t, sure
 
 
@@ -380,7 +430,7 @@ def _verify_plain(table, numbers, floats, lanes):  # type: ignore[no-untyped-def
         r = floats[at + 6 * LANES], floats[at + 7 * LANES], floats[at + 8 * LANES]
         a, b, c, det, t = _areas((p, q, r), _lane(floats, lane))
         off = abs(t - floats[_ENTRY + lane] - floats[_ROUGH + lane])
-        sure = (det != 0) & _inside(a, b, c) & (t >= floats[_T_MIN]) & (off <= 1.5 * _MARGIN)
+        sure = _clearly(a, b, c, det) & (t >= floats[_T_MIN]) & (off <= 1.5 * _MARGIN)
         floats[_T + lane], numbers[_KEY + lane] = t, np.int64(sure)
 
 
@@ -509,37 +559,28 @@ def _next(row, pose, within, step, rows, each):  # type: ignore[no-untyped-def]
 
 
 @_inline
-def _prepare(scratch, mesh, instances, masked, filter_address, t_min, t_max):  # type: ignore[no-untyped-def]
+def _prepare(scene, scratch, mesh, instances, masked, filters, t_min, t_max):  # type: ignore[no-untyped-def]
     """Write to the scratch memory what all rays share."""
     numbers, floats = _int64s(scratch), _float64s(scratch)
     numbers[0] = -1  # no instance
     numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED] = mesh, instances, masked
     floats[_T_MIN], floats[_T_MAX] = t_min, t_max
+    numbers[_SCENE], numbers[_NEARBY] = scene, filters[3]
     numbers[_ARGUMENTS] = np.int64(-1) << 32  # flags are set later; all features
     numbers[_ARGUMENTS + 1] = scratch
-    numbers[_ARGUMENTS + 2] = filter_address
+    numbers[_ARGUMENTS + 2] = filters[0]
     numbers[_ARGUMENTS + 3] = numbers[_ARGUMENTS + 4] = 0
 
 
 @_inline
 def _shear_all(numbers, floats, lanes):  # type: ignore[no-untyped-def]
     for lane in range(lanes):
-        _keep_sheared(
-            numbers,
-            floats,
-            lane,
-            floats[_OX + lane],
-            floats[_OY + lane],
-            floats[_OZ + lane],
-            floats[_DX + lane],
-            floats[_DY + lane],
-            floats[_DZ + lane],
-        )
+        _keep_sheared(numbers, floats, lane, *_given(floats, lane))
 
 
 @_seldom
-def _single(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
-    """Cast one ray of a packet by itself."""
+def _single(scene, scratch, lane, reach, aside=0.0, up=0.0):  # type: ignore[no-untyped-def]
+    """Cast one ray of a packet by itself; or what Embree sees of one along an axis, moved."""
     numbers, floats = _int64s(scratch), _float64s(scratch)
     ray, entry = _float32s(scratch + 8 * _SINGLE), floats[_ENTRY + lane]
     ray[0] = _begun(floats[_OX + lane], floats[_DX + lane], entry)
@@ -549,6 +590,9 @@ def _single(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
     ray[4], ray[5] = np.float32(floats[_DX + lane]), np.float32(floats[_DY + lane])
     ray[6], ray[7] = np.float32(floats[_DZ + lane]), np.float32(0)
     ray[8] = np.float32(min(reach - entry + _MARGIN, _FAR))
+    axis = 0 if abs(ray[4]) > 0.5 else (1 if abs(ray[5]) > 0.5 else 2)
+    ray[(axis + 1) % 3] += np.float32(aside)
+    ray[(axis + 2) % 3] += np.float32(up)
     whole = _int32s(scratch + 8 * _SINGLE)
     whole[9], whole[10], whole[11], whole[18], whole[19], whole[20] = -1, 0, 0, -1, -1, -1
     numbers[_LANE] = lane
@@ -558,18 +602,31 @@ def _single(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
 
 @_seldom
 def _decided(scene, scratch, lane, reach):  # type: ignore[no-untyped-def]
-    """Distance and triangle of a ray of which `propose` could not be sure."""
+    """Distance and triangle of a ray of which `propose` could not be sure.
+
+    Embree does not see what touches a ray along an axis with the upper side of its box. So it
+    is shown eight such rays around it, too.
+    """
     numbers, floats = _int64s(scratch), _float64s(scratch)
     flags = _int32s(scratch + 8 * _ARGUMENTS)
-    floats[_T + lane] = floats[_SOFT_T + lane] = np.inf
-    numbers[_KEY + lane] = numbers[_SOFT_KEY + lane] = -1
+    floats[_T + lane], numbers[_KEY + lane] = np.inf, -1
     flags[0] = _CALL_FILTER
     _single(scene, scratch, lane, reach)
+    if _along(floats, lane):
+        for k in range(8):
+            one = _MARGIN if k & 1 else -_MARGIN
+            other = 0.4 * (_MARGIN if k & 2 else -_MARGIN)
+            aside, up = (one, other) if k & 4 else (other, one)
+            _single(scene, scratch, lane, reach, aside, up)
     flags[0] = _CALL_FILTER | _COHERENT
-    t, soft = floats[_T + lane], floats[_SOFT_T + lane]
-    if t <= soft + _MARGIN:
-        return t, numbers[_KEY + lane]
-    return soft, numbers[_SOFT_KEY + lane]
+    return floats[_T + lane], numbers[_KEY + lane]
+
+
+@_inline
+def _along(floats, lane):  # type: ignore[no-untyped-def]
+    """Whether a ray is along an axis."""
+    _, _, _, x, y, z = _given(floats, lane)
+    return (abs(x) + abs(y)) + abs(z) < _STRAIGHT
 
 
 @_inline
@@ -602,7 +659,7 @@ def trace(  # type: ignore[no-untyped-def]
     masked
         Whether any mesh has an opacity.
     filters
-        int64 (3,): addresses of the filters for packets, for single rays, and of `decide`.
+        int64 (4,): addresses of the filters for packets, for single rays, of `decide` and `nearby`.
     addresses
         int64 (8,): of arrays (float64, contiguous), 0 for those that there are not: directions
         and origins of the pattern (3, rows), positions (k, 3), rotations (k, 3, 3), delays
@@ -626,7 +683,7 @@ def trace(  # type: ignore[no-untyped-def]
     rays, whole = _float32s(scratch + 8 * _PACKET), _int32s(scratch + 8 * _PACKET)
     valid = _int32s(scratch + 8 * _VALID)
     flags = _int32s(scratch + 8 * _ARGUMENTS)
-    _prepare(scratch, mesh, instances, masked, filters[0], t_min, t_max)
+    _prepare(scene, scratch, mesh, instances, masked, filters, t_min, t_max)
     flags[0] = _CALL_FILTER | _COHERENT
     numbers[_LANE] = 0
     for lane in range(width):
@@ -669,15 +726,7 @@ def trace(  # type: ignore[no-untyped-def]
                     row, pose, within = _next(row, pose, within, step, rows, each)
             if not near:
                 for lane in range(lanes):
-                    floats[_ENTRY + lane] = _entry(
-                        frame,
-                        floats[_OX + lane],
-                        floats[_OY + lane],
-                        floats[_OZ + lane],
-                        floats[_DX + lane],
-                        floats[_DY + lane],
-                        floats[_DZ + lane],
-                    )
+                    floats[_ENTRY + lane] = _entry(frame, *_given(floats, lane))
             for lane in range(lanes):
                 floats[_ROUGH + lane], numbers[_INSIDE + lane] = np.inf, -1
                 numbers[_FIRST + lane] = numbers[_OTHER + lane] = -1
@@ -716,8 +765,11 @@ def trace(  # type: ignore[no-untyped-def]
                     _intersect_4(
                         scratch + 8 * _VALID, scene, scratch + 8 * _PACKET, scratch + 8 * _ARGUMENTS
                     )
+            straight = 0
+            for lane in range(lanes):
+                straight += _along(floats, lane)
             if plain:
-                found = 0
+                found = straight
                 for lane in range(lanes):
                     floats[_ROUGH + lane] = rough[lane]
                     numbers[_FIRST + lane], numbers[_OTHER + lane] = firsts[lane], others[lane]
@@ -727,7 +779,8 @@ def trace(  # type: ignore[no-untyped-def]
                     _verify_plain(table, numbers, floats, lanes)
             at = ray - start
             for lane in range(lanes):
-                one, other, t = numbers[_FIRST + lane], numbers[_OTHER + lane], np.inf
+                one, other = numbers[_FIRST + lane], numbers[_OTHER + lane]
+                t, sure = np.inf, True
                 if one >= 0:
                     if plain:
                         t, sure = floats[_T + lane], numbers[_KEY + lane] == 1
@@ -738,12 +791,14 @@ def trace(  # type: ignore[no-untyped-def]
                         sure = sure and sure_2
                         if t_2 < t or (t_2 == t and other < one):
                             t, one = t_2, other
-                    if not sure or other == -2:
-                        numbers[_ARGUMENTS + 2] = filters[2]
-                        t, one = _decided(scene, scratch, lane, t_max)
-                        numbers[_ARGUMENTS + 2] = filters[0]
-                    if t > t_max:
-                        t, one = np.inf, np.int64(-1)
+                    if other == -2:
+                        sure = False
+                if not sure or (straight and _along(floats, lane)):
+                    numbers[_ARGUMENTS + 2] = filters[2]
+                    t, one = _decided(scene, scratch, lane, t_max)
+                    numbers[_ARGUMENTS + 2] = filters[0]
+                if t > t_max:
+                    t, one = np.inf, np.int64(-1)
                 if instances != 0 and one >= 0:
                     number = one // _NUMBER
                     record = _int64s(instances + 8 * RECORD * number)

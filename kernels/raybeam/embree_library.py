@@ -101,7 +101,7 @@ def packet_width() -> int:
 def build() -> str:
     """Version of embreex, the hash of its copy of Embree, and the width of its vectors.
 
-    With vectors of 4, SSE without fused multiply-add, Embree proposes others at a triangle's rim.
+    With vectors of 4, SSE without fused multiply-add, Embree misses others at a triangle's rim.
     """
     [shipped] = [file for file in files("embreex") or () if file.name == find().name]
     digest = shipped.hash.value[:8] if shipped.hash else ""

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from benchmarks.gpu_scenes import grid_faces
+
+from raybeam import RayCaster
 
 TRIANGLE = np.array([[0.0, 0, 0], [4, 0, 0], [0, 4, 0]]), np.array([[0, 1, 2]])
 
@@ -90,8 +93,8 @@ def test_cube_from_inside_and_outside(caster, shapes):
     assert not cube.cast(10 * axes, axes).hit.any()
 
 
-def test_limits_count_on_both_ends(exact_caster, shapes):
-    cube = exact_caster(*shapes["cube"]())
+def test_limits_count_on_both_ends(caster, shapes):
+    cube = caster(*shapes["cube"]())
     ray = [-4, 0.25, 0.5], [[1, 0, 0]]
     assert cube.cast(*ray, t_min=3).distance == 3
     assert cube.cast(*ray, t_min=np.nextafter(3, 4)).distance == 5
@@ -102,8 +105,8 @@ def test_limits_count_on_both_ends(exact_caster, shapes):
     assert not cube.cast(*ray, t_min=3.5, t_max=4.5).hit
 
 
-def test_start_on_a_surface(exact_caster, shapes):
-    cube = exact_caster(*shapes["cube"]())
+def test_start_on_a_surface(caster, shapes):
+    cube = caster(*shapes["cube"]())
     start = [1, 0.25, 0.5]
     assert cube.cast(start, [[-1, 0, 0]]).distance == 0
     assert cube.cast(start, [[1, 0, 0]]).distance == 0
@@ -134,22 +137,22 @@ def test_a_ray_that_grazes_what_it_starts_on_meets_the_wall_behind(caster, t_min
         np.testing.assert_allclose(np.abs(points[:, :2]).max(axis=1), 10, rtol=1e-9)
 
 
-def test_edges_and_corners_belong_to_the_triangle(exact_caster):
-    triangle = exact_caster(*TRIANGLE)
+def test_edges_and_corners_belong_to_the_triangle(caster):
+    triangle = caster(*TRIANGLE)
     on = np.array([[0, 0, 1], [4, 0, 1], [0, 4, 1], [2, 0, 1], [0, 2, 1], [2, 2, 1], [1, 3, 1.0]])
     assert triangle.cast(on, np.broadcast_to([0, 0, -1], on.shape)).hit.all()
     off = np.array([[-1e-9, 1, 1], [1, -1e-9, 1], [2 + 1e-9, 2, 1], [4 + 1e-9, 0, 1]])
     assert not triangle.cast(off, np.broadcast_to([0, 0, -1], off.shape)).hit.any()
 
 
-def test_in_the_plane_is_a_miss(exact_caster):
-    triangle = exact_caster(*TRIANGLE)
+def test_in_the_plane_is_a_miss(caster):
+    triangle = caster(*TRIANGLE)
     origins = [[-1, 1, 0], [1, -1, 0], [-1, 0, 0], [-1, -1, 0], [1, 1, 0]]
     directions = [[1, 0, 0], [0, 1, 0], [1, 0, 0], [1, 1, 0], [1, 2, 0]]
     assert not triangle.cast(origins, directions).hit.any()
 
 
-def test_nearly_in_the_plane_stays_beside_the_triangle(exact_caster):
+def test_nearly_in_the_plane_stays_beside_the_triangle(caster):
     """Planes that float64 cannot hold: hit or miss is rounding, but no distance from elsewhere."""
     rng = np.random.default_rng(5)
     met = 0
@@ -158,7 +161,7 @@ def test_nearly_in_the_plane_stays_beside_the_triangle(exact_caster):
         weights = rng.dirichlet([1, 1, 1], (100, 2))
         start, end = np.einsum("nkc,cx->knx", weights, corners)
         origins, directions = start - 3 * (end - start), end - start
-        hits = exact_caster(corners, [[0, 1, 2]]).cast(origins, directions)
+        hits = caster(corners, [[0, 1, 2]]).cast(origins, directions)
         axis = np.argmax(np.abs(directions), axis=1)[:, None]
         unit = directions / np.linalg.norm(directions, axis=1, keepdims=True)
         points = origins + np.where(hits.hit, hits.distance, 0)[:, None] * unit
@@ -179,12 +182,12 @@ def test_triangles_without_area_are_not_hit(caster):
     assert (beside.cast(origin, targets - origin).triangle == 4).all()
 
 
-def test_nearest_of_equals_is_the_first(exact_caster, shapes):
+def test_nearest_of_equals_is_the_first(caster, shapes):
     vertices, faces = shapes["sphere"](12, 18)
     copies = np.concatenate([faces[::-1], faces, faces])
     directions = np.random.default_rng(6).normal(size=(2000, 3))
-    once = exact_caster(vertices, faces[::-1]).cast([0, 0, 0], directions)
-    many = exact_caster(vertices, copies).cast([0, 0, 0], directions)
+    once = caster(vertices, faces[::-1]).cast([0, 0, 0], directions)
+    many = caster(vertices, copies).cast([0, 0, 0], directions)
     np.testing.assert_array_equal(many.triangle, once.triangle)
     np.testing.assert_array_equal(many.distance, once.distance)
 
@@ -205,11 +208,30 @@ def test_far_origins_lose_nothing(caster, shapes):
 
 
 @pytest.mark.parametrize("size", [1e-30, 1e-6, 1e6, 1e30])
-def test_any_unit_of_length(exact_caster, shapes, size):
+def test_any_unit_of_length(caster, shapes, size):
     vertices, faces = shapes["vase"](20, 20)
     rng = np.random.default_rng(8)
     origins, directions = 0.1 * rng.normal(size=(300, 3)), rng.normal(size=(300, 3))
-    want = exact_caster(vertices, faces).cast(origins, directions)
-    got = exact_caster(vertices * size, faces).cast(origins * size, directions)
+    want = caster(vertices, faces).cast(origins, directions)
+    got = caster(vertices * size, faces).cast(origins * size, directions)
     np.testing.assert_array_equal(got.triangle, want.triangle)
     np.testing.assert_allclose(got.distance / size, want.distance, rtol=1e-12)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_corners_of_an_open_sheet_and_of_a_ball_are_hit(backend, shapes, axis, sign):
+    """Along an axis, where a corner is on the border of its triangles' boxes, too."""
+    way = sign * np.eye(3)[axis]
+    x, y = np.meshgrid(np.arange(21) / 10, np.arange(21) / 10, indexing="ij")
+    sheet = np.roll(np.stack([x, y, 0 * x], axis=-1).reshape(-1, 3), axis + 1, axis=1)
+    tip = np.roll([[0, 0, 0], [1, 0, 0], [0, 1, 0]], axis + 1, axis=1)
+    for mesh in ((sheet, grid_faces(21, 21)), (tip, [[0, 1, 2]]), shapes["sphere"]()):
+        at = mesh[0] * (way == 0) - 5 * way
+        hits, want = (
+            RayCaster(*mesh, name).cast(at, np.broadcast_to(way, at.shape))
+            for name in (backend, "numpy")
+        )
+        assert hits.hit.all()
+        for column in ("distance", "triangle"):
+            np.testing.assert_array_equal(getattr(hits, column), getattr(want, column))

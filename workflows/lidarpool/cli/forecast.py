@@ -24,6 +24,7 @@ from raybeam import available_backends
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.storage import Storage
+from ..base.words import counted
 from ..columns.cloud import CHUNK_POINTS
 from ..export.formats import Format
 from ..export.navigation import instrument_bytes
@@ -63,6 +64,7 @@ SCAN_BYTES = 64  # in the driver
 WAY_POSES = 1000  # that the length of a way is measured by
 SUMMARY_BYTES = 28  # of a scan, in the database
 FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most: LAS
+_FINE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
 # Rays that are sampled, parts of the survey, and consecutive scans of each part, at most.
 SAMPLE_RAYS, SAMPLE_PARTS, SAMPLE_SCANS = 500_000, 500, 40
@@ -125,6 +127,8 @@ def forecast(
         estimate = sample_survey(job.scene, job.survey)
         if not estimate["hits"]:
             notes.append(no_hits(job))
+    if backend == "embree":
+        notes += _of_fine_triangles(job.scene)
     # Without an estimate every ray may hit.
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     # Scans of the largest batches; small ones take less.
@@ -307,6 +311,19 @@ def _slots(
 def _existing(out: Path) -> Path:
     """Return the folder itself, or its innermost existing parent."""
     return next(path for path in (out, *out.absolute().parents) if path.exists())
+
+
+def _of_fine_triangles(scene: Scene) -> list[str]:
+    """Return a note on triangles that Embree may miss, since it finds them in float32."""
+    count, least = 0, _FINE * np.ptp(scene.bounds, axis=0).max()
+    parts = scene.instances.parts if scene.instances else ()
+    for points, faces in ((scene.vertices, scene.faces), *((p.vertices, p.faces) for p in parts)):
+        corners = points[faces.T]
+        edges = np.linalg.norm(corners - np.roll(corners, 1, axis=0), axis=2).min(axis=0)
+        # Without an area no backend hits them.
+        count += int(((edges > 0) & (edges < least)).sum())
+    note = "with an edge below a millionth of the scene may be missed by embree, not by numpy"
+    return [f"{counted(count, 'triangle')} {note}"] if count else []
 
 
 def _look_at_folder(out: Path | Storage) -> list[str]:
