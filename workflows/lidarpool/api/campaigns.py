@@ -42,6 +42,7 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
         resume: bool = False,
         fresh: bool = False,
         retry_failed: bool = False,
+        overwrite: bool = False,
         live: bool = False,
         wait_s: float = WAIT_S,
         patience_s: float = PATIENCE_S,
@@ -69,9 +70,11 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             Go on from what an earlier run has left in `out`, from the beginning if there is
             nothing.
         fresh
-            Remove first what an earlier run of a campaign has left in `out`.
+            Remove first what an unfinished run of a campaign has left in `out`.
         retry_failed
             Resume, and do the jobs that have failed again.
+        overwrite
+            Replace a finished data set, too; if jobs of it have failed, with `fresh`.
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
             in the cell.
@@ -102,7 +105,7 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
 
         making = Making(
             output_place(out), client is None, resume, fresh, retry_failed, parts, backend,
-            wait_s, patience_s,
+            wait_s, patience_s, overwrite,
         )  # fmt: skip
         progress = bars_here() if on_progress is None else nullcontext(on_progress)
         with _page(self, live) as page:

@@ -41,11 +41,8 @@ from .terminal import shown_progress
 def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) -> None:
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
     set_logs(options.verbose)
-    if options.overwrite or options.only:
-        raise LidarpoolError(
-            "--overwrite and --only are for one survey: a data set needs a folder of its own, and "
-            "--fresh removes an unfinished one."
-        )
+    if options.only:
+        raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
     pool = (campaign.describe(0).scenario or Scenario()).pool
 
     def cluster(waiting: Waiting, job: Job) -> AbstractContextManager[Client]:
@@ -57,7 +54,7 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
 
     making = Making(
         options.out, options.here, options.resume, options.fresh, retry_failed, options.parts,
-        options.backend, options.wait_s, options.patience_s,
+        options.backend, options.wait_s, options.patience_s, options.overwrite,
     )  # fmt: skip
     with _page(campaign, options) as page:
         progress = shown_progress(options.quiet)

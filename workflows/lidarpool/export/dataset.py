@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal, TypeVar
 
@@ -18,7 +20,7 @@ from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
 from ..columns.cloud import CloudLike
 from .boxes import Boxes
-from .folder import local_folder, remove_left
+from .folder import local_folder
 from .formats import Format
 from .jobs import JobRow
 from .nuscenes import merge
@@ -38,6 +40,25 @@ INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
 VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
+# Files of jobs in all formats: {folder of the data set: what they are called in it}
+OF_JOBS = {
+    ".jobs": r"[^/]+\.json|[0-9a-f]{16}-dataset",
+    "sweeps": r"[^/]+(\.npz|/[^/]+/\d+\.pcd\.bin)",
+    "boxes": r"[^/]+\.npz",
+    "sequences": r"[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))",
+    "poses": r"\d+(_[^/]+)?\.txt",
+    "samples": r"[^/]+/[^/]+/\d+\.pcd\.bin",
+    "bags": r"[^/]+\.mcap",
+    "points": r"job=\d+/part-\d+\.parquet",
+    "images": r"[^/]+/([^/]+/)?\d+\.npz",
+    "jobs": r"[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)",
+}
+
+
+def is_among(files: Mapping[str, str], name: str) -> bool:
+    """Whether a file of a data set is one of these, such as OF_JOBS."""
+    folder, _, rest = name.partition("/")
+    return folder in files and bool(re.fullmatch(files[folder], rest))
 
 
 def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
@@ -125,7 +146,8 @@ class DataSet:
             else:
                 summary, made = {}, []
                 path = f"jobs/{name}/{one.file}" if self.format == "folder" else f"bags/{name}.mcap"
-                with local_folder(Path(place.url) if place.is_local else place) as folder:
+                place.prepare(Path(path).parent)
+                with local_folder(place.local() if place.is_local else place) as folder:
                     (folder / path).parent.mkdir(parents=True, exist_ok=True)
                     one.write(folder / path, cloud, sweeps, overwrite=True)
                     if not place.is_local:
@@ -142,26 +164,26 @@ class DataSet:
             summary |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
             files[_summary_file(name)] = json.dumps(summary).encode()
             for file, data in files.items():
-                _make_folder(place, file)
+                place.prepare(Path(file).parent)
                 place.write(file, data)
 
     def remove_job(self, number: int, name: str) -> None:
         """Remove the files of a job, as far as there are any; LidarpoolError if that fails."""
-        place, own = self.place, f"{number:02}"
+        place, own, is_own = self.place, f"{number:02}", partial(is_among, OF_JOBS)
         with explained(f"Job {name} cannot be removed from {place}"):
             # First what says that it is there.
             place.remove([_summary_file(name)])
             if self.format == "kitti":
                 for folder in ("sequences", "poses"):
-                    for entry in Storage(place.path(folder)).entries():
+                    for entry in place.below(folder).entries():
                         stem = entry.removesuffix(".txt")
                         if stem == own or stem.startswith(f"{own}_"):
-                            place.discard(f"{folder}/{entry}")
+                            place.discard(f"{folder}/{entry}", is_own)
             elif self.format == "nuscenes":
                 for folder in ("samples", "sweeps"):
-                    for channel, size in Storage(place.path(folder)).entries().items():
+                    for channel, size in place.below(folder).entries().items():
                         if size is None:
-                            place.discard(f"{folder}/{channel}/{name}")
+                            place.discard(f"{folder}/{channel}/{name}", is_own)
             else:
                 places = {
                     "mcap": f"bags/{name}.mcap",
@@ -169,7 +191,7 @@ class DataSet:
                     "images": f"images/{name}",
                     "folder": f"jobs/{name}",
                 }
-                place.discard(places[self.format])
+                place.discard(places[self.format], is_own)
             for file in (SWEEPS_FILE, BOXES_FILE):
                 place.remove([job_file(self.format, name, file)])
 
@@ -186,7 +208,7 @@ class DataSet:
         """
         with explained(f"{self.place} cannot be written"):
             self.place.remove([INDEX_FILE])
-            self._tidy()
+            self.place.tidy()
             with self.place.writing(INDEX_FILE) as file:
                 head = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
@@ -197,14 +219,6 @@ class DataSet:
                 else:
                     deque(summaries, maxlen=0)
                 file.write(b"\n]}\n")
-
-    def _tidy(self) -> None:
-        """Remove what killed writers have left on this machine."""
-        self.place.tidy()
-        if self.place.is_local:
-            root = Path(self.place.url)
-            for folder in (*root.glob("bags"), *root.glob("jobs/*")):
-                remove_left(folder)
 
     def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
         """Yield what each job that is done has left, and add it to the index."""
@@ -254,11 +268,6 @@ def _write_far(pieces: Pieces, place: Storage) -> Written:
     with ThreadPoolExecutor(_REQUESTS, "write") as pool:
         written = [*pool.map(lambda span: pieces.write(place, *span), spans)]
     return sum(rows for rows, _ in written), [one for _, made in written for one in made]
-
-
-def _make_folder(place: Storage, file: str) -> None:
-    if place.is_local:
-        Path(place.path(file)).parent.mkdir(parents=True, exist_ok=True)
 
 
 def _packed(boxes: Sequence[Boxes]) -> bytes:

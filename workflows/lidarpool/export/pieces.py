@@ -69,7 +69,8 @@ class Pieces:
 
     def make_folders(self, place: Storage) -> None:
         """Make the folders of the files of pieces."""
-        _make_folders(place, self.folders)
+        for name in self.folders:
+            place.prepare(name)
 
     def write(self, place: Storage, first: int, stop: int) -> Written:
         """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
@@ -84,9 +85,8 @@ class Pieces:
 
     def write_others(self, place: Storage, made: Sequence[Any]) -> None:
         """Write the files that are not of one piece; OSError if that fails."""
-        others = self.others(made)
-        _make_folders(place, [str(Path(name).parent) for name in others])
-        for name, data in others.items():
+        for name, data in self.others(made).items():
+            place.prepare(Path(name).parent)
             place.write(name, data)
 
 
@@ -160,11 +160,6 @@ def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None
 def as_data(array: NDArray[Any]) -> Data:
     """Return the bytes of an array, without a copy of them."""
     return array.data.cast("B") if array.size else b""
-
-
-def _make_folders(place: Storage, names: Sequence[str]) -> None:
-    for name in dict.fromkeys(names) if place.is_local else ():
-        Path(place.url, name).mkdir(parents=True, exist_ok=True)
 
 
 # Writes ranges on workers; returns what was written of those whose workers see the folder.

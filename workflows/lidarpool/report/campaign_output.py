@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
-import re
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -17,32 +17,37 @@ from distributed import Client
 
 from ..base.errors import LidarpoolError, explained
 from ..base.software import difference, software
-from ..base.storage import Storage, target_of
+from ..base.storage import Storage
 from ..base.words import counted
-from ..export.dataset import INDEX_FILE, DataSet
-from ..export.folder import result_folder
-from ..export.jobs import JobRow, read_table, write_table
+from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet, is_among
+from ..export.folder import LAST_FILE, result_folder
+from ..export.jobs import PARQUET_FILE, TABLE_FILE, JobRow, read_table, write_table
 from ..export.loader import sweeps
+from ..pipeline.database import FILE
 from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.identity import OF_CAMPAIGN
 from ..run.job import Job
 from ..run.progress import Show
-from ..run.store import RUN_FOLDER, remove_run
+from ..run.store import RUN_FOLDER, drop_run
 from ..run.watch import Waiting
 from ..scenario.campaign import Campaign, Described
 from .campaign_figures import CampaignInfo
-from .campaign_report import write_card
+from .campaign_report import CARD, PAGE, PICTURES, SPLITS, write_card
 from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
-# What there may be in the folder of a data set, of any format.
-_OWN = re.compile(
-    r"run|campaign\.json|dataset\.json|README\.md|report\.(html|json)|pictures|splits|"
-    r"jobs\.(csv|parquet)|\.?jobs|sweeps|boxes|sequences|poses|samples|maps|v1\.0-lidarpool|"
-    r"bags|points|images|job-.+|[0-9a-f]{16}-dataset"
-)
+# What `_finish` writes once there is a CAMPAIGN_FILE, as OF_JOBS.
+_OF_ALL = {
+    **dict.fromkeys(
+        (CAMPAIGN_FILE, INDEX_FILE, CARD, PAGE, LAST_FILE, TABLE_FILE, PARQUET_FILE), ""
+    ),
+    PICTURES: r"\w+\.png",
+    SPLITS: r"[^/]+\.txt",
+    "v1.0-lidarpool": r"\w+\.json",
+    "maps": r"none\.png",
+}
 
 
 @dataclass(frozen=True)
@@ -50,7 +55,8 @@ class Making:
     """How a campaign is to be made into a data set.
 
     `out` is its place; `own` says that the cluster is a local one for this run. `resume` continues
-    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again.
+    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again; `overwrite` replaces
+    a finished data set.
     """
 
     out: Path | Storage
@@ -62,6 +68,7 @@ class Making:
     backend: str | None = None
     wait_s: float = 0.0
     patience_s: float = 60.0
+    overwrite: bool = False
 
 
 def make_dataset(
@@ -80,37 +87,39 @@ def make_dataset(
     LidarpoolError if the place holds something else, the cluster lacks something, or what all jobs
     need fails; its notes say what was kept.
     """
-    out = Storage.at(str(making.out), durable=False)
+    out = replace(Storage.at(making.out), durable=False)
     dataset = DataSet(out, campaign.keep.format, campaign.keep.layout)
     dataset.check_installed()
     resume = making.resume or making.retry_failed
-    if making.fresh and resume:
-        raise LidarpoolError("fresh removes the run that resume and retry_failed go on with.")
-    place = f"{out}/{RUN_FOLDER}"
+    if (making.fresh or making.overwrite) and resume:
+        raise LidarpoolError("fresh and overwrite remove what resume and retry_failed go on with.")
+    kept = out.below(RUN_FOLDER)
     with result_folder(making.out), ExitStack() as stack:
-        if making.fresh:
-            _remove_dataset(out, place)
-        there = set(out.entries())
+        there = out.entries()
+        begin = not resume and (making.fresh or RUN_FOLDER not in there)
+        if begin and INDEX_FILE in there and not making.overwrite:
+            raise LidarpoolError(
+                f"{out} holds a finished data set, and one needs a folder of its own: give another "
+                "with --out, or replace it with --overwrite (in Python overwrite=True)."
+            )
+        if begin and (making.fresh or making.overwrite):
+            _remove_dataset(out, kept)
         if resume and INDEX_FILE in there and RUN_FOLDER not in there:
             check_same(out, campaign)
             tell(f"{out} is complete: nothing is left to do")
             run = run_result(_shown(read_table(out), page), time.monotonic())
             page.finish(run)
             return run
-        if RUN_FOLDER not in there and (found := sorted(there)):
-            raise LidarpoolError(
-                f"{out} holds {found[0]}: a data set needs a folder of its own, give another with "
-                "--out."
-            )
         store = CampaignStore(
             campaign.identity,
             campaign.count,
             making.backend or "auto",
-            place,
+            kept,
             making.parts,
             resume=resume,
         )
         stack.enter_context(store.kept_on_error())
+        _refuse_others(out, store)
         if making.retry_failed:
             store.forget_failed()
         store.tidy_jobs()
@@ -221,24 +230,42 @@ def row_of(place: Storage, number: int) -> JobRow | None:
     return next((row for row in read_table(place) if row.number == number), None)
 
 
-def _remove_dataset(out: Storage, place: str) -> None:
-    """Remove an unfinished data set; LidarpoolError if there is none that is known to be one."""
-    there = set(out.entries())
-    if not there:
-        return
-    if RUN_FOLDER not in there and CAMPAIGN_FILE not in there:
-        raise LidarpoolError(
-            f"{out} holds {sorted(there)[0]} and no data set of a campaign: give another folder."
-        )
-    if foreign := sorted(name for name in there if not _OWN.fullmatch(target_of(name))):
-        raise LidarpoolError(
-            f"{out} holds {foreign[0]}, which is not of a data set: move it elsewhere, or give "
-            "another folder."
-        )
-    remove_run(place)
-    with explained(f"{out} cannot be removed"):
-        for name in sorted(there - {RUN_FOLDER}):
-            out.discard(name)
+def _refuse_others(out: Storage, store: CampaignStore) -> None:
+    """Refuse a folder with anything that the run has not put there; LidarpoolError names it."""
+    there = out.entries()
+    own = _own_files(CAMPAIGN_FILE in there) if store.kept else {}
+    for name in sorted(there.keys() - own - {RUN_FOLDER}):
+        if not (store.kept and name.startswith("job-")):  # the result of one that was done again
+            raise LidarpoolError(
+                f"{out} holds {name}: a data set needs a folder of its own, move that elsewhere, "
+                "or give another with --out."
+            )
+
+
+def _remove_dataset(out: Storage, kept: Storage) -> None:
+    """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more.
+
+    What neither a record nor the database of a run says to be a data set stays.
+    """
+    there = out.tree()
+    if CAMPAIGN_FILE in there or FILE in kept.sizes():
+        own = _own_files(CAMPAIGN_FILE in there)
+        for name in sorted(there):
+            if not is_among(own | {RUN_FOLDER: ".*"}, name):
+                raise LidarpoolError(
+                    f"{out} holds {name}, which is not of a data set: move it elsewhere, or give "
+                    "another folder."
+                )
+        with explained(f"{out} cannot be removed"):
+            # First what says that it is finished, and last what says that it is a data set.
+            for name in (INDEX_FILE, *sorted(own.keys() - {CAMPAIGN_FILE}), CAMPAIGN_FILE):
+                out.discard(name, partial(is_among, own))
+    drop_run(kept)
+
+
+def _own_files(recorded: bool) -> dict[str, str]:
+    """Files of a data set as OF_JOBS, those that all jobs share if there is a CAMPAIGN_FILE."""
+    return OF_JOBS | _OF_ALL if recorded else OF_JOBS
 
 
 def failures(run: CampaignRun, most: int = 5) -> str:
