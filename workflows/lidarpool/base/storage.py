@@ -7,13 +7,12 @@ renamed, and an object store shows only complete objects.
 from __future__ import annotations
 
 import errno
-import io
 import os
 import re
 import secrets
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -187,17 +186,11 @@ class Storage:
         """Write bytes, or a list of them, completely or not at all; flush them if durable."""
         pieces = data if isinstance(data, list) else [data]
         if self.is_local:
-            self._write_file(name, pieces)
+            with self._replacing(self._target(name)) as file:
+                file.writelines(pieces)
             return
         with self._remote() as (system, folder):
             system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
-
-    def _write_file(self, name: str, pieces: list[Any]) -> None:
-        with self._replacing(self._target(name)) as file:
-            for piece in pieces:
-                view = memoryview(piece).cast("B")
-                while len(view):
-                    view = view[file.write(view) :]
 
     @contextmanager
     def writing(self, name: str) -> Iterator[IO[bytes]]:
@@ -208,7 +201,7 @@ class Storage:
         if self.is_local:
             target = self._target(name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            with self._replacing(target, io.DEFAULT_BUFFER_SIZE) as file:
+            with self._replacing(target) as file:
                 yield file
             return
         with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
@@ -218,10 +211,10 @@ class Storage:
             self.put(path, name)
 
     @contextmanager
-    def _replacing(self, target: Path, buffering: int = 0) -> Iterator[IO[bytes]]:
+    def _replacing(self, target: Path) -> Iterator[IO[bytes]]:
         temporary = target.with_name(f"{_TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
-            with temporary.open("xb", buffering) as file:
+            with temporary.open("xb") as file:
                 yield file
                 if self.durable:
                     file.flush()
@@ -293,11 +286,6 @@ class Storage:
                 with suppress(FileNotFoundError), self._remote() as (system, folder):
                     system.rm_file(f"{folder}/{name}")
 
-    def has(self, name: str) -> bool:
-        """Whether there is a file or folder of this name."""
-        with self._remote() as (system, folder):
-            return bool(system.exists(f"{folder}/{name}"))
-
     def tree(self, name: str = "") -> list[str]:
         """Names, as of `read`, of a file itself, or of all in a folder and below; none if missing.
 
@@ -305,21 +293,25 @@ class Storage:
         """
         if self.is_local:
             top = self.local(name)
-            paths = [top] if top.is_file() else top.rglob("*")
-            found = (self.local(path) for path in paths if path.is_symlink() or path.is_file())
+            found = [top] if top.is_file() else []
+            for folder, folders, files in os.walk(top):
+                paths = [Path(folder, one) for one in (*files, *folders)]
+                for path in filter(Path.is_symlink, paths):
+                    self.local(path)
+                found += paths[: len(files)]
             return [path.relative_to(self.url).as_posix() for path in found]
         with self._remote() as (system, folder):
             below = system.find(f"{folder}/{name}".rstrip("/"))
             return [one.removeprefix(f"{folder}/") for one in below]
 
-    def discard(self, name: str, own: Callable[[str], bool] | None = None) -> None:
+    def discard(self, name: str, own: re.Pattern[str] | None = None) -> None:
         """Remove a file, or a folder with its content, if it exists.
 
-        With `own`, only files for whose names, as those of `tree`, it is true, and folders that
-        are empty then.
+        With `own`, only files whose names, as those of `tree`, it matches, and folders that are
+        empty then.
         """
         if own is not None:
-            self.remove([file for file in self.tree(name) if own(file)])
+            self.remove([file for file in self.tree(name) if own.fullmatch(file)])
             for folder, _, _ in os.walk(self.local(name), False) if self.is_local else ():
                 with suppress(OSError):
                     Path(folder).rmdir()

@@ -105,9 +105,9 @@ def run_job(campaign: Campaign, number: int, options: RunOptions) -> None:
     must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
     other software.
     """
-    place = Storage.at(str(options.out))
+    place = Storage.at(options.out)
     dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
-    of_dataset = place.has(CAMPAIGN_FILE)
+    of_dataset = CAMPAIGN_FILE in place.entries()
     if of_dataset:
         backend = check_same(place, campaign)["backend"]
         name = campaign.describe(number).name

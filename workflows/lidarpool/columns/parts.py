@@ -70,14 +70,6 @@ def own_files(storage: Storage, mark: str | None) -> list[str]:
     return sorted(own, key=lambda name: name.endswith("-mark"))
 
 
-def files_of(storage: Storage, mark: str) -> list[str]:
-    """Names of the files with the mark of a run, in a folder that is its own.
-
-    Unlike `own_files`, for folders whose mark has been removed.
-    """
-    return [name for name in storage.sizes() if _mark_of(target_of(name)) == mark]
-
-
 def _mark_of(name: str) -> str:
     """Mark in the name of a file of a run; empty for any other name."""
     found = _OWN.fullmatch(name)

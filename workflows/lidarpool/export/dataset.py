@@ -6,10 +6,9 @@ import io
 import json
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import IO, Any, Literal, TypeVar
 
@@ -40,25 +39,13 @@ INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
 VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
-# Files of jobs in all formats: {folder of the data set: what they are called in it}
-OF_JOBS = {
-    ".jobs": r"[^/]+\.json|[0-9a-f]{16}-dataset",
-    "sweeps": r"[^/]+(\.npz|/[^/]+/\d+\.pcd\.bin)",
-    "boxes": r"[^/]+\.npz",
-    "sequences": r"[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))",
-    "poses": r"\d+(_[^/]+)?\.txt",
-    "samples": r"[^/]+/[^/]+/\d+\.pcd\.bin",
-    "bags": r"[^/]+\.mcap",
-    "points": r"job=\d+/part-\d+\.parquet",
-    "images": r"[^/]+/([^/]+/)?\d+\.npz",
-    "jobs": r"[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)",
-}
-
-
-def is_among(files: Mapping[str, str], name: str) -> bool:
-    """Whether a file of a data set is one of these, such as OF_JOBS."""
-    folder, _, rest = name.partition("/")
-    return folder in files and bool(re.fullmatch(files[folder], rest))
+# Files of jobs, in all formats, and that by which workers see whether they see the place.
+OF_JOBS = re.compile(
+    r"[0-9a-f]{16}-dataset|\.jobs/[^/]+\.json|(sweeps|boxes)/[^/]+\.npz|bags/[^/]+\.mcap|"
+    r"jobs/[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)|points/job=\d+/part-\d+\.parquet|"
+    r"images/[^/]+/[^/]+/\d+\.npz|(samples|sweeps)/[^/]+/[^/]+/\d+\.pcd\.bin|poses/[^/]+\.txt|"
+    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
+)
 
 
 def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
@@ -169,7 +156,7 @@ class DataSet:
 
     def remove_job(self, number: int, name: str) -> None:
         """Remove the files of a job, as far as there are any; LidarpoolError if that fails."""
-        place, own, is_own = self.place, f"{number:02}", partial(is_among, OF_JOBS)
+        place, own = self.place, f"{number:02}"
         with explained(f"Job {name} cannot be removed from {place}"):
             # First what says that it is there.
             place.remove([_summary_file(name)])
@@ -178,12 +165,12 @@ class DataSet:
                     for entry in place.below(folder).entries():
                         stem = entry.removesuffix(".txt")
                         if stem == own or stem.startswith(f"{own}_"):
-                            place.discard(f"{folder}/{entry}", is_own)
+                            place.discard(f"{folder}/{entry}", OF_JOBS)
             elif self.format == "nuscenes":
                 for folder in ("samples", "sweeps"):
                     for channel, size in place.below(folder).entries().items():
                         if size is None:
-                            place.discard(f"{folder}/{channel}/{name}", is_own)
+                            place.discard(f"{folder}/{channel}/{name}", OF_JOBS)
             else:
                 places = {
                     "mcap": f"bags/{name}.mcap",
@@ -191,7 +178,7 @@ class DataSet:
                     "images": f"images/{name}",
                     "folder": f"jobs/{name}",
                 }
-                place.discard(places[self.format], is_own)
+                place.discard(places[self.format], OF_JOBS)
             for file in (SWEEPS_FILE, BOXES_FILE):
                 place.remove([job_file(self.format, name, file)])
 

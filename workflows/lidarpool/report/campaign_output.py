@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import json
+import re
 import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,9 +19,9 @@ from ..base.errors import LidarpoolError, explained
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import counted
-from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet, is_among
-from ..export.folder import LAST_FILE, result_folder
-from ..export.jobs import PARQUET_FILE, TABLE_FILE, JobRow, read_table, write_table
+from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
+from ..export.folder import result_folder
+from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import sweeps
 from ..pipeline.database import FILE
 from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
@@ -33,21 +33,18 @@ from ..run.store import RUN_FOLDER, drop_run
 from ..run.watch import Waiting
 from ..scenario.campaign import Campaign, Described
 from .campaign_figures import CampaignInfo
-from .campaign_report import CARD, PAGE, PICTURES, SPLITS, write_card
+from .campaign_report import write_card
 from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
-# What `_finish` writes once there is a CAMPAIGN_FILE, as OF_JOBS.
-_OF_ALL = {
-    **dict.fromkeys(
-        (CAMPAIGN_FILE, INDEX_FILE, CARD, PAGE, LAST_FILE, TABLE_FILE, PARQUET_FILE), ""
-    ),
-    PICTURES: r"\w+\.png",
-    SPLITS: r"[^/]+\.txt",
-    "v1.0-lidarpool": r"\w+\.json",
-    "maps": r"none\.png",
-}
+# With what `_finish` writes, CAMPAIGN_FILE first.
+_FINISHED = re.compile(
+    OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
+    r"jobs\.(csv|parquet)|splits/[^/]+\.txt|v1\.0-lidarpool/\w+\.json|maps/none\.png"
+)
+# The run, results of single jobs, and what writers that have not heard of their end may add.
+_BESIDE = re.compile(r"(run|job-[^/]+)/.*|(.*/)?\.lidarpool-(tmp|writing)-.*")
 
 
 @dataclass(frozen=True)
@@ -119,7 +116,7 @@ def make_dataset(
             resume=resume,
         )
         stack.enter_context(store.kept_on_error())
-        _refuse_others(out, store)
+        _own_files(out, begun=bool(store.kept))
         if making.retry_failed:
             store.forget_failed()
         store.tidy_jobs()
@@ -230,42 +227,32 @@ def row_of(place: Storage, number: int) -> JobRow | None:
     return next((row for row in read_table(place) if row.number == number), None)
 
 
-def _refuse_others(out: Storage, store: CampaignStore) -> None:
-    """Refuse a folder with anything that the run has not put there; LidarpoolError names it."""
-    there = out.entries()
-    own = _own_files(CAMPAIGN_FILE in there) if store.kept else {}
-    for name in sorted(there.keys() - own - {RUN_FOLDER}):
-        if not (store.kept and name.startswith("job-")):  # the result of one that was done again
+def _own_files(out: Storage, *, begun: bool) -> list[str]:
+    """Name the files of a data set, which has begun or is empty.
+
+    LidarpoolError if there is a link, or a file that neither jobs nor `_finish` write.
+    """
+    files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
+    own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS
+    for name in sorted(files):
+        if not begun or not own.fullmatch(name):
             raise LidarpoolError(
                 f"{out} holds {name}: a data set needs a folder of its own, move that elsewhere, "
                 "or give another with --out."
             )
+    return files
 
 
 def _remove_dataset(out: Storage, kept: Storage) -> None:
-    """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more.
-
-    What neither a record nor the database of a run says to be a data set stays.
-    """
-    there = out.tree()
-    if CAMPAIGN_FILE in there or FILE in kept.sizes():
-        own = _own_files(CAMPAIGN_FILE in there)
-        for name in sorted(there):
-            if not is_among(own | {RUN_FOLDER: ".*"}, name):
-                raise LidarpoolError(
-                    f"{out} holds {name}, which is not of a data set: move it elsewhere, or give "
-                    "another folder."
-                )
-        with explained(f"{out} cannot be removed"):
-            # First what says that it is finished, and last what says that it is a data set.
-            for name in (INDEX_FILE, *sorted(own.keys() - {CAMPAIGN_FILE}), CAMPAIGN_FILE):
-                out.discard(name, partial(is_among, own))
+    """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more."""
+    begun = CAMPAIGN_FILE in out.sizes() or FILE in kept.sizes()
+    tops = {name.partition("/")[0] for name in _own_files(out, begun=begun)}
+    with explained(f"{out} cannot be removed"):
+        out.tidy()
+        # First what says that it is finished, and last what says that it is a data set.
+        for name in sorted(tops, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)):
+            out.discard(name, _FINISHED)
     drop_run(kept)
-
-
-def _own_files(recorded: bool) -> dict[str, str]:
-    """Files of a data set as OF_JOBS, those that all jobs share if there is a CAMPAIGN_FILE."""
-    return OF_JOBS | _OF_ALL if recorded else OF_JOBS
 
 
 def failures(run: CampaignRun, most: int = 5) -> str:

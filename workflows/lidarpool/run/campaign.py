@@ -636,9 +636,9 @@ def run_campaign(
             return run_result(store.rows(), started, store=store)
         client = connect(waiting, first.job)
         show = stack.enter_context(progress)
-        probe = (f".jobs/{store.db.meta['mark']}-dataset", store.db.meta["mark"].encode())
+        probe = (f"{store.db.meta['mark']}-dataset", store.db.meta["mark"].encode())
         with explained(f"{dataset.place} cannot be written"):
-            dataset.place.prepare(".jobs")
+            dataset.place.prepare()
             dataset.place.write(*probe)
         stack.callback(_remove_probe, dataset.place, probe[0])
         while True:

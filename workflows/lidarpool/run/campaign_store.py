@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -11,7 +12,6 @@ from pathlib import Path
 from ..base.errors import LidarpoolError
 from ..base.software import software
 from ..base.storage import Storage
-from ..columns.parts import files_of
 from ..export.jobs import JobRow
 from ..pipeline.database import RunDatabase, mark_of_folder, parts_folder
 from .identity import OF_CAMPAIGN
@@ -106,10 +106,8 @@ class CampaignStore(KeptRun):
         """Remove the store, and parts of jobs that were written late: their jobs had them twice."""
         for name in self.storage.entries():
             if mark := mark_of_folder(name):
-                folder = self.storage.below(name)
                 with suppress(OSError):
-                    folder.remove(files_of(folder, mark))
-                folder.remove_folder()
+                    self.storage.discard(name, re.compile(f".*{mark}-.*"))
         super().remove()
 
     def folder_of(self, store: RunStore) -> str:

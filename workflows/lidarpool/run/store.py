@@ -92,7 +92,7 @@ class KeptRun:
         self._gone = False
         self.identity = here = identity
         self._remote = None
-        kept = Storage.at(place or tempfile.mkdtemp(prefix="lidarpool-"))
+        kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
         self.place = self._folder = kept  # that of the run, and that of its database
         if not kept.is_local:
             self._remote = RemoteRun(kept)
@@ -100,7 +100,6 @@ class KeptRun:
         folder = self._folder.local()
         if place is None or self._remote:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-        made = not folder.exists()
         advice = "make the one that it lies in first, or give another"
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
@@ -112,15 +111,14 @@ class KeptRun:
                 self.close()
                 raise
         except BaseException:
-            if made:
-                with suppress(OSError):
-                    folder.rmdir()
+            self._folder.remove_folder()
             raise
         self.resumed = self.db.scans_done  # scans whose points are of an earlier run
 
     def _open(self, here: dict[str, str], parts: str | Path | Storage | None) -> RunDatabase:
         """Open the database, or a new one if nothing is committed in it."""
         path, count = _database(self._folder), self._scan_count
+        jobs_of(self.place)  # an error if one is a link
         durable = self.lasting and self._remote is None
         mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
         try:
@@ -158,7 +156,6 @@ class KeptRun:
     def _claim(self, here: dict[str, str], resume: bool) -> None:
         """Find the parts, check them if there are any, and mark their folder as this run's."""
         self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
-        jobs_of(self.place)  # an error if one is a link
         with explained(f"{self.storage.url} cannot be looked at"):
             sizes = self.storage.sizes()  # also an error if the place cannot be opened
         if self.kept:
