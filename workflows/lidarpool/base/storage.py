@@ -328,8 +328,9 @@ class Storage:
     def tidy(self, *, deep: bool = True) -> None:
         """Remove what killed writers have left in a folder of this machine, and below if `deep`."""
         for folder, folders, files in os.walk(self.local()) if self.is_local else ():
-            for name in filter(_LEFT.fullmatch, (*folders, *files)):
-                self.discard(Path(folder, name).relative_to(self.url).as_posix())
+            for path in (Path(folder, name) for name in (*folders, *files)):
+                if _LEFT.fullmatch(path.name) and not path.is_symlink():
+                    self.discard(path.relative_to(self.url).as_posix())
             if not deep:
                 break
 
