@@ -41,9 +41,8 @@ def is_url(place: str | Path) -> bool:
 class Storage:
     """A folder of files, by path or URL; small when pickled.
 
-    Nothing is opened, written or removed through a link below the folder that the user named,
-    which may be a link itself. A link in place of a file that is written or removed is replaced or
-    removed, not what it leads to.
+    Nothing is opened, written or removed through a link below the folder that the user named. A
+    link in place of a file that is written or removed goes, not what it leads to.
 
     Its methods raise OSError if the storage fails, and LidarpoolError if it cannot be opened or
     there is such a link.
@@ -57,7 +56,7 @@ class Storage:
         Whether files must survive a power failure: flushing takes milliseconds for each file, and
         is not needed for a temporary folder.
     named
-        The folder that the user named, which is this one or above it; "" follows all links.
+        The folder that the user named, this or one above, which may be a link; "" follows all.
     """
 
     url: str
@@ -277,14 +276,17 @@ class Storage:
                 found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
         return found
 
-    def remove(self, names: list[str]) -> None:
-        """Remove files; no error for missing ones."""
+    def remove(self, names: list[str], *, folder: bool = False) -> None:
+        """Remove files; no error for missing ones. Then the `folder` itself, if it is empty."""
         for name in names:
             if self.is_local:
                 self._target(name).unlink(missing_ok=True)
             else:
-                with suppress(FileNotFoundError), self._remote() as (system, folder):
-                    system.rm_file(f"{folder}/{name}")
+                with suppress(FileNotFoundError), self._remote() as (system, path):
+                    system.rm_file(f"{path}/{name}")
+        if folder and self.is_local:
+            with suppress(OSError):
+                self.local().rmdir()
 
     def tree(self, name: str = "") -> list[str]:
         """Names, as of `read`, of a file itself, or of all in a folder and below; none if missing.
@@ -333,12 +335,6 @@ class Storage:
                     self.discard(path.relative_to(self.url).as_posix())
             if not deep:
                 break
-
-    def remove_folder(self) -> None:
-        """Remove the folder if it is empty."""
-        if self.is_local:
-            with suppress(OSError):
-                self.local().rmdir()
 
 
 def flush(path: Path) -> None:

@@ -168,9 +168,8 @@ class DataSet:
                             place.discard(f"{folder}/{entry}", OF_JOBS)
             elif self.format == "nuscenes":
                 for folder in ("samples", "sweeps"):
-                    for channel, size in place.below(folder).entries().items():
-                        if size is None:
-                            place.discard(f"{folder}/{channel}/{name}", OF_JOBS)
+                    for channel in place.below(folder).entries():
+                        place.discard(f"{folder}/{channel}/{name}", OF_JOBS)
             else:
                 places = {
                     "mcap": f"bags/{name}.mcap",
@@ -235,7 +234,8 @@ def _summary_file(name: str) -> str:
 
 def _write_pieces(pieces: Pieces, place: Storage) -> tuple[dict[str, Any], list[Any]]:
     """Write all pieces of a job; returns its summary, and what was made of the pieces."""
-    pieces.make_folders(place)
+    for folder in pieces.folders:
+        place.prepare(folder)
     if place.is_local:
         rows, made = pieces.write(place, 0, len(pieces))
     else:

@@ -67,11 +67,6 @@ class Pieces:
         """Return what the data set's own files need of this job, as JSON holds it."""
         return {}
 
-    def make_folders(self, place: Storage) -> None:
-        """Make the folders of the files of pieces."""
-        for name in self.folders:
-            place.prepare(name)
-
     def write(self, place: Storage, first: int, stop: int) -> Written:
         """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
         count, made = 0, []
@@ -131,8 +126,8 @@ class RangeWriter:
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
         pieces = self._pieces()
-        self.place.prepare()
-        pieces.make_folders(self.place)
+        for folder in ("", *pieces.folders):
+            self.place.prepare(folder)
         count = len(pieces)
         size = max(1, min(RANGE_PIECES, RANGE_POINTS * count // max(1, len(self.cloud))))
         spans = [(first, min(first + size, count)) for first in range(0, count, size)]

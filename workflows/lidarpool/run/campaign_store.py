@@ -13,7 +13,7 @@ from ..base.errors import LidarpoolError
 from ..base.software import software
 from ..base.storage import Storage
 from ..export.jobs import JobRow
-from ..pipeline.database import RunDatabase, mark_of_folder, parts_folder
+from ..pipeline.database import mark_of_folder, parts_folder
 from .identity import OF_CAMPAIGN
 from .job import Job
 from .store import JOBS, KeptRun, RunStore, drop_run, jobs_of
@@ -47,9 +47,6 @@ class CampaignStore(KeptRun):
         """Jobs that have ended, in words; empty if none was begun."""
         begun = self.db.jobs or jobs_of(self.place)
         return f"{len(self.db.jobs):,} of {self.count:,} jobs" if begun else ""
-
-    def _is_used(self, db: RunDatabase) -> bool:
-        return db.used or bool(jobs_of(self.place))
 
     @property
     def left(self) -> list[int]:
@@ -95,11 +92,9 @@ class CampaignStore(KeptRun):
         self.place.prepare(JOBS)
         # The campaign keeps with which backend and software all of its jobs are cast.
         place = self.place.below(f"{JOBS}/{name}")
-        if place.entries():
-            try:
-                return RunStore(job, place, self.storage, resume=True, backend="auto")
-            except LidarpoolError:  # damaged, or files that the description names have changed
-                drop_run(place)
+        with suppress(LidarpoolError):  # damaged, or files that the description names have changed
+            return RunStore(job, place, self.storage, resume=True, backend="auto")
+        drop_run(place)
         return RunStore(job, place, self.storage, resume=True, backend="auto")
 
     def remove(self) -> None:

@@ -75,5 +75,6 @@ class RemoteRun:
 
 def fetch_database(storage: Storage, path: Path) -> None:
     """Copy the database of a run, if there is one, to this machine."""
-    if FILE in storage.sizes():
-        storage.get(FILE, path)
+    with explained(f"The run in {storage} cannot be read"):
+        if FILE in storage.sizes():
+            storage.get(FILE, path)

@@ -11,7 +11,7 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -111,16 +111,16 @@ class KeptRun:
                 self.close()
                 raise
         except BaseException:
-            self._folder.remove_folder()
+            self._folder.remove([], folder=True)
             raise
         self.resumed = self.db.scans_done  # scans whose points are of an earlier run
 
     def _open(self, here: dict[str, str], parts: str | Path | Storage | None) -> RunDatabase:
         """Open the database, or a new one if nothing is committed in it."""
         path, count = _database(self._folder), self._scan_count
-        jobs_of(self.place)  # an error if one is a link
         durable = self.lasting and self._remote is None
         mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
+        jobs_of(self.place)  # an error if one is a link
         try:
             if self._remote:
                 fetch_database(self._remote.storage, path)
@@ -132,8 +132,6 @@ class KeptRun:
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
         except LidarpoolError as error:  # the copy of a database is nobody's business
             raise LidarpoolError(str(error).replace(self._folder.url, self.place.url)) from error
-        except OSError as error:
-            raise LidarpoolError(f"The run in {self.place} cannot be read: {error}.") from error
         if self.lasting:
             _remove(self.place, _parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
@@ -150,15 +148,15 @@ class KeptRun:
             raise
 
     def _is_used(self, db: RunDatabase) -> bool:
-        """Whether an earlier run has left something."""
-        return db.used
+        """Whether an earlier run has left something, of one survey or many."""
+        return db.used or bool(jobs_of(self.place))
 
     def _claim(self, here: dict[str, str], resume: bool) -> None:
         """Find the parts, check them if there are any, and mark their folder as this run's."""
         self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
             sizes = self.storage.sizes()  # also an error if the place cannot be opened
-        if self.kept:
+        if self._is_used(self.db):
             self._go_on(here, resume, sizes)
         if self._remote:
             self._remote.claim(self.db)
@@ -177,8 +175,8 @@ class KeptRun:
             )
         if not resume:
             raise LidarpoolError(
-                f"{self.place} holds an unfinished run, {self.kept}: continue it with {_RESUME}, "
-                f"or drop it with {_DROP}."
+                f"{self.place} holds an unfinished run, {self.kept or 'a job'}: continue it with "
+                f"{_RESUME}, or drop it with {_DROP}."
             )
         if self._wanted not in ("auto", self.backend):
             raise LidarpoolError(
@@ -312,7 +310,7 @@ class KeptRun:
     def close(self) -> None:
         """Close the database of an unfinished run; remove one that has committed nothing."""
         self.db.close()
-        if not self.kept:
+        if not self._is_used(self.db):
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
@@ -456,7 +454,7 @@ def remove_run(folder: str | Path) -> None:
 
 def drop_run(place: Storage) -> None:
     """Remove a stored run, see `remove_run`."""
-    with _removing(place), tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
         path = _database(place if place.is_local else Storage.at(temporary))
         if not place.is_local:
             fetch_database(place, path)
@@ -473,19 +471,13 @@ def _remove(place: Storage, parts: Storage, mark: str | None) -> None:
 
     `mark` is None if the database does not say it: then that in the folder of the parts counts.
     """
-    with _removing(place):
+    with explained(f"The run in {place} cannot be removed"):
         own = own_files(parts, mark)  # an error if they are behind a link
         for job in jobs_of(place).values():
             drop_run(job)
-        place.below(JOBS).remove_folder()
-        parts.remove(own)
-        parts.remove_folder()
-        place.remove([FILE, f"{FILE}-journal", OWNER])
-        place.remove_folder()
-
-
-def _removing(place: Storage) -> AbstractContextManager[None]:
-    return explained(f"The run in {place} cannot be removed")
+        place.below(JOBS).remove([], folder=True)
+        parts.remove(own, folder=True)
+        place.remove([FILE, f"{FILE}-journal", OWNER], folder=True)
 
 
 def _span(part: Receipt) -> str:
