@@ -104,7 +104,7 @@ class Storage:
         """Path of a file or folder in a local file system, by default its own, to open it."""
         path = Path(self.url, name)
         for part in (path, *path.parents) if self.named else ():
-            if part == Path(self.named):
+            if len(str(part)) <= len(self.named):
                 break
             if part.is_symlink():
                 raise LidarpoolError(
