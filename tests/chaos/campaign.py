@@ -41,6 +41,8 @@ WORKERS = {"GPU": 1, "LIDAR": 5}  # slots of each of two
 DRIVER = "driver"
 HARMED = 0.5  # of the times that the driver is killed
 HARMS = 4  # runs of a finished data set, each after a file was harmed
+LINK = "link"  # is put before the driver that follows a killed one
+LINKS = ("run", "run/parts", "run/jobs/x", "jobs", ".jobs")
 BETWEEN_S = 0.3, 4.0  # seconds between faults
 ENDS_WITHIN_S = 300.0
 
@@ -117,12 +119,12 @@ class Arena:
         harms = HARMS if faults else 0  # of the finished data set
         while driver.poll() is None and faults:
             time.sleep(self._chance.uniform(*BETWEEN_S))
-            kind = self._chance.choice((*WORKERS, DRIVER))
+            kind = self._chance.choice((*WORKERS, DRIVER, LINK))
             if driver.poll() is not None:
                 break
             faults -= 1
             tally.done[kind] += 1
-            if kind != DRIVER:
+            if kind in WORKERS:
                 name = self._chance.choice([n for n in self._workers if n.startswith(kind)])
                 self._workers.remove(name)
                 self.cluster.kill(name)
@@ -132,6 +134,8 @@ class Arena:
             driver.communicate()
             if self._chance.random() < HARMED:
                 tally.done.update(self._harm(self.folder / out))
+            if kind == LINK and (self.folder / out / "run" / "run.db").exists():
+                self._lead_away(out, tally)
             driver = self.start(out)
         while True:
             _, err = driver.communicate(timeout=ENDS_WITHIN_S)
@@ -145,6 +149,26 @@ class Arena:
             if len(tally.errors) > 10:
                 return
             driver = self.start(out)
+
+    def _lead_away(self, out: str, tally: Tally) -> None:
+        """Put a link to a stranger's folder there: a driver refuses it, and touches nothing."""
+        link = self.folder / out / self._chance.choice(LINKS)
+        stranger, aside = self.folder / "stranger", self.folder / "aside"
+        stranger.mkdir(exist_ok=True)
+        (stranger / "thesis.txt").write_text("mine")
+        link.parent.mkdir(exist_ok=True)
+        if link.exists():
+            link.rename(aside)
+        link.symlink_to(stranger)
+        driver = self.start(out)
+        _, err = driver.communicate(timeout=ENDS_WITHIN_S)
+        if driver.returncode != 2 or f"{link} is a link" not in err:
+            tally.errors.append(f"with {link} as a link: {err}")
+        if [path.name for path in stranger.iterdir()] != ["thesis.txt"]:
+            tally.differing.append(f"files behind {link}")
+        link.unlink()
+        if aside.exists():
+            aside.rename(link)
 
 
 def files_of(dataset: Path) -> dict[str, bytes]:

@@ -28,7 +28,7 @@ from lidarpool.base.tracing import trace_to
 
 Event = dict[str, Any]
 
-KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE = KINDS = (
+KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE, LINK = KINDS = (
     "kill",  # SIGKILL
     "term",  # SIGTERM
     "segv",  # segmentation fault
@@ -37,6 +37,7 @@ KILL, TERM, SEGV, STOP, RETIRE, RESTART, PAUSE, DAMAGE = KINDS = (
     "restart",  # its nanny is told to start it again
     "pause",  # as Dask does if memory is short, and on again some time later
     "damage",  # a bit of a part in storage is flipped; the run is resumed once it has ended
+    "link",  # the run's folder gets a link to another's; the run is resumed with and without it
 )
 SIGNALS = {KILL: signal.SIGKILL, TERM: signal.SIGTERM, SEGV: signal.SIGSEGV, STOP: signal.SIGSTOP}
 

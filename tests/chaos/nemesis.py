@@ -8,7 +8,7 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from itertools import chain, cycle
 from pathlib import Path
@@ -19,7 +19,20 @@ from distributed import Worker
 from lidarpool.base.tracing import trace_to
 
 from .arena import TIME_TO_LIVE_S, Arena
-from .events import DAMAGE, KINDS, PAUSE, RANDOM, RESTART, RETIRE, SIGNALS, STOP, Fault, Fired, Sink
+from .events import (
+    DAMAGE,
+    KINDS,
+    LINK,
+    PAUSE,
+    RANDOM,
+    RESTART,
+    RETIRE,
+    SIGNALS,
+    STOP,
+    Fault,
+    Fired,
+    Sink,
+)  # fmt: skip
 
 PARTITIONS = ("GPU", "LIDAR", "OTHER")
 ALL_AT_ONCE = 0.15  # part of the faults at random times that come together with the one before
@@ -82,14 +95,16 @@ def _fault(
 class Nemesis:
     """Carries out faults during a run whose driver is in this process; a context manager around it.
 
-    The run keeps its parts in the folder `parts`.
+    The run keeps its parts in the folder `parts`. `links` lead from its folder to that of a
+    `stranger`, who has a run, too.
 
     Faults at points are armed at once; those at random times follow one another, from when
     anybody passes a point.
     """
 
-    def __init__(self, arena: Arena, faults: Sequence[Fault], parts: Path) -> None:
-        self.arena, self.parts = arena, parts
+    def __init__(self, arena: Arena, faults: Sequence[Fault], parts: Path, stranger: Path) -> None:
+        self.arena, self.parts, self.stranger = arena, parts, stranger
+        self.links: list[Path] = []
         self.faults = {fault.number: fault for fault in faults}
         self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
         self.left: list[Fault] = []  # afterwards: those that were not carried out
@@ -151,7 +166,8 @@ class Nemesis:
         fault = self.faults[fired.number]
         if fault.partition:  # the driver does that in its own thread
             return
-        if fault.kind != DAMAGE or self._damage(fault):
+        do = self._files.get(fault.kind)
+        if do is None or do(fault):
             self._note(fault)
         fired.path.unlink()
         if fault.kind == STOP:
@@ -186,8 +202,8 @@ class Nemesis:
         if not names:
             return False
         name = names[int(fault.pick * len(names))]
-        if fault.kind == DAMAGE:
-            done = self._damage(fault)
+        if fault.kind in self._files:
+            done = self._files[fault.kind](fault)
         else:
             done = (self._signal if fault.kind in SIGNALS else self._help)(fault, name)
         if done:
@@ -201,6 +217,18 @@ class Nemesis:
         if fault.kind == STOP:
             with self._lock:
                 self._stopped[pid] = time.monotonic() + fault.stop_s
+        return True
+
+    @property
+    def _files(self) -> dict[str, Callable[[Fault], bool]]:
+        return {DAMAGE: self._damage, LINK: self._link}
+
+    def _link(self, fault: Fault) -> bool:
+        """Put a link where a run removes what it finds."""
+        link = self.parts.with_name("jobs") / str(fault.number)
+        link.parent.mkdir(exist_ok=True)
+        link.symlink_to(self.stranger)
+        self.links.append(link)
         return True
 
     def _damage(self, fault: Fault) -> bool:

@@ -9,19 +9,29 @@ import time
 import traceback
 from collections import Counter
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 
-from lidarpool import Planning, Result, Scene, Sensor, Survey, simulate
+from lidarpool import (
+    LidarpoolError,
+    Planning,
+    Result,
+    Scene,
+    Sensor,
+    Survey,
+    remove_run,
+    simulate,
+)  # fmt: skip
 from lidarpool.scene.mesh import Mesh
 from poolpart import placement_violations
 
 from .arena import Arena
 from .checker import Verdict, judge
-from .events import DAMAGE, Fault
+from .events import DAMAGE, LINK, Fault
 from .nemesis import Nemesis
 
 STEPS, POSES = 360, 2
@@ -96,6 +106,19 @@ def reference(arena: Arena, what: Survey, planning: Planning | None = PLANNING) 
     return Reference.of(result)
 
 
+def _run_of_another(folder: Path) -> dict[str, bytes]:
+    """Make what a run removes of its own; returns the files."""
+    mark = "0123456789abcdef"
+    (folder / "parts").mkdir()
+    for name in ("run.owner", f"parts/{mark}-mark", f"parts/{mark}-00000000-00000004.npz"):
+        (folder / name).write_text("theirs")
+    return _files_of(folder)
+
+
+def _files_of(folder: Path) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
 def disturbed(
     arena: Arena,
     what: Survey,
@@ -106,33 +129,43 @@ def disturbed(
 ) -> Outcome:
     """Run it while the nemesis does its worst, and judge what comes of it.
 
-    Where parts were damaged, it is resumed in the end.
+    Where parts were damaged, or there are links, it is resumed in the end.
     """
     arena.wait_until_whole()
     arena.board.forget_events()
     started = time.monotonic()
     result: Result | None = None
     error = ""
-    place = tempfile.mkdtemp(prefix="chaos-run-")
+    place, stranger = (tempfile.mkdtemp(prefix=f"chaos-{of}-") for of in ("run", "stranger"))
+    theirs = _run_of_another(Path(stranger))
     again = partial(
         simulate, room(), what, planning, client=arena.client, backend="numpy", folder=place
     )
     try:
-        with Nemesis(arena, faults, Path(place, "parts")) as nemesis:
+        with Nemesis(arena, faults, Path(place, "parts"), Path(stranger)) as nemesis:
             try:
                 result = again(**options)
             except Exception as failure:
                 error = "".join(traceback.format_exception(failure))
         events = arena.board.events(nemesis.run)
-        if result is not None and any(kind == DAMAGE for kind, _ in nemesis.done):
+        if result is not None and not {DAMAGE, LINK}.isdisjoint(kind for kind, _ in nemesis.done):
             arena.wait_until_whole()
+            if nemesis.links:
+                for use in (partial(again, resume=True), partial(remove_run, place)):
+                    with suppress(LidarpoolError):
+                        use()
+                        error = "a link was not refused"
+            for link in nemesis.links:
+                link.unlink()
             mended = again(resume=True)
             cloud, same = mended.cloud, digest(mended) == known.digest
         else:
             cloud = None if result is None else result.cloud
             same = result is not None and digest(result) == known.digest
     finally:
+        error += "" if _files_of(Path(stranger)) == theirs else "another's run was touched"
         shutil.rmtree(place)
+        shutil.rmtree(stranger)
     return Outcome(
         verdict=judge(
             events, what.scan_count, [] if cloud is None else cloud.scan.tolist(), known.rows

@@ -5,6 +5,7 @@ from __future__ import annotations
 import pickle
 import sys
 import threading
+from dataclasses import replace
 
 import pytest
 
@@ -101,9 +102,36 @@ def test_links_and_folders_are_no_files(tmp_path):
     storage = Storage.at(tmp_path)
     assert storage.sizes() == {"file": 2}
     assert storage.entries() == {"file": 2, "folder": None, "link": None}
-    (tmp_path / "other").symlink_to(tmp_path / "folder")
-    assert Storage.at(tmp_path / "other").is_link
-    assert not Storage.at(tmp_path / "other" / "below").is_link
+
+
+USES = {
+    "below": lambda s: s.below("link"),
+    "prepare": lambda s: s.prepare("link/in"),
+    "write": lambda s: s.write("link/file", b"x"),
+    "writing": lambda s: s.writing("link/file").__enter__(),
+    "read": lambda s: s.read("link/file"),
+    "entries": lambda s: replace(s, url=f"{s.url}/link").entries(),
+    "remove": lambda s: s.remove(["link/file"]),
+    "discard": lambda s: s.discard("link/in"),
+    "discard own": lambda s: s.discard("link", lambda name: True),
+    "tree": lambda s: s.tree("link"),
+}
+
+
+@pytest.mark.parametrize("use", [*USES])
+def test_nothing_goes_through_a_link_below_the_named_folder(use, tmp_path):
+    named, theirs = tmp_path / "named", tmp_path / "theirs"
+    (theirs / "in").mkdir(parents=True)
+    (theirs / "file").write_text("12")
+    (tmp_path / "out").mkdir()
+    named.symlink_to(tmp_path / "out")
+    (named / "link").symlink_to(theirs)
+    for storage in (Storage.at(named), pickle.loads(pickle.dumps(Storage.at(named)))):
+        with pytest.raises(LidarpoolError, match=f"{named}/link is a link, and nothing behind"):
+            USES[use](storage)
+    assert {path.name for path in theirs.iterdir()} == {"in", "file"}
+    Storage.at(named).discard("link")
+    assert [*named.iterdir()] == [] and (theirs / "file").read_text() == "12"
 
 
 @pytest.mark.parametrize("url", ["nonsense://a/b", "gs://bucket/folder"])

@@ -7,6 +7,7 @@ import gc
 import sqlite3
 from contextlib import closing
 from dataclasses import fields, make_dataclass, replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -17,6 +18,7 @@ from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_ru
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name, part_name, probe_name
 from lidarpool.plan import run_trial
+from lidarpool.run.campaign_store import CampaignStore
 from lidarpool.run.identity import identity_of
 from lidarpool.run.job import Job, make_job
 from lidarpool.run.store import RunStore
@@ -98,7 +100,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
     store = RunStore(JOB)
     add(store, 0, 6)
-    points, folder = store.points(), store.place
+    points, folder = store.points(), store.place.local()
     del store
     gc.collect()
     assert len(points.load()) == 18
@@ -421,12 +423,68 @@ def test_nothing_behind_a_link_is_deleted(unfinished, tmp_path):
         lambda folder: RunStore(JOB, folder, resume=True),
         lambda folder: RunStore(JOB, folder),
     ):
-        with pytest.raises(LidarpoolError, match=f"{parts} is a link, .* deletes nothing behind"):
+        with pytest.raises(LidarpoolError, match=f"{parts} is a link, and nothing behind"):
             use(unfinished)
     assert content(elsewhere) == before
     parts.unlink()
     elsewhere.rename(parts)
     assert RunStore(JOB, unfinished, resume=True).resumed == 4
+
+
+LINKS = ["jobs", "jobs/x", "jobs/x/parts", "jobs/x/run.db", "parts", "run.db", "run.db-journal"]
+
+
+@pytest.mark.parametrize("where", LINKS)
+@pytest.mark.parametrize("use", [remove_run, "resume", "new"])
+def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):
+    """Wherever the link is, and whatever it leads to."""
+    theirs = tmp_path / "theirs"
+    other = RunStore(JOB, theirs)
+    add(other, 0, 6)
+    other.db.close()
+    (theirs / "jobs").mkdir()
+    store = RunStore(JOB, folder)
+    if use == "resume":
+        add(store, 0, 2)
+    store.db.close()
+    link = folder / where
+    link.parent.mkdir(parents=True, exist_ok=True)
+    if link.exists():
+        link.rename(tmp_path / "kept")
+    target = theirs / link.name if link.name in ("parts", "run.db", "jobs") else theirs
+    link.symlink_to(target if target.exists() else theirs / "run.db")
+    before = {name: (theirs / name).read_bytes() for name in names(theirs)}
+    assert len(before) == 3
+    with pytest.raises(LidarpoolError, match=f"{link} is a link|holds .* run, a job"):
+        use(folder) if callable(use) else RunStore(JOB, folder, resume=use == "resume").remove()
+    assert before == {name: (theirs / name).read_bytes() for name in names(theirs)}
+    link.unlink()
+    remove_run(folder)
+    named = tmp_path / "named"
+    named.symlink_to(theirs)
+    assert RunStore(JOB, named, resume=True).resumed == 6, "a link that was named is one's own"
+
+
+@pytest.mark.parametrize("left", ["a job that is done", "a job under way"])
+def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, unfinished):
+    begin = partial(CampaignStore, {"seed": "1"}, 2, "auto", Storage.at(folder))
+    with pytest.raises(LidarpoolError, match="cannot be continued, "):
+        begin()
+    assert len(names(folder)) > 2
+    remove_run(folder)
+    campaign = begin()
+    if left == "a job under way":
+        job = campaign.store_of("0000", JOB)
+        add(job, 0, 2)
+        job.db.close()
+    else:
+        campaign.db.end_job(0, {})
+    campaign.db.close()
+    before = names(folder)
+    for resume in (False, True):
+        with pytest.raises(LidarpoolError, match="cannot be continued, "):
+            RunStore(JOB, folder, resume=resume)
+    assert names(folder) == before
 
 
 def test_a_link_with_the_name_of_a_part_is_no_part(unfinished, tmp_path):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -454,6 +455,107 @@ def test_other_content_or_software_is_refused(files, lidarpool, slots, no_pictur
     assert old.code == 2 and "was made with numpy 1.0, " in old.err and old.err.count("\n") == 1
 
 
+def all_of(folder: Path) -> dict[str, bytes]:
+    """All files in a folder and below."""
+    found = (path for path in folder.rglob("*") if path.is_file())
+    return {str(path.relative_to(folder)): path.read_bytes() for path in found}
+
+
+@pytest.fixture
+def cut(client, tmp_path, monkeypatch):
+    """A campaign of three jobs, of which one is in the data set when the disk is full."""
+    write = DataSet.write_job
+
+    def fail(self: DataSet, number: int, name: str, *arguments: Any) -> None:
+        write(self, number, name, *arguments)
+        if number:
+            with explained("Job cannot be written"):
+                raise OSError(28, "No space left on device")
+
+    campaign = Campaign(make, 3, keep="folder")
+    with monkeypatch.context() as patched, pytest.raises(LidarpoolError, match="No space left"):
+        patched.setattr(DataSet, "write_job", fail)
+        campaign.run(tmp_path / "ds", client=client)
+    assert bytes_of(tmp_path / "ds")
+    return campaign
+
+
+def lead_away(link: Path, stranger: Path) -> dict[str, bytes]:
+    """Put a link in place of a folder, which is kept beside; returns what it leads to."""
+    stranger.mkdir()
+    left = shutil.ignore_patterns(".lidarpool-*")
+    shutil.copytree(
+        link if link.exists() else link.parents[1], stranger, ignore=left, dirs_exist_ok=True
+    )
+    (stranger / "thesis.txt").write_text("mine")
+    if link.exists():
+        link.rename(stranger.with_name("kept"))
+    link.symlink_to(stranger)
+    return all_of(stranger)
+
+
+@pytest.mark.parametrize("where", ["run", "run/parts", "run/jobs/x", "jobs", "jobs/0001", ".jobs"])
+def test_nothing_behind_a_link_is_touched(client, tmp_path, cut, where):
+    link, stranger = tmp_path / "ds" / where, tmp_path / "stranger"
+    before = lead_away(link, stranger)
+    for how in ("resume", "fresh"):
+        with pytest.raises(LidarpoolError) as caught:
+            cut.run(tmp_path / "ds", client=client, **{how: True})
+        assert f"{where} is a link" in str(caught.value)
+        assert len(str(caught.value).splitlines()) == 1
+    assert all_of(stranger) == before
+    link.unlink()
+    if (tmp_path / "kept").exists():
+        (tmp_path / "kept").rename(link)
+    run = cut.run(tmp_path / "ds", client=client, resume=True)
+    assert (run.done, run.failed) == (3, ()) and not (tmp_path / "ds" / "run").exists()
+    cut.run(tmp_path / "whole", client=client)
+    assert bytes_of(tmp_path / "ds") == bytes_of(tmp_path / "whole")
+
+
+def test_a_run_removes_its_own_files_only(client, tmp_path, cut):
+    ds = tmp_path / "ds"
+    for name in ("thesis.txt", "jobs/thesis.txt", "jobs/0000/thesis.txt", "README.md", "x/cloud"):
+        (ds / name).parent.mkdir(exist_ok=True)
+        (ds / name).write_text("mine")
+        before = all_of(ds)
+        for how in ("fresh", "resume"):
+            with pytest.raises(LidarpoolError, match=f"holds {name}: a data set needs a folder"):
+                cut.run(ds, client=client, **{how: True})
+        assert all_of(ds) == before
+        (ds / name).unlink()
+    (ds / "x").rmdir()
+    assert cut.run(ds, client=client, fresh=True).resumed == 0
+    # An empty folder that is called run says nothing, nor does one that is called points.
+    (tmp_path / "other" / "run").mkdir(parents=True)
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "other" / "jobs").symlink_to(tmp_path / "mine")
+    for how in ("resume", "fresh", "overwrite"):
+        with pytest.raises(LidarpoolError, match=r"holds jobs: a data set|jobs is a link"):
+            cut.run(tmp_path / "other", client=client, **{how: True})
+    assert [*(tmp_path / "mine").iterdir()] == []
+
+
+@pytest.mark.parametrize("kept", ["folder", "kitti", "nuscenes", "mcap", "parquet", "images"])
+def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept):
+    ds = tmp_path / "ds"
+    Campaign(make, 2, keep=kept, splits={"a": 0.5, "b": 0.5}).run(ds, client=client)
+    before = all_of(ds)
+    other = Campaign(failing(1), 2, keep="folder")
+    for options in ({}, {"fresh": True}):
+        with pytest.raises(LidarpoolError, match=r"holds a finished data set, .* --overwrite"):
+            other.run(ds, client=client, **options)
+        assert all_of(ds) == before
+    (ds / "run").mkdir()
+    assert len(other.run(ds, client=client, fresh=True, overwrite=True).failed) == 1
+    assert {name.split("/")[0] for name in all_of(ds)} == {
+        "run", ".jobs", "jobs", "campaign.json", "dataset.json", "jobs.csv", "jobs.parquet",
+        "README.md", "report.html", "report.json", "pictures",
+    }  # fmt: skip
+    with pytest.raises(LidarpoolError, match="holds a finished data set"):
+        other.run(ds, client=client, fresh=True)
+
+
 def test_foreign_files_are_not_touched(files, lidarpool, slots, no_pictures):
     (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 1"))
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
@@ -467,18 +569,21 @@ def test_foreign_files_are_not_touched(files, lidarpool, slots, no_pictures):
     assert lidarpool(*run).code == 0
     (files / "notes.txt").rename(files / "ds" / "notes.txt")
     before = bytes_of(files / "ds")
-    refused = lidarpool(*run, "--fresh")
-    assert refused.code == 2 and "notes.txt, which is not of a data set" in refused.err
+    refused = lidarpool(*run, "--overwrite")
+    assert (
+        refused.code == 2 and "holds notes.txt: a data set needs a folder of its own" in refused.err
+    )
     assert bytes_of(files / "ds") == before
     (files / "ds" / "notes.txt").unlink()
-    assert lidarpool(*run, "--fresh").code == 0
+    assert lidarpool(*run, "--fresh").code == 2
+    assert lidarpool(*run, "--overwrite").code == 0
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
         (["--job", 99], "there is no job 99"),
-        (["--overwrite"], "for one survey"),
+        (["--resume", "--overwrite"], "overwrite remove what resume"),
         (["--only", "cloud"], "for one survey"),
         (["--resume", "--fresh"], "--fresh"),
         (["--retry-failed", "--fresh"], "--fresh"),

@@ -69,7 +69,7 @@ def drive(point, times):
     before(RunDatabase, "commit", "COMMIT")
     before(RunDatabase, "__init__", "OPEN")
     before(lidarpool.report.output.Format, "write", "SAVE")
-    before(lidarpool.cli.run_command, "remove_run", "REMOVE")
+    before(lidarpool.cli.run_command, "drop_run", "REMOVE")
     before(lidarpool.cli.run_command.RunStore, "remove", "REMOVE")
     sys.argv = ["lidarpool", *json.loads(sys.argv[1])]
     main()

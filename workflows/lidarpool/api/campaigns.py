@@ -43,6 +43,7 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
         fresh: bool = False,
         retry_failed: bool = False,
         verify: bool = False,
+        overwrite: bool = False,
         live: bool = False,
         wait_s: float = WAIT_S,
         patience_s: float = PATIENCE_S,
@@ -70,12 +71,14 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             Go on from what an earlier run has left in `out`, from the beginning if there is
             nothing.
         fresh
-            Remove first what an earlier run of a campaign has left in `out`.
+            Remove first what an unfinished run of a campaign has left in `out`.
         retry_failed
             Resume, and do the jobs that have failed again.
         verify
             Resume, and compare every byte of the jobs that are done: those with others are damaged,
             and made again.
+        overwrite
+            Replace a finished data set, too; if jobs of it have failed, with `fresh`.
         live
             Show the jobs in the browser meanwhile, as `lidarpool run --live` does; in a notebook,
             in the cell.
@@ -105,8 +108,8 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             )
 
         making = Making(
-            output_place(out), client is None, resume, fresh, retry_failed, verify, parts,
-            backend, wait_s, patience_s,
+            output_place(out), client is None, resume, fresh, retry_failed, verify, overwrite,
+            parts, backend, wait_s, patience_s,
         )  # fmt: skip
         progress = bars_here() if on_progress is None else nullcontext(on_progress)
         with _page(self, live) as page:

@@ -6,15 +6,16 @@ renamed, and an object store shows only complete objects.
 
 from __future__ import annotations
 
-import io
+import errno
 import os
 import re
 import secrets
+import shutil
 import tempfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from typing import IO, Any
@@ -23,13 +24,14 @@ from .errors import LidarpoolError
 
 _PIECE = 1 << 20  # bytes in memory of a file that is checked
 _TEMPORARY = ".lidarpool-tmp-"
-_LEFT = re.compile(rf"{re.escape(_TEMPORARY)}(.+)-[0-9a-f]{{8}}")
+WRITING = ".lidarpool-writing-"  # begins the name of a folder of unfinished files
+_LEFT = re.compile(rf"(?:{re.escape(_TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
 
 
 def target_of(name: str) -> str:
     """Name of the file that a temporary file was written for; other names are their own."""
     found = _LEFT.fullmatch(name)
-    return found[1] if found else name
+    return found[1] or name if found else name
 
 
 def is_url(place: str | Path) -> bool:
@@ -41,7 +43,11 @@ def is_url(place: str | Path) -> bool:
 class Storage:
     """A folder of files, by path or URL; small when pickled.
 
-    Its methods raise OSError if the storage fails, and LidarpoolError if it cannot be opened.
+    Nothing is opened, written or removed through a link below the folder that the user named. A
+    link in place of a file that is written or removed goes, not what it leads to.
+
+    Its methods raise OSError if the storage fails, and LidarpoolError if it cannot be opened or
+    there is such a link.
 
     Parameters
     ----------
@@ -51,21 +57,27 @@ class Storage:
     durable
         Whether files must survive a power failure: flushing takes milliseconds for each file, and
         is not needed for a temporary folder.
+    named
+        The folder that the user named, this or one above, which may be a link; "" follows all.
     """
 
     url: str
     durable: bool = True
+    named: str = ""
 
     @classmethod
-    def at(cls, place: str | Path, *, durable: bool = True) -> Storage:
-        """Storage at a path, made absolute, or a URL.
+    def at(cls, place: str | Path | Storage, *, durable: bool = True) -> Storage:
+        """Storage at a path that the user named, made absolute, or a URL; a storage as it is.
 
         LidarpoolError if the URL holds a password, which would get into databases and reports, or
         only a scheme.
         """
+        if isinstance(place, Storage):
+            return place
         text = str(place)
         if not is_url(text):
-            return cls(str(Path(text).absolute()), durable)
+            path = str(Path(text).absolute())
+            return cls(path, durable, path)
         if ":" in text.partition("://")[2].partition("/")[0].rpartition("@")[0]:
             raise LidarpoolError(
                 f"A URL for {text.partition(':')[0]} has a password: leave it out, and give "
@@ -84,10 +96,29 @@ class Storage:
         """Whether it is a folder in a local file system."""
         return not is_url(self.url)
 
-    @property
-    def is_link(self) -> bool:
-        """Whether it is a link to a folder elsewhere; the folders above it may be links."""
-        return self.is_local and Path(self.url).is_symlink()
+    def below(self, name: str) -> Storage:
+        """Open a folder in it, which need not exist."""
+        if self.is_local:
+            self.local(name)
+        return replace(self, url=f"{self.url}/{name}")
+
+    def local(self, name: str | Path = "") -> Path:
+        """Path of a file or folder in a local file system, by default its own, to open it."""
+        path = Path(self.url, name)
+        for part in (path, *path.parents) if self.named else ():
+            if len(str(part)) <= len(self.named):
+                break
+            if part.is_symlink():
+                raise LidarpoolError(
+                    f"{part} is a link, and nothing behind a link in {self.named} is opened, "
+                    "written or deleted: remove it, or put there what it leads to."
+                ) from OSError(errno.ELOOP, os.strerror(errno.ELOOP))  # it fails all alike
+        return path
+
+    def _target(self, name: str) -> Path:
+        """Path of a file or folder that is replaced or removed."""
+        path = Path(name)
+        return self.local(path.parent) / path.name
 
     @contextmanager
     def _remote(self) -> Iterator[tuple[Any, str]]:
@@ -119,21 +150,21 @@ class Storage:
             return opened
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Storage, (self.url, self.durable)
+        return Storage, (self.url, self.durable, self.named)
 
     def path(self, name: str) -> str:
         """Path or URL of a file, for messages."""
         return f"{self.url}/{name}"
 
-    def prepare(self) -> None:
-        """Make the folder."""
+    def prepare(self, name: str | Path = "") -> None:
+        """Make the folder, or one in it."""
         if self.is_local:
-            Path(self.url).mkdir(parents=True, exist_ok=True)
+            self.local(name).mkdir(parents=True, exist_ok=True)
             return
         with suppress(FileExistsError), self._remote() as (system, folder):
             # An object store has no folders, and s3fs would make a bucket for a mistyped name.
             if folder.startswith("/"):
-                system.makedirs(folder, exist_ok=True)
+                system.makedirs(f"{folder}/{name}".rstrip("/"), exist_ok=True)
 
     def claim(self) -> None:
         """Make the folder; LidarpoolError if files cannot be written and removed there."""
@@ -156,17 +187,11 @@ class Storage:
         """Write bytes, or a list of them, completely or not at all; flush them if durable."""
         pieces = data if isinstance(data, list) else [data]
         if self.is_local:
-            self._write_file(name, pieces)
+            with self._replacing(self._target(name)) as file:
+                file.writelines(pieces)
             return
         with self._remote() as (system, folder):
             system.pipe_file(f"{folder}/{name}", b"".join(bytes(piece) for piece in pieces))
-
-    def _write_file(self, name: str, pieces: list[Any]) -> None:
-        with self._replacing(Path(self.url, name)) as file:
-            for piece in pieces:
-                view = memoryview(piece).cast("B")
-                while len(view):
-                    view = view[file.write(view) :]
 
     @contextmanager
     def writing(self, name: str) -> Iterator[IO[bytes]]:
@@ -175,9 +200,9 @@ class Storage:
         Folders in its name are made.
         """
         if self.is_local:
-            target = Path(self.url, name)
+            target = self._target(name)
             target.parent.mkdir(parents=True, exist_ok=True)
-            with self._replacing(target, io.DEFAULT_BUFFER_SIZE) as file:
+            with self._replacing(target) as file:
                 yield file
             return
         with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
@@ -187,10 +212,10 @@ class Storage:
             self.put(path, name)
 
     @contextmanager
-    def _replacing(self, target: Path, buffering: int = 0) -> Iterator[IO[bytes]]:
+    def _replacing(self, target: Path) -> Iterator[IO[bytes]]:
         temporary = target.with_name(f"{_TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
-            with temporary.open("xb", buffering) as file:
+            with temporary.open("xb") as file:
                 yield file
                 if self.durable:
                     file.flush()
@@ -206,13 +231,15 @@ class Storage:
     def read(self, name: str) -> bytes:
         """Read a file."""
         if self.is_local:
-            return Path(self.url, name).read_bytes()
+            return self.local(name).read_bytes()
         with self._remote() as (system, folder):
             return bytes(system.cat_file(f"{folder}/{name}"))
 
     def checksum(self, name: str) -> list[int]:
         """Bytes of a file and their CRC-32, read a piece at a time."""
         size = crc = 0
+        if self.is_local:
+            self.local(name)
         with self._remote() as (system, folder), system.open(f"{folder}/{name}", "rb") as file:
             while piece := file.read(_PIECE):
                 size, crc = size + len(piece), zlib.crc32(piece, crc)
@@ -249,7 +276,7 @@ class Storage:
         """
         found: dict[str, int | None] = {}
         if self.is_local:
-            with suppress(FileNotFoundError), os.scandir(self.url) as entries:
+            with suppress(FileNotFoundError), os.scandir(self.local()) as entries:
                 for entry in entries:
                     with suppress(FileNotFoundError):  # just renamed or removed
                         plain = entry.is_file(follow_symlinks=False)
@@ -261,37 +288,65 @@ class Storage:
                 found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
         return found
 
-    def remove(self, names: list[str]) -> None:
-        """Remove files; no error for missing ones."""
+    def remove(self, names: list[str], *, folder: bool = False) -> None:
+        """Remove files; no error for missing ones. Then the `folder` itself, if it is empty."""
         for name in names:
             if self.is_local:
-                Path(self.url, name).unlink(missing_ok=True)
+                self._target(name).unlink(missing_ok=True)
             else:
-                with suppress(FileNotFoundError), self._remote() as (system, folder):
-                    system.rm_file(f"{folder}/{name}")
-
-    def has(self, name: str) -> bool:
-        """Whether there is a file or folder of this name."""
-        with self._remote() as (system, folder):
-            return bool(system.exists(f"{folder}/{name}"))
-
-    def discard(self, name: str) -> None:
-        """Remove a file or folder of the storage with its content, if it exists."""
-        with suppress(FileNotFoundError), self._remote() as (system, folder):
-            system.rm(f"{folder}/{name}", recursive=True)
-
-    def tidy(self) -> None:
-        """Remove what killed writers have left of files in a folder of this machine."""
-        for folder, _, names in os.walk(self.url) if self.is_local else ():  # follows no links
-            for name in names:
-                if target_of(name) != name:
-                    Path(folder, name).unlink(missing_ok=True)
-
-    def remove_folder(self) -> None:
-        """Remove the folder if it is empty."""
-        if self.is_local:
+                with suppress(FileNotFoundError), self._remote() as (system, path):
+                    system.rm_file(f"{path}/{name}")
+        if folder and self.is_local:
             with suppress(OSError):
-                Path(self.url).rmdir()
+                self.local().rmdir()
+
+    def tree(self, name: str = "") -> list[str]:
+        """Names, as of `read`, of a file itself, or of all in a folder and below; none if missing.
+
+        LidarpoolError if there is a link.
+        """
+        if self.is_local:
+            top = self.local(name)
+            found = [top] if top.is_file() else []
+            for folder, folders, files in os.walk(top):
+                paths = [Path(folder, one) for one in (*files, *folders)]
+                for path in filter(Path.is_symlink, paths):
+                    self.local(path)
+                found += paths[: len(files)]
+            return [path.relative_to(self.url).as_posix() for path in found]
+        with self._remote() as (system, folder):
+            below = system.find(f"{folder}/{name}".rstrip("/"))
+            return [one.removeprefix(f"{folder}/") for one in below]
+
+    def discard(self, name: str, own: re.Pattern[str] | None = None) -> None:
+        """Remove a file, or a folder with its content, if it exists.
+
+        With `own`, only files whose names, as those of `tree`, it matches, and folders that are
+        empty then.
+        """
+        if own is not None:
+            self.remove([file for file in self.tree(name) if own.fullmatch(file)])
+            for folder, _, _ in os.walk(self.local(name), False) if self.is_local else ():
+                with suppress(OSError):
+                    Path(folder).rmdir()
+        elif self.is_local:
+            path = self._target(name)
+            if path.is_dir() and not path.is_symlink():
+                shutil.rmtree(path)
+            else:
+                path.unlink(missing_ok=True)
+        else:
+            with suppress(FileNotFoundError), self._remote() as (system, folder):
+                system.rm(f"{folder}/{name}", recursive=True)
+
+    def tidy(self, *, deep: bool = True) -> None:
+        """Remove what killed writers have left in a folder of this machine, and below if `deep`."""
+        for folder, folders, files in os.walk(self.local()) if self.is_local else ():
+            for path in (Path(folder, name) for name in (*folders, *files)):
+                if _LEFT.fullmatch(path.name) and not path.is_symlink():
+                    self.discard(path.relative_to(self.url).as_posix())
+            if not deep:
+                break
 
 
 def flush(path: Path) -> None:

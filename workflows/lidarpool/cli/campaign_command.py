@@ -42,11 +42,8 @@ from .terminal import shown_progress
 def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) -> None:
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
     set_logs(options.verbose)
-    if options.overwrite or options.only:
-        raise LidarpoolError(
-            "--overwrite and --only are for one survey: a data set needs a folder of its own, and "
-            "--fresh removes an unfinished one."
-        )
+    if options.only:
+        raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
     pool = (campaign.describe(0).scenario or Scenario()).pool
 
     def cluster(waiting: Waiting, job: Job) -> AbstractContextManager[Client]:
@@ -58,7 +55,7 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
 
     making = Making(
         options.out, options.here, options.resume, options.fresh, retry_failed, options.verify,
-        options.parts, options.backend, options.wait_s, options.patience_s,
+        options.overwrite, options.parts, options.backend, options.wait_s, options.patience_s,
     )  # fmt: skip
     with _page(campaign, options) as page:
         progress = shown_progress(options.quiet)
@@ -109,9 +106,9 @@ def run_job(campaign: Campaign, number: int, options: RunOptions) -> None:
     must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
     other software, or its files there are damaged.
     """
-    place = Storage.at(str(options.out))
+    place = Storage.at(options.out)
     dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
-    of_dataset = place.has(CAMPAIGN_FILE)
+    of_dataset = CAMPAIGN_FILE in place.entries()
     if of_dataset:
         backend = check_same(place, campaign)["backend"]
         verify(place, number)

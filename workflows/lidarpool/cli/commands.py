@@ -61,7 +61,7 @@ _SHOWN = (
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no pictures and no page.",
     ),
-    options.flag("--overwrite", help="Replace the result of another survey."),
+    options.flag("--overwrite", help="Replace the result of another survey, or a data set."),
     options.flag("--quiet", "-q", help="No progress, only the result."),
     options.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
     options.as_json,

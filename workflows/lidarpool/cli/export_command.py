@@ -75,7 +75,7 @@ def export(
         with result_folder(place) as folder:
             for one in wanted:  # before any is written, which may take long
                 one.check(folder / one.file, cloud, overwrite=overwrite)
-                if isinstance(place, Storage) and not overwrite and place.has(one.file):
+                if isinstance(place, Storage) and not overwrite and one.file in place.entries():
                     raise LidarpoolError(
                         f"{place.path(one.file)} is there already: give another place with --out, "
                         "or --overwrite."

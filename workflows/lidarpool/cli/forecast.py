@@ -330,14 +330,13 @@ def _look_at_folder(out: Path | Storage) -> list[str]:
     """Return notes on the place of the result; LidarpoolError if it cannot be written there."""
     if isinstance(out, Storage):
         out.claim()  # leaves nothing
-        unfinished = FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
     else:
         there = _existing(out)
         if not there.is_dir():
             raise LidarpoolError(f"{there} is a file: give a folder for the results with --out.")
         if not os.access(there, os.W_OK | os.X_OK):
             raise LidarpoolError(f"Cannot write to the folder {there}: give another with --out.")
-        unfinished = (out / RUN_FOLDER / FILE).exists()
+    unfinished = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
     note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
     return [note] if unfinished else []
 

@@ -13,7 +13,6 @@ from typing import Any
 import click
 from distributed import Client
 
-from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, WAIT_S
@@ -31,7 +30,7 @@ from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
 from ..run.job import Job, make_job
 from ..run.result import RunResult
-from ..run.store import RUN_FOLDER, RunStore, remove_run
+from ..run.store import RUN_FOLDER, RunStore, drop_run
 from ..run.watch import Waiting
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
@@ -139,11 +138,12 @@ def _run(
         store.remove()
 
     with result_folder(out) as folder:
-        goes_on = options.resume and FILE in Storage.at(f"{out}/{RUN_FOLDER}").sizes()
+        kept = Storage.at(out).below(RUN_FOLDER)
+        goes_on = options.resume and FILE in kept.sizes()
         if not (options.overwrite or goes_on):
             further = further_files(job.survey, formats)
             refuse_to_replace(out, lambda: identity_of(job), further)
-        store = _store(job, options, goes_on)
+        store = _store(job, options, kept, goes_on)
         with conducted(
             store,
             lambda waiting: cluster_of(scenario.pool, slots_needed(job), options, waiting),
@@ -196,18 +196,12 @@ def _page(job: Job, live: bool) -> AbstractContextManager[Page]:
     return live_run(job)
 
 
-def _store(job: Job, options: RunOptions, goes_on: bool) -> RunStore:
+def _store(job: Job, options: RunOptions, place: Storage, goes_on: bool) -> RunStore:
     """Store of the run, with what an earlier run has left if it is to be resumed."""
     if not options.resumable:
         return RunStore(job)
-    place = f"{options.out}/{RUN_FOLDER}"
-    if Storage.at(place).is_link:
-        raise LidarpoolError(
-            f"{place} is a link, and a run deletes nothing behind a link: remove it, or give "
-            "another folder with --out."
-        )
     if options.fresh:
-        remove_run(place)
+        drop_run(place)
     with shown_status("checking the points of the earlier run", options.quiet or not goes_on):
         store = RunStore(job, place, options.parts, resume=options.resume)
     if options.resume and not (store.kept or store.notes):

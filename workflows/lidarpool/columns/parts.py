@@ -56,24 +56,14 @@ def mark_name(mark: str) -> str:
 def own_files(storage: Storage, mark: str | None) -> list[str]:
     """Names of the files that a run may delete, those that killed writers left among them.
 
-    `mark` is that of the run; None for each that the folder has. Behind a link, or without the mark
-    in the folder, there are none. Marks come last, so that what an interrupted removal has left
-    stays known.
+    `mark` is that of the run; None for each that the folder has. Without the mark in the folder
+    there are none. Marks come last, so that what an interrupted removal has left stays known.
     """
-    names = [] if storage.is_link else [*storage.sizes()]
+    names = [*storage.sizes()]
     marks = {_mark_of(name) for name in names if name.endswith("-mark")} - {""}
     marks &= marks if mark is None else {mark}
     own = [name for name in names if _mark_of(target_of(name)) in marks]
     return sorted(own, key=lambda name: name.endswith("-mark"))
-
-
-def files_of(storage: Storage, mark: str) -> list[str]:
-    """Names of the files with the mark of a run, in a folder that is its own; none behind a link.
-
-    Unlike `own_files`, for folders whose mark has been removed.
-    """
-    names = [] if storage.is_link else [*storage.sizes()]
-    return [name for name in names if _mark_of(target_of(name)) == mark]
 
 
 def _mark_of(name: str) -> str:
@@ -203,7 +193,7 @@ def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[
         part = read_part(storage, name)
         return part.triangles, part.hits
     try:
-        with zipfile.ZipFile(storage.path(name)) as archive:
+        with zipfile.ZipFile(storage.local(name)) as archive:
             return read_array(archive, ".triangles.npy"), read_array(archive, ".hits.npy")
     except Exception as error:  # as above
         raise LidarpoolError(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import zlib
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -21,7 +22,7 @@ from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
 from ..columns.cloud import CloudLike
 from .boxes import Boxes
-from .folder import local_folder, remove_left
+from .folder import local_folder
 from .formats import Format
 from .jobs import JobRow
 from .nuscenes import merge
@@ -40,6 +41,13 @@ VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
 _AHEAD = 16  # jobs that are looked at ahead
 _LISTED = 32  # folders whose files are known at a time, some of which all jobs share
+# Files of jobs, in all formats, and that by which workers see whether they see the place.
+OF_JOBS = re.compile(
+    r"[0-9a-f]{16}-dataset|\.jobs/[^/]+\.json|(sweeps|boxes)/[^/]+\.npz|bags/[^/]+\.mcap|"
+    r"jobs/[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)|points/job=\d+/part-\d+\.parquet|"
+    r"images/[^/]+/[^/]+/\d+\.npz|(samples|sweeps)/[^/]+/[^/]+/\d+\.pcd\.bin|poses/[^/]+\.txt|"
+    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
+)
 
 
 def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
@@ -131,7 +139,7 @@ class DataSet:
         entry, one = Entry(number, name), self._of_jobs
         one.check_installed()
         one.check_columns(cloud)
-        place = listing or Listing(self.place.url, self.place.durable)
+        place = listing or Listing.of(self.place)
         boxes: list[Boxes] = []
         with explained(f"Job {name} cannot be written to {place}"):
             if one.in_pieces:
@@ -141,7 +149,8 @@ class DataSet:
             else:
                 manifest = {}
                 path = f"jobs/{name}/{one.file}" if self.format == "folder" else f"bags/{name}.mcap"
-                with local_folder(Path(place.url) if place.is_local else place) as folder:
+                place.prepare(Path(path).parent)
+                with local_folder(place.local() if place.is_local else place) as folder:
                     (folder / path).parent.mkdir(parents=True, exist_ok=True)
                     one.write(folder / path, cloud, sweeps, overwrite=True)
                     place.files[path] = Storage(str(folder)).checksum(path)
@@ -175,7 +184,7 @@ class DataSet:
         """
         with explained(f"{self.place} cannot be written"):
             self.place.remove([INDEX_FILE])
-            self._tidy()
+            self.place.tidy()
             with self.place.writing(INDEX_FILE) as file:
                 head = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
@@ -186,14 +195,6 @@ class DataSet:
                 else:
                     deque(manifests, maxlen=0)
                 file.write(b"\n]}\n")
-
-    def _tidy(self) -> None:
-        """Remove what killed writers have left on this machine."""
-        self.place.tidy()
-        if self.place.is_local:
-            root = Path(self.place.url)
-            for folder in (*root.glob("bags"), *root.glob("jobs/*")):
-                remove_left(folder)
 
     def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
         """Yield the manifest of each job that is done, and add it to the index."""
@@ -215,7 +216,7 @@ class DataSet:
         The last is a clause, or empty; then the manifest may be, too. Sizes are compared, and with
         `contents` every byte is read. OSError if the place cannot be read.
         """
-        sizes = lru_cache(_LISTED)(lambda folder: Storage(self.place.path(folder)).sizes())
+        sizes = lru_cache(_LISTED)(lambda folder: self.place.below(folder).sizes())
 
         def look_at(job: JobRow) -> tuple[dict[str, Any], str]:
             try:
@@ -243,9 +244,13 @@ class Listing(Storage):
 
     files: dict[str, list[int]] = field(default_factory=dict)
 
+    @classmethod
+    def of(cls, place: Storage) -> Listing:
+        """List the files that are written to a place from now on."""
+        return cls(place.url, place.durable, place.named)
+
     def write(self, name: str, data: Any) -> None:  # noqa: D102 - as of any
-        if self.is_local:
-            Path(self.path(name)).parent.mkdir(parents=True, exist_ok=True)
+        self.prepare(Path(name).parent)
         super().write(name, data)
         self.files[name] = [len(data), zlib.crc32(data)]
 
@@ -254,7 +259,7 @@ class Listing(Storage):
         self.remove([*self.files])
         folders = {str(folder) for file in self.files for folder in Path(file).parents}
         for folder in sorted(folders - {"."}, key=len, reverse=True):
-            Storage(self.path(folder)).remove_folder()
+            self.below(folder).remove([], folder=True)
 
 
 def _manifest_file(name: str) -> str:

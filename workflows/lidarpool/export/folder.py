@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import fcntl
 import os
-import re
 import secrets
 import shutil
 import tempfile
@@ -14,12 +13,9 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage, is_url
+from ..base.storage import WRITING, Storage, is_url
 
 LAST_FILE = "report.json"  # a result with this file is complete
-# Folder of unfinished files; the next writer removes that of a killed program.
-_WRITING = ".lidarpool-writing-"
-_LEFT = re.compile(rf"{re.escape(_WRITING)}[0-9a-f]{{8}}")
 
 
 def output_place(text: str | Path) -> Path | Storage:
@@ -53,7 +49,7 @@ def result_folder(place: Path | Storage) -> Iterator[Path]:
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             lock = _lock(folder)
-        remove_left(folder)
+        Storage.at(folder).tidy(deep=False)
     except BlockingIOError as error:
         raise LidarpoolError(
             f"Another run or export is using the folder {folder}: wait for it, or give another "
@@ -123,20 +119,13 @@ def local_folder(place: Path | Storage) -> Iterator[Path]:
         yield folder
 
 
-def remove_left(folder: Path) -> None:
-    """Remove the folders of `staging` that killed programs have left in a folder."""
-    for left in folder.iterdir():
-        if _LEFT.fullmatch(left.name) and left.is_dir() and not left.is_symlink():
-            shutil.rmtree(left)
-
-
 @contextmanager
 def staging(folder: Path, place: object = None) -> Iterator[Path]:
     """Temporary folder in a folder, for what is moved into place once it is whole.
 
     Errors name `place`, by default `folder`, in its stead.
     """
-    staged = folder / f"{_WRITING}{secrets.token_hex(4)}"
+    staged = folder / f"{WRITING}{secrets.token_hex(4)}"
     try:
         staged.mkdir()
         yield staged

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -137,7 +136,7 @@ class Format:
                     getattr(writers, f"write_{self.format}")(staged, cloud, sweeps, **more)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
-                    remove(path)
+                    Storage.at(path.parent).discard(path.name)
                 staged.replace(path)
                 flush(path.parent)
 
@@ -179,11 +178,3 @@ def save(
         )
     one.write(path, cloud, sweeps, overwrite=True)
     return one.left_out(cloud)
-
-
-def remove(path: Path) -> None:
-    """Remove a file, folder or link, if it exists."""
-    if path.is_dir() and not path.is_symlink():
-        shutil.rmtree(path)
-    else:
-        path.unlink(missing_ok=True)

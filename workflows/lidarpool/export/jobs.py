@@ -220,8 +220,9 @@ def read_table(place: Storage) -> Iterator[JobRow]:
     """
     with ExitStack() as stack:
         with explained(f"{place.path(TABLE_FILE)} cannot be read", "give the folder of a data set"):
-            path = Path(place.url, TABLE_FILE)
-            if not place.is_local:
+            if place.is_local:
+                path = place.local(TABLE_FILE)
+            else:
                 folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarpool-"))
                 path = Path(folder, TABLE_FILE)
                 place.get(TABLE_FILE, path)

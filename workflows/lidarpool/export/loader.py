@@ -9,7 +9,7 @@ import threading
 from bisect import bisect_right
 from collections import OrderedDict
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from importlib import import_module
 from importlib.util import find_spec
@@ -301,7 +301,7 @@ def sweeps(
         If there is no data set, it is unfinished or damaged, a package that its format needs is
         not installed, or there is no such split, job or sensor.
     """
-    storage = Storage.at(place)
+    storage = replace(Storage.at(place), named="")  # links of the user's own are welcome
     head = read_index(storage)
     Format(DATA_SETS[head["format"]]).check_installed()
     of_sensors = {row["number"]: row["sensors"] for row in head["jobs"]}

@@ -68,10 +68,6 @@ class Pieces:
         """Return what the data set's own files need of this job, as JSON holds it."""
         return {}
 
-    def make_folders(self, place: Storage) -> None:
-        """Make the folders of the files of pieces."""
-        _make_folders(place, self.folders)
-
     def write(self, place: Storage, first: int, stop: int) -> Written:
         """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
         count, made = 0, []
@@ -85,9 +81,8 @@ class Pieces:
 
     def write_others(self, place: Storage, made: Sequence[Any]) -> None:
         """Write the files that are not of one piece; OSError if that fails."""
-        others = self.others(made)
-        _make_folders(place, [str(Path(name).parent) for name in others])
-        for name, data in others.items():
+        for name, data in self.others(made).items():
+            place.prepare(Path(name).parent)
             place.write(name, data)
 
 
@@ -132,8 +127,8 @@ class RangeWriter:
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
         pieces = self._pieces()
-        self.place.prepare()
-        pieces.make_folders(self.place)
+        for folder in ("", *pieces.folders):
+            self.place.prepare(folder)
         count = len(pieces)
         size = max(1, min(RANGE_PIECES, RANGE_POINTS * count // max(1, len(self.cloud))))
         spans = [(first, min(first + size, count)) for first in range(0, count, size)]
@@ -161,11 +156,6 @@ def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None
 def as_data(array: NDArray[Any]) -> Data:
     """Return the bytes of an array, without a copy of them."""
     return array.data.cast("B") if array.size else b""
-
-
-def _make_folders(place: Storage, names: Sequence[str]) -> None:
-    for name in dict.fromkeys(names) if place.is_local else ():
-        Path(place.url, name).mkdir(parents=True, exist_ok=True)
 
 
 # Writes ranges on workers; returns what was written of those whose workers see the folder.

@@ -8,7 +8,7 @@ import tempfile
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,19 @@ from distributed import Client
 
 from ..base.errors import LidarpoolError, explained
 from ..base.software import difference, software
-from ..base.storage import Storage, target_of
+from ..base.storage import Storage
 from ..base.words import counted
-from ..export.dataset import INDEX_FILE, DataSet
+from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
 from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import read_index, sweeps
+from ..pipeline.database import FILE
 from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.identity import OF_CAMPAIGN
 from ..run.job import Job
 from ..run.progress import Show
-from ..run.store import RUN_FOLDER, listed, remove_run
+from ..run.store import RUN_FOLDER, drop_run, listed
 from ..run.watch import Waiting
 from ..scenario.campaign import Campaign, Described, hashes
 from .campaign_figures import CampaignInfo
@@ -37,12 +38,13 @@ from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
-# What there may be in the folder of a data set, of any format.
-_OWN = re.compile(
-    r"run|campaign\.json|dataset\.json|README\.md|report\.(html|json)|pictures|splits|"
-    r"jobs\.(csv|parquet)|\.?jobs|sweeps|boxes|sequences|poses|samples|maps|v1\.0-lidarpool|"
-    r"bags|points|images|job-.+|[0-9a-f]{16}-dataset"
+# With what `_finish` writes, CAMPAIGN_FILE first.
+_FINISHED = re.compile(
+    OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
+    r"jobs\.(csv|parquet)|splits/[^/]+\.txt|v1\.0-lidarpool/\w+\.json|maps/none\.png"
 )
+# The run, results of single jobs, and what writers that have not heard of their end may add.
+_BESIDE = re.compile(r"(run|job-[^/]+)/.*|(.*/)?\.lidarpool-(tmp|writing)-.*")
 
 
 @dataclass(frozen=True)
@@ -50,8 +52,9 @@ class Making:
     """How a campaign is to be made into a data set.
 
     `out` is its place; `own` says that the cluster is a local one for this run. `resume` continues
-    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again. Of the jobs that are
-    done a resumed run compares sizes of files, and with `verify` every byte.
+    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again; `overwrite` replaces
+    a finished data set. Of the jobs that are done a resumed run compares sizes of files, and with
+    `verify` every byte.
     """
 
     out: Path | Storage
@@ -60,6 +63,7 @@ class Making:
     fresh: bool = False
     retry_failed: bool = False
     verify: bool = False
+    overwrite: bool = False
     parts: str | Path | None = None
     backend: str | None = None
     wait_s: float = 0.0
@@ -82,43 +86,47 @@ def make_dataset(
     LidarpoolError if the place holds something else, the cluster lacks something, or what all jobs
     need fails; its notes say what was kept.
     """
-    out = Storage.at(str(making.out), durable=False)
+    out = replace(Storage.at(making.out), durable=False)
     dataset = DataSet(out, campaign.keep.format, campaign.keep.layout)
     dataset.check_installed()
     resume = making.resume or making.retry_failed or making.verify
-    if making.fresh and resume:
-        raise LidarpoolError("fresh removes the run that resume and retry_failed go on with.")
-    place = f"{out}/{RUN_FOLDER}"
+    if (making.fresh or making.overwrite) and resume:
+        raise LidarpoolError(
+            "fresh and overwrite remove what resume, retry_failed and verify go on with."
+        )
+    kept = out.below(RUN_FOLDER)
     with result_folder(making.out), ExitStack() as stack:
-        if making.fresh:
-            _remove_dataset(out, place)
-        there = set(out.entries())
+        there = out.entries()
+        begin = not resume and (making.fresh or RUN_FOLDER not in there)
+        if begin and INDEX_FILE in there and not making.overwrite:
+            raise LidarpoolError(
+                f"{out} holds a finished data set, and one needs a folder of its own: give another "
+                "with --out, or replace it with --overwrite (in Python overwrite=True)."
+            )
+        if begin and (making.fresh or making.overwrite):
+            _remove_dataset(out, kept)
         made, wrong = None, dict[int, str]()
         if resume and CAMPAIGN_FILE in there and RUN_FOLDER not in there:
             made = check_same(out, campaign)
             whole, wrong = _look(dataset, read_table(out), making.verify, campaign)
-            if INDEX_FILE in there and whole == campaign.count and not wrong:
+            if whole == campaign.count and not wrong and _is_indexed(out, whole):
                 tell(f"{out} is complete: nothing is left to do")
                 run = run_result(_shown(read_table(out), page), time.monotonic())
                 page.finish(run)
                 return run
-        elif RUN_FOLDER not in there and (found := sorted(there)):
-            raise LidarpoolError(
-                f"{out} holds {found[0]}: a data set needs a folder of its own, give another with "
-                "--out."
-            )
         store = CampaignStore(
             campaign.identity,
             campaign.count,
             making.backend or "auto",
-            place,
+            kept,
             making.parts,
             resume=resume,
         )
         stack.enter_context(store.kept_on_error())
         if made is not None:
             store.take_over(made, read_table(out))
-        else:
+        _own_files(out, begun=bool(store.kept))
+        if made is None:
             _, wrong = _look(dataset, store.rows(), making.verify, campaign)
         if not store.kept:
             campaign.check_files()
@@ -226,6 +234,13 @@ def _look(
     return whole, wrong
 
 
+def _is_indexed(place: Storage, jobs: int) -> bool:
+    """Whether the last file of a data set is there, whole, and has all of its jobs."""
+    with suppress(LidarpoolError):
+        return len(read_index(place)["jobs"]) == jobs
+    return False
+
+
 def verify(place: Storage, number: int | None = None) -> str:
     """Compare each file of a finished data set, or of one of its jobs, with what is kept of it.
 
@@ -283,24 +298,32 @@ def row_of(place: Storage, number: int) -> JobRow | None:
     return next((row for row in read_table(place) if row.number == number), None)
 
 
-def _remove_dataset(out: Storage, place: str) -> None:
-    """Remove an unfinished data set; LidarpoolError if there is none that is known to be one."""
-    there = set(out.entries())
-    if not there:
-        return
-    if RUN_FOLDER not in there and CAMPAIGN_FILE not in there:
-        raise LidarpoolError(
-            f"{out} holds {sorted(there)[0]} and no data set of a campaign: give another folder."
-        )
-    if foreign := sorted(name for name in there if not _OWN.fullmatch(target_of(name))):
-        raise LidarpoolError(
-            f"{out} holds {foreign[0]}, which is not of a data set: move it elsewhere, or give "
-            "another folder."
-        )
-    remove_run(place)
+def _own_files(out: Storage, *, begun: bool) -> list[str]:
+    """Name the files of a data set, which has begun or is empty.
+
+    LidarpoolError if there is a link, or a file that neither jobs nor `_finish` write.
+    """
+    files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
+    own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS
+    for name in sorted(files):
+        if not begun or not own.fullmatch(name):
+            raise LidarpoolError(
+                f"{out} holds {name}: a data set needs a folder of its own, move that elsewhere, "
+                "or give another with --out."
+            )
+    return files
+
+
+def _remove_dataset(out: Storage, kept: Storage) -> None:
+    """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more."""
+    begun = CAMPAIGN_FILE in out.sizes() or FILE in kept.sizes()
+    tops = {name.partition("/")[0] for name in _own_files(out, begun=begun)}
     with explained(f"{out} cannot be removed"):
-        for name in sorted(there - {RUN_FOLDER}):
-            out.discard(name)
+        out.tidy()
+        # First what says that it is finished, and last what says that it is a data set.
+        for name in sorted(tops, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)):
+            out.discard(name, _FINISHED)
+    drop_run(kept)
 
 
 def failures(run: CampaignRun, most: int = 5) -> str:

@@ -16,7 +16,7 @@ from ..base.interrupts import deferred_interrupts
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
 from ..export.folder import LAST_FILE, staging
-from ..export.formats import Format, remove
+from ..export.formats import Format
 from ..export.navigation import FILES as INSTRUMENT_FILES
 from ..export.navigation import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -61,7 +61,7 @@ def refuse_to_replace(
         If there is a result of another scene or survey, or one that cannot be read; or a file that
         this result would replace and that no report there lists.
     """
-    storage = place if isinstance(place, Storage) else Storage.at(place)
+    storage = Storage.at(place)
     advice = "give another folder with --out, or replace it with --overwrite (in Python "
     advice += "overwrite=True)."
     with explained(f"{place} cannot be read"):
@@ -116,7 +116,7 @@ def write_result(
     LidarpoolError if a file cannot be written.
     """
     storage = place if isinstance(place, Storage) else None
-    _, earlier = _earlier(storage or Storage.at(folder))
+    _, earlier = _earlier(Storage.at(storage or folder))
     points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
     cloud = CountedCloud(points, len(result.scene.all_names))
     advice = "make room or give another folder with --out"
@@ -187,7 +187,7 @@ def _move(
         flush(folder)
         # A path of an earlier run would look like this one's; folders are not replaced.
         for name in _stale(earlier, files):
-            remove(folder / name)
+            Storage.at(folder).discard(name)
         for name in (*_FURTHER, *FILES):
             if name in files:
                 (staged / name).replace(folder / name)

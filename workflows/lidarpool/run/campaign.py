@@ -281,7 +281,7 @@ def _written(
     dataset: DataSet, number: int, name: str, cloud: CloudLike, *more: Any
 ) -> dict[str, Any]:
     """Write a job; JobError if that fails, LidarpoolError if it is because of the place."""
-    listing = Listing(dataset.place.url, dataset.place.durable)
+    listing = Listing.of(dataset.place)
     try:
         tally = Tally.of(cloud)
         dataset.write_job(number, name, cloud, *more, listing=listing)

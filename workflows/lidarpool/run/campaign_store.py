@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -12,12 +13,11 @@ from typing import Any
 from ..base.errors import LidarpoolError
 from ..base.software import software
 from ..base.storage import Storage
-from ..columns.parts import files_of
 from ..export.jobs import JobRow
-from ..pipeline.database import RunDatabase, mark_of_folder, parts_folder
+from ..pipeline.database import mark_of_folder, parts_folder
 from .identity import OF_CAMPAIGN
 from .job import Job
-from .store import JOBS, KeptRun, RunStore, remove_run
+from .store import JOBS, KeptRun, RunStore, drop_run, jobs_of
 
 SENSORS_TOLD = 8  # kinds of a sensor that are named
 
@@ -33,7 +33,7 @@ class CampaignStore(KeptRun):
         identity: Mapping[str, str],
         count: int,
         backend: str,
-        place: str | Path,
+        place: Storage,
         parts: str | Path | None = None,
         *,
         resume: bool = False,
@@ -46,11 +46,8 @@ class CampaignStore(KeptRun):
     @property
     def kept(self) -> str:
         """Jobs that have ended, in words; empty if none was begun."""
-        begun = self.db.jobs or self.remains()
+        begun = self.db.jobs or jobs_of(self.place)
         return f"{len(self.db.jobs):,} of {self.count:,} jobs" if begun else ""
-
-    def _is_used(self, db: RunDatabase) -> bool:
-        return db.used or bool(self.remains())
 
     @property
     def left(self) -> list[int]:
@@ -101,33 +98,22 @@ class CampaignStore(KeptRun):
 
     def store_of(self, name: str, job: Job) -> RunStore:
         """Open the store of a job, with what an earlier run has left of it."""
-        Storage.at(f"{self.place}/{JOBS}").prepare()
+        self.place.prepare(JOBS)
         # The campaign keeps with which backend and software all of its jobs are cast.
-        place, parts = self._place_of(name), self.storage.url
-        if (earlier := Storage.at(place)).entries():
-            try:
-                return RunStore(job, place, parts, resume=True, backend="auto")
-            except LidarpoolError:  # damaged, or files that the description names have changed
-                remove_run(earlier.url)
-        return RunStore(job, place, parts, resume=True, backend="auto")
+        place = self.place.below(f"{JOBS}/{name}")
+        with suppress(LidarpoolError):  # damaged, or files that the description names have changed
+            return RunStore(job, place, self.storage, resume=True, backend="auto")
+        drop_run(place)
+        return RunStore(job, place, self.storage, resume=True, backend="auto")
 
     def remove(self) -> None:
         """Remove the store, and parts of jobs that were written late: their jobs had them twice."""
         for name in self.storage.entries():
             if mark := mark_of_folder(name):
-                folder = Storage.at(self.storage.path(name))
                 with suppress(OSError):
-                    folder.remove(files_of(folder, mark))
-                folder.remove_folder()
+                    self.storage.discard(name, re.compile(f".*{mark}-.*"))
         super().remove()
 
     def folder_of(self, store: RunStore) -> str:
         """Folder of a job's parts in the storage of the campaign."""
         return f"{parts_folder(store.db.meta['mark'])}/"
-
-    def remains(self) -> list[str]:
-        """Names of the jobs of which there is something."""
-        return [*Storage.at(f"{self.place}/{JOBS}").entries()]
-
-    def _place_of(self, name: str) -> str:
-        return f"{self.place}/{JOBS}/{name}"

@@ -73,7 +73,8 @@ class RemoteRun:
         return explained(f"The run cannot be kept in {self.storage.url}")
 
 
-def fetch_database(storage: Storage, folder: Path) -> None:
-    """Copy the database of a run, if there is one, into a folder of this machine."""
-    if FILE in storage.sizes():
-        storage.get(FILE, folder / FILE)
+def fetch_database(storage: Storage, path: Path) -> None:
+    """Copy the database of a run, if there is one, to this machine."""
+    with explained(f"The run in {storage} cannot be read"):
+        if FILE in storage.sizes():
+            storage.get(FILE, path)

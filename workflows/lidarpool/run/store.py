@@ -11,7 +11,8 @@ import tempfile
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import contextmanager, suppress
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -20,7 +21,7 @@ from numpy.typing import NDArray
 
 from ..base.arguments import checked
 from ..base.errors import LidarpoolError, explained
-from ..base.storage import Storage, is_url
+from ..base.storage import Storage
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
 from ..export.sweeps import Sweeps
@@ -75,8 +76,8 @@ class KeptRun:
         identity: dict[str, str],
         scan_count: int,
         backend: str,
-        place: str | Path | None = None,
-        parts: str | Path | None = None,
+        place: str | Path | Storage | None = None,
+        parts: str | Path | Storage | None = None,
         *,
         resume: bool = False,
     ) -> None:
@@ -91,16 +92,14 @@ class KeptRun:
         self._gone = False
         self.identity = here = identity
         self._remote = None
-        if place is None or is_url(place):
-            folder = Path(tempfile.mkdtemp(prefix="lidarpool-"))
+        kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
+        self.place = self._folder = kept  # that of the run, and that of its database
+        if not kept.is_local:
+            self._remote = RemoteRun(kept)
+            self._folder = Storage.at(tempfile.mkdtemp(prefix="lidarpool-"))
+        folder = self._folder.local()
+        if place is None or self._remote:
             weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
-            if place is not None:
-                self._remote = RemoteRun(Storage.at(place))
-        else:
-            folder = Path(place)
-        self.place = self._remote.storage.url if self._remote else folder  # for people
-        self._folder = folder  # of the database
-        made = not folder.exists()
         advice = "make the one that it lies in first, or give another"
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
@@ -112,20 +111,19 @@ class KeptRun:
                 self.close()
                 raise
         except BaseException:
-            if made:
-                with suppress(OSError):
-                    folder.rmdir()
+            self._folder.remove([], folder=True)
             raise
         self.resumed = self.db.scans_done  # scans whose points are of an earlier run
 
-    def _open(self, here: dict[str, str], parts: str | Path | None) -> RunDatabase:
+    def _open(self, here: dict[str, str], parts: str | Path | Storage | None) -> RunDatabase:
         """Open the database, or a new one if nothing is committed in it."""
-        path, count = self._folder / FILE, self._scan_count
+        path, count = _database(self._folder), self._scan_count
         durable = self.lasting and self._remote is None
         mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
+        jobs_of(self.place)  # an error if one is a link
         try:
             if self._remote:
-                fetch_database(self._remote.storage, self._folder)
+                fetch_database(self._remote.storage, path)
             if path.exists():
                 db = RunDatabase(path, count, durable=durable)
                 if self._is_used(db):
@@ -133,13 +131,11 @@ class KeptRun:
                 db.close()
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
         except LidarpoolError as error:  # the copy of a database is nobody's business
-            raise LidarpoolError(str(error).replace(str(self._folder), str(self.place))) from error
-        except OSError as error:
-            raise LidarpoolError(f"The run in {self.place} cannot be read: {error}.") from error
+            raise LidarpoolError(str(error).replace(self._folder.url, self.place.url)) from error
         if self.lasting:
-            _remove(self.place, _storage(self.place, earlier), mark)
+            _remove(self.place, _parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
-        self._folder.mkdir(exist_ok=True)
+        self._folder.prepare()
         mark = secrets.token_hex(8)
         shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
         new = {"mark": mark, "identity": json.dumps(here), "parts": shared}
@@ -152,16 +148,15 @@ class KeptRun:
             raise
 
     def _is_used(self, db: RunDatabase) -> bool:
-        """Whether an earlier run has left something."""
-        return db.used
+        """Whether an earlier run has left something, of one survey or many."""
+        return db.used or bool(jobs_of(self.place))
 
     def _claim(self, here: dict[str, str], resume: bool) -> None:
         """Find the parts, check them if there are any, and mark their folder as this run's."""
-        self.storage = _storage(self.place, self.db.meta["parts"], durable=self.lasting)
-        _refuse_link(self.storage)
+        self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
             sizes = self.storage.sizes()  # also an error if the place cannot be opened
-        if self.kept:
+        if self._is_used(self.db):
             self._go_on(here, resume, sizes)
         if self._remote:
             self._remote.claim(self.db)
@@ -180,8 +175,8 @@ class KeptRun:
             )
         if not resume:
             raise LidarpoolError(
-                f"{self.place} holds an unfinished run, {self.kept}: continue it with {_RESUME}, "
-                f"or drop it with {_DROP}."
+                f"{self.place} holds an unfinished run, {self.kept or 'a job'}: continue it with "
+                f"{_RESUME}, or drop it with {_DROP}."
             )
         if self._wanted not in ("auto", self.backend):
             raise LidarpoolError(
@@ -308,17 +303,17 @@ class KeptRun:
                 self.db.close()
                 raise
             self.close()
-            if self.kept and (self._folder / FILE).exists():
+            if self.kept and self._folder.local(FILE).exists():
                 error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
             raise
 
     def close(self) -> None:
         """Close the database of an unfinished run; remove one that has committed nothing."""
         self.db.close()
-        if not self.kept:
+        if not self._is_used(self.db):
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
-            (self._folder / FILE).unlink(missing_ok=True)  # where the place of the parts failed
+            self._folder.remove([FILE])  # where the place of the parts failed
 
 
 class RunStore(KeptRun):
@@ -327,8 +322,8 @@ class RunStore(KeptRun):
     def __init__(
         self,
         job: Job,
-        place: str | Path | None = None,
-        parts: str | Path | None = None,
+        place: str | Path | Storage | None = None,
+        parts: str | Path | Storage | None = None,
         *,
         resume: bool = False,
         backend: str = "",
@@ -419,9 +414,22 @@ class RunStore(KeptRun):
         return np.concatenate(rays)
 
 
-def _storage(place: str | Path, parts: str, *, durable: bool = True) -> Storage:
-    """Where the parts of a run are: below the run's place, or in a place of their own."""
-    return Storage.at(parts or f"{place}/{PARTS}", durable=durable)
+def _database(folder: Storage) -> Path:
+    """Path of the database in a folder of this machine; LidarpoolError if it is a link."""
+    folder.local(f"{FILE}-journal")  # which SQLite would follow, too
+    return folder.local(FILE)
+
+
+def _parts_of(place: Storage, parts: str) -> Storage:
+    """Where the parts of a run are: below the run's place, or in a place that was named."""
+    named, _, name = parts.rpartition("/")
+    return Storage.at(named or "/").below(name) if parts else place.below(PARTS)
+
+
+def jobs_of(place: Storage) -> dict[str, Storage]:
+    """Where a campaign keeps its jobs, as far as there is something of them: {name: place}."""
+    jobs = place.below(JOBS)
+    return {name: jobs.below(name) for name in jobs.entries()}
 
 
 @checked
@@ -439,48 +447,37 @@ def remove_run(folder: str | Path) -> None:
     Raises
     ------
     LidarpoolError
-        If another run uses it, it cannot be removed, or the folder of its parts is a link.
+        If another run uses it, it cannot be removed, or there is a link in place of its files.
     """
-    kept = Storage.at(folder)
-    with _removing(folder), tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
-        if not kept.is_local:
-            fetch_database(kept, Path(temporary))
+    drop_run(Storage.at(folder))
+
+
+def drop_run(place: Storage) -> None:
+    """Remove a stored run, see `remove_run`."""
+    with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
+        path = _database(place if place.is_local else Storage.at(temporary))
+        if not place.is_local:
+            fetch_database(place, path)
         try:
-            found = read_place(Path(folder if kept.is_local else temporary) / FILE)
+            found = read_place(path)
         except LidarpoolError as error:
-            raise LidarpoolError(str(error).replace(temporary, str(folder))) from error
+            raise LidarpoolError(str(error).replace(temporary, place.url)) from error
         mark, parts = found or (None, "")
-        _remove(folder, _storage(folder, parts), mark)
+        _remove(place, _parts_of(place, parts), mark)
 
 
-def _remove(place: str | Path, parts: Storage, mark: str | None) -> None:
+def _remove(place: Storage, parts: Storage, mark: str | None) -> None:
     """Remove a run and what its mark says is its own.
 
     `mark` is None if the database does not say it: then that in the folder of the parts counts.
     """
-    _refuse_link(parts)
-    with _removing(place):
-        jobs = Storage.at(f"{place}/{JOBS}")  # of a campaign
-        for name in jobs.entries() if not jobs.is_link else ():
-            remove_run(jobs.path(name))
-        jobs.remove_folder()
-        parts.remove(own_files(parts, mark))
-        parts.remove_folder()
-        kept = Storage.at(place)
-        kept.remove([FILE, f"{FILE}-journal", OWNER])
-        kept.remove_folder()
-
-
-def _removing(place: str | Path) -> AbstractContextManager[None]:
-    return explained(f"The run in {place} cannot be removed")
-
-
-def _refuse_link(parts: Storage) -> None:
-    if parts.is_link:
-        raise LidarpoolError(
-            f"{parts.url} is a link, and a run deletes nothing behind a link: put the folder "
-            "itself there, or remove the link; --parts gives the points another place."
-        )
+    with explained(f"The run in {place} cannot be removed"):
+        own = own_files(parts, mark)  # an error if they are behind a link
+        for job in jobs_of(place).values():
+            drop_run(job)
+        place.below(JOBS).remove([], folder=True)
+        parts.remove(own, folder=True)
+        place.remove([FILE, f"{FILE}-journal", OWNER], folder=True)
 
 
 def _span(part: Receipt) -> str:
