@@ -478,7 +478,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
         add(job, 0, 2)
         job.db.close()
     else:
-        campaign.db.end_job(0, {})
+        campaign.db.end_jobs([(0, False, {})])
     campaign.db.close()
     before = names(folder)
     for resume in (False, True):
