@@ -462,12 +462,12 @@ def all_of(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture
-def cut(client, tmp_path, monkeypatch):
+def unwritten(client, tmp_path, monkeypatch):
     """A campaign of three jobs, of which one is in the data set when the disk is full."""
     write = DataSet.write_job
 
-    def fail(self: DataSet, number: int, name: str, *arguments: Any) -> None:
-        write(self, number, name, *arguments)
+    def fail(self: DataSet, number: int, name: str, *arguments: Any, **more: Any) -> None:
+        write(self, number, name, *arguments, **more)
         if number:
             with explained("Job cannot be written"):
                 raise OSError(28, "No space left on device")
@@ -495,25 +495,25 @@ def lead_away(link: Path, stranger: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("where", ["run", "run/parts", "run/jobs/x", "jobs", "jobs/0001", ".jobs"])
-def test_nothing_behind_a_link_is_touched(client, tmp_path, cut, where):
+def test_nothing_behind_a_link_is_touched(client, tmp_path, unwritten, where):
     link, stranger = tmp_path / "ds" / where, tmp_path / "stranger"
     before = lead_away(link, stranger)
     for how in ("resume", "fresh"):
         with pytest.raises(LidarpoolError) as caught:
-            cut.run(tmp_path / "ds", client=client, **{how: True})
+            unwritten.run(tmp_path / "ds", client=client, **{how: True})
         assert f"{where} is a link" in str(caught.value)
         assert len(str(caught.value).splitlines()) == 1
     assert all_of(stranger) == before
     link.unlink()
     if (tmp_path / "kept").exists():
         (tmp_path / "kept").rename(link)
-    run = cut.run(tmp_path / "ds", client=client, resume=True)
+    run = unwritten.run(tmp_path / "ds", client=client, resume=True)
     assert (run.done, run.failed) == (3, ()) and not (tmp_path / "ds" / "run").exists()
-    cut.run(tmp_path / "whole", client=client)
+    unwritten.run(tmp_path / "whole", client=client)
     assert bytes_of(tmp_path / "ds") == bytes_of(tmp_path / "whole")
 
 
-def test_a_run_removes_its_own_files_only(client, tmp_path, cut):
+def test_a_run_removes_its_own_files_only(client, tmp_path, unwritten):
     ds = tmp_path / "ds"
     for name in ("thesis.txt", "jobs/thesis.txt", "jobs/0000/thesis.txt", "README.md", "x/cloud"):
         (ds / name).parent.mkdir(exist_ok=True)
@@ -521,18 +521,18 @@ def test_a_run_removes_its_own_files_only(client, tmp_path, cut):
         before = all_of(ds)
         for how in ("fresh", "resume"):
             with pytest.raises(LidarpoolError, match=f"holds {name}: a data set needs a folder"):
-                cut.run(ds, client=client, **{how: True})
+                unwritten.run(ds, client=client, **{how: True})
         assert all_of(ds) == before
         (ds / name).unlink()
     (ds / "x").rmdir()
-    assert cut.run(ds, client=client, fresh=True).resumed == 0
+    assert unwritten.run(ds, client=client, fresh=True).resumed == 0
     # An empty folder that is called run says nothing, nor does one that is called points.
     (tmp_path / "other" / "run").mkdir(parents=True)
     (tmp_path / "mine").mkdir()
     (tmp_path / "other" / "jobs").symlink_to(tmp_path / "mine")
     for how in ("resume", "fresh", "overwrite"):
         with pytest.raises(LidarpoolError, match=r"holds jobs: a data set|jobs is a link"):
-            cut.run(tmp_path / "other", client=client, **{how: True})
+            unwritten.run(tmp_path / "other", client=client, **{how: True})
     assert [*(tmp_path / "mine").iterdir()] == []
 
 
