@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Floats, Integers, Ints32
 from .hits import Hits, ScanReturns
 from .instances import Scene
 from .rays import Rays
@@ -37,12 +37,12 @@ class Found:
         int32 (k,): number of the instance.
     """
 
-    ray: NDArray[np.integer[Any]]
-    t: NDArray[np.float64]
-    triangle: NDArray[np.int32]
-    u: NDArray[np.float64]
-    v: NDArray[np.float64]
-    instance: NDArray[np.int32]
+    ray: Integers
+    t: Floats
+    triangle: Ints32
+    u: Floats
+    v: Floats
+    instance: Ints32
 
 
 class Backend(ABC):

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from operator import index
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import Ints
 from .backend import Backend, BackendUnavailable
 from .cuda_backend import CudaBackend
 from .device import DeviceHits, OtherHits
@@ -301,9 +302,9 @@ class RayCaster:
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
-        counters: tuple[NDArray[np.int64], int] | None = None,
+        counters: tuple[Ints, int] | None = None,
         others: OtherHits | None = None,
-    ) -> tuple[NDArray[np.int64], Counted | None]:
+    ) -> tuple[Ints, Counted | None]:
         """Cast a scan, and use its hits on the CUDA device where they are.
 
         Parameters

@@ -10,8 +10,8 @@ from typing import Any, ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import Ints
 from .backend import Backend, Found
 from .device import DeviceHits, OtherHits, to_device
 from .hits import Counted, Part, ScanReturns, joined
@@ -143,9 +143,9 @@ class CudaBackend(Backend):
         self,
         scan: Scan,
         use: Callable[[DeviceHits], object],
-        counters: tuple[NDArray[np.int64], int] | None = None,
+        counters: tuple[Ints, int] | None = None,
         others: OtherHits | None = None,
-    ) -> tuple[NDArray[np.int64], Counted | None]:
+    ) -> tuple[Ints, Counted | None]:
         """See `RayCaster.visit`."""
         cp, scene, groups = self._cupy, self._scene, Groups(scan.groups, scan.keep_every)
         with self._device:

@@ -8,8 +8,9 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import DTypeLike, NDArray
+from numpy.typing import DTypeLike
 
+from .arrays import AnyArray, Floats, Ints32, UInts32
 from .hits import Part
 
 _UNDER_WAY = 2  # copies: one runs while the arrays of the next are made
@@ -65,12 +66,12 @@ class OtherHits:
         int32 (k,): any number.
     """
 
-    ray: NDArray[np.uint32]
-    distance: NDArray[np.float64]
-    triangle: NDArray[np.int32]
+    ray: UInts32
+    distance: Floats
+    triangle: Ints32
 
 
-def to_device(cupy: Any, array: NDArray[Any]) -> Any:
+def to_device(cupy: Any, array: AnyArray) -> Any:
     """Copy an array to the current device, and wait for that: any stream may read it then.
 
     A device that reads ordinary memory itself, as Grace Hopper does, may still read after `set`
@@ -101,7 +102,7 @@ class Outbox:
         # Events after copies, and arrays that the device still reads.
         self._under_way: deque[tuple[Any, Sequence[Any]]] = deque()
 
-    def room(self, count: int, kind: DTypeLike) -> NDArray[Any]:
+    def room(self, count: int, kind: DTypeLike) -> AnyArray:
         """Make an array (count,) in page-locked memory, to which the device writes by itself.
 
         It goes back to CuPy's pool when the last view of it has gone.
@@ -110,7 +111,7 @@ class Outbox:
         memory = self._cupy.cuda.alloc_pinned_memory(max(size, 1))
         return np.frombuffer(memory, kind, count)
 
-    def send(self, pairs: Sequence[tuple[Any, NDArray[Any]]]) -> None:
+    def send(self, pairs: Sequence[tuple[Any, AnyArray]]) -> None:
         """Begin to copy arrays that the current stream makes: pairs of one here, one in `room`."""
         self._stream.wait_event(self._cupy.cuda.get_current_stream().record())
         for given, out in pairs:

@@ -6,13 +6,13 @@ import importlib.util
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, ClassVar
+from typing import ClassVar
 from weakref import WeakKeyDictionary
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import embree_library
+from .arrays import AnyArray, Floats, Ints, Ints32
 from .backend import Backend, Found
 from .hits import ScanReturns
 from .instances import Scene
@@ -22,8 +22,7 @@ from .poses import Poses
 from .rays import Rays
 from .scan import Scan
 
-Float = NDArray[np.float64]
-_Room = tuple[Float, NDArray[np.int32], NDArray[np.int32]]
+_Room = tuple[Floats, Ints32, Ints32]
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 _COHERENCE = 0.94  # cosine of 20 degrees: wider packets are slower than single rays
@@ -160,7 +159,7 @@ class EmbreeBackend(Backend):
         counts = self._by_face(tally) if scan.tally else None
         return ScanReturns(*found, hits, counts, instance[:kept])
 
-    def _by_face(self, tally: NDArray[np.int64]) -> NDArray[np.int64]:
+    def _by_face(self, tally: Ints) -> Ints:
         """Count hits of all faces, from those of triangles that have an area."""
         counts, start = np.zeros(self._scene.face_count, np.int64), 0
         for mesh, first in zip(self._scene.meshes, self._scene.first_face, strict=False):
@@ -256,7 +255,7 @@ class _Source:
     """Arrays from which rays are made, and their addresses for compiled code; see `trace`."""
 
     def __init__(
-        self, directions: Float, origins: Float | None, poses: Poses, frame: Frame
+        self, directions: Floats, origins: Floats | None, poses: Poses, frame: Frame
     ) -> None:
         motion, self.each = poses.motion, poses.rays
         tables = [directions, origins, poses.positions, poses.rotations]
@@ -279,7 +278,7 @@ _own = threading.local()  # threads of one worker may cast at the same time
 
 def _scratch(size: int) -> int:
     """Address of scratch memory of this thread, a multiple of 64."""
-    room: NDArray[Any] | None = getattr(_own, "room", None)
+    room: AnyArray | None = getattr(_own, "room", None)
     if room is None:
         room = _own.room = np.zeros(size + 8, np.int64)
     return room.ctypes.data + -room.ctypes.data % 64

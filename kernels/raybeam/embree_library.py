@@ -11,8 +11,9 @@ from weakref import finalize
 
 import numpy as np
 
+from .arrays import Floats
 from .instances import Scene
-from .mesh import Float, LocalMesh
+from .mesh import LocalMesh
 
 # Constants of rtcore.h.
 _TRIANGLES, _INSTANCE = 0, 121
@@ -161,7 +162,7 @@ class EmbreeInstances(EmbreeScene):
     def __init__(self, scene: Scene, meshes: list[EmbreeMesh], threads: int | None) -> None:
         super().__init__(threads)
         embree, self._meshes = library(), meshes
-        self._transforms: Float = np.full((len(scene.mesh), 3, 4), np.nan)
+        self._transforms: Floats = np.full((len(scene.mesh), 3, 4), np.nan)
         for number, mesh in enumerate(scene.mesh.tolist()):
             geometry = embree.rtcNewGeometry(self._device, _INSTANCE)
             embree.rtcSetGeometryInstancedScene(geometry, meshes[mesh].address)

@@ -5,13 +5,14 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
+
+from .arrays import Bools, Floats, Ints, Ints32, UInts32
 
 # Ray, distance, triangle and instance of some hits, as in `ScanReturns`.
-Part = tuple[NDArray[np.uint32], NDArray[np.float64], NDArray[np.int32], NDArray[np.int32]]
+Part = tuple[UInts32, Floats, Ints32, Ints32]
 
 # Numbers of the counters of a tally that are not 0, ascending, and their hits.
-Counted = tuple[NDArray[np.int64], NDArray[np.int64]]
+Counted = tuple[Ints, Ints]
 
 
 @dataclass(frozen=True)
@@ -34,17 +35,17 @@ class Hits:
         int32 (n,): number of the instance that is hit; 0 for a plain mesh, -1 for a miss.
     """
 
-    distance: NDArray[np.float64]
-    triangle: NDArray[np.int32]
-    u: NDArray[np.float64]
-    v: NDArray[np.float64]
-    instance: NDArray[np.int32]
+    distance: Floats
+    triangle: Ints32
+    u: Floats
+    v: Floats
+    instance: Ints32
 
     def __len__(self) -> int:
         return len(self.distance)
 
     @property
-    def hit(self) -> NDArray[np.bool_]:
+    def hit(self) -> Bools:
         """Which rays hit something: (n,)."""
         return self.triangle >= 0
 
@@ -71,12 +72,12 @@ class ScanReturns:
         int32 (k,): as in `Hits`.
     """
 
-    ray: NDArray[np.uint32]
-    distance: NDArray[np.float64]
-    triangle: NDArray[np.int32]
-    hits: NDArray[np.int64]
-    tally: NDArray[np.int64] | None
-    instance: NDArray[np.int32]
+    ray: UInts32
+    distance: Floats
+    triangle: Ints32
+    hits: Ints
+    tally: Ints | None
+    instance: Ints32
 
     def __len__(self) -> int:
         return len(self.ray)

@@ -15,12 +15,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .mesh import Float, Frame, LocalMesh, local_mesh, middle
+from .arrays import Floats, Indices, Integers, Ints, Ints32
+from .mesh import Frame, LocalMesh, local_mesh, middle
 from .opacity import Opacity
 from .tree import PAD
 
@@ -99,10 +99,10 @@ class Scene:
     """
 
     meshes: tuple[LocalMesh, ...]
-    mesh: NDArray[np.intp]
+    mesh: Indices
     frame: Frame
-    matrices: Float | None
-    boxes: Float
+    matrices: Floats | None
+    boxes: Floats
 
     @property
     def nested(self) -> bool:
@@ -110,7 +110,7 @@ class Scene:
         return self.matrices is not None
 
     @cached_property
-    def first_face(self) -> NDArray[np.int64]:
+    def first_face(self) -> Ints:
         """Where the faces of each mesh begin in a tally, and their number: (meshes + 1,)."""
         return np.cumsum([0, *(mesh.face_count for mesh in self.meshes)])
 
@@ -120,12 +120,12 @@ class Scene:
         return int(self.first_face[-1])
 
     @property
-    def counters(self) -> NDArray[np.int64]:
+    def counters(self) -> Ints:
         """First row of each instance's triangles in a tally, and the step to the next: (n, 2)."""
         first = self.first_face[:-1][self.mesh]
         return np.stack([first, np.ones_like(first)], axis=1)
 
-    def to_scene(self) -> Float:
+    def to_scene(self) -> Floats:
         """Matrices (n, 3, 4) that take the meshes' local coordinates to the scene's."""
         assert self.matrices is not None
         matrices = self.matrices.reshape(-1, 3, 4)
@@ -133,15 +133,13 @@ class Scene:
         move = -_product(inverse, matrices[:, :, 3])
         return np.concatenate([inverse, move[:, :, None]], axis=2)
 
-    def tally_rows(
-        self, instance: NDArray[np.int32], triangle: NDArray[np.int32]
-    ) -> NDArray[np.integer[Any]]:
+    def tally_rows(self, instance: Ints32, triangle: Ints32) -> Integers:
         """Rows of a tally of triangles (k,) that instances (k,) show."""
         return self.first_face[self.mesh[instance]] + triangle if self.nested else triangle
 
     def enter(
-        self, instance: NDArray[np.intp], origins: Float, directions: Float
-    ) -> tuple[Float, Float, Float]:
+        self, instance: Indices, origins: Floats, directions: Floats
+    ) -> tuple[Floats, Floats, Floats]:
         """Take rays to the coordinates of the meshes of instances (m,); the scene is not plain.
 
         Parameters
@@ -174,7 +172,7 @@ def plain(mesh: LocalMesh) -> Scene:
     return Scene((mesh,), np.zeros(1, np.intp), frame, None, boxes)
 
 
-def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Float]:
+def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Floats]:
     """Make a scene of instances, and return it with their transforms (n, 3, 4).
 
     Raises
@@ -198,14 +196,14 @@ def check_instances(instances: Sequence[Instance]) -> tuple[Scene, Float]:
     return place(meshes, mesh, transforms), transforms
 
 
-def check_transform(number: int, transform: ArrayLike | None) -> Float:
+def check_transform(number: int, transform: ArrayLike | None) -> Floats:
     """Transform of the instance of that number: float64 (3, 4); ValueError if it is invalid."""
     matrix = _matrix(number, transform)
     _check_regular(number, matrix[None])
     return matrix
 
 
-def _matrix(number: int, transform: ArrayLike | None) -> Float:
+def _matrix(number: int, transform: ArrayLike | None) -> Floats:
     if transform is None:
         return np.eye(3, 4)
     given = np.asarray(transform)
@@ -223,7 +221,7 @@ def _matrix(number: int, transform: ArrayLike | None) -> Float:
     return matrix[:3]
 
 
-def _check_regular(first: int, transforms: Float) -> None:
+def _check_regular(first: int, transforms: Floats) -> None:
     """Check transforms (n, 3, 4) of instances from a number on, all at once."""
     finite = np.isfinite(transforms).all(axis=(1, 2))
     if not finite.all():
@@ -244,7 +242,7 @@ def _check_regular(first: int, transforms: Float) -> None:
         )
 
 
-def place(meshes: tuple[LocalMesh, ...], mesh: NDArray[np.intp], transforms: Float) -> Scene:
+def place(meshes: tuple[LocalMesh, ...], mesh: Indices, transforms: Floats) -> Scene:
     """Make a scene that is not plain.
 
     Parameters
@@ -276,12 +274,12 @@ def place(meshes: tuple[LocalMesh, ...], mesh: NDArray[np.intp], transforms: Flo
     return Scene(meshes, mesh, frame, matrices.reshape(-1, 12), boxes)
 
 
-def _product(matrices: Float, vectors: Float) -> Float:
+def _product(matrices: Floats, vectors: Floats) -> Floats:
     """Matrices (n, 3, 3) times vectors (n, 3), with the same bits on every machine."""
     return (matrices * vectors[:, None, :]).sum(axis=2)
 
 
-def _inverse(matrices: Float) -> tuple[Float, Float]:
+def _inverse(matrices: Floats) -> tuple[Floats, Floats]:
     """Inverses and determinants of matrices (n, 3, 3), with the same bits on every machine."""
     a, b, c = (matrices[:, :, k] for k in range(3))
     across = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=1)

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from .arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from .instances import Scene
 from .mesh import LocalMesh
 from .opacity import Masks, join_masks
@@ -41,11 +40,11 @@ class Layout:
         Opacities of the triangles, in the same order; None if all are opaque.
     """
 
-    nodes: NDArray[np.float32]
-    triangles: NDArray[np.float32]
-    corners: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    roots: NDArray[np.int64]
+    nodes: Floats32
+    triangles: Floats32
+    corners: Floats
+    faces: Ints32
+    roots: Ints
     stack: int
     masks: Masks | None
 
@@ -66,9 +65,9 @@ class Places:
         Most nodes of `top` that can wait.
     """
 
-    top: NDArray[np.float32]
-    instances: NDArray[np.float64]
-    frame: NDArray[np.float64]
+    top: Floats32
+    instances: Floats
+    frame: Floats
     stack: int
 
 
@@ -89,7 +88,7 @@ def lay_out(meshes: tuple[LocalMesh, ...]) -> Layout:
     )
 
 
-def lay_out_places(scene: Scene, roots: NDArray[np.int64]) -> Places:
+def lay_out_places(scene: Scene, roots: Ints) -> Places:
     """Build the tree over the instances; a plain scene has none, and tables that are not read."""
     if scene.matrices is None:
         return Places(np.zeros((1, 32), np.float32), np.zeros((1, 20)), scene.frame.table, 0)
@@ -104,11 +103,11 @@ def lay_out_places(scene: Scene, roots: NDArray[np.int64]) -> Places:
     return Places(_nodes(tree), instances, scene.frame.table, _stack_need(tree) + 1)
 
 
-def _joined(tables: list[NDArray[Any]]) -> NDArray[Any]:
+def _joined(tables: list[AnyArray]) -> AnyArray:
     return tables[0] if len(tables) == 1 else np.concatenate(tables)
 
 
-def _nodes(tree: WideTree) -> NDArray[np.float32]:
+def _nodes(tree: WideTree) -> Floats32:
     out = np.zeros((len(tree.child), 8, _WIDTH), np.float32)
     out[:, 0:3] = tree.low
     out[:, 3:6] = tree.high
@@ -116,7 +115,7 @@ def _nodes(tree: WideTree) -> NDArray[np.float32]:
     return out.reshape(-1, 32)
 
 
-def _records(corners: NDArray[np.float64]) -> NDArray[np.float32]:
+def _records(corners: Floats) -> Floats32:
     """First corner, two edges, and bounds of the test's rounding errors.
 
     With u = 2**-24, coordinates within [-1, 1], unit directions d, edges e and g, and

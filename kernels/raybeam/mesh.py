@@ -6,8 +6,9 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import Bools, Floats, Ints, Ints32
 from .opacity import LocalOpacity, Opacity, check_opacity
 from .rays import finite_rows, real_rows, refuse_rows
 from .tree import PAD
@@ -17,7 +18,6 @@ from .tree import PAD
 NEAR = 2.0
 TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
 
-Float = NDArray[np.float64]
 
 _BLOCK = 1 << 16  # triangles that are processed together
 
@@ -40,22 +40,22 @@ class Frame:
         float64 (3,): least and greatest local coordinates of what is hit, padded as in the tree.
     """
 
-    centre: Float
+    centre: Floats
     scale: float
-    low: Float
-    high: Float
+    low: Floats
+    high: Floats
 
-    def to_local(self, points: Float) -> Float:
+    def to_local(self, points: Floats) -> Floats:
         """Points (n, 3) in metres to local coordinates."""
         return (points - self.centre) * self.scale
 
     @property
-    def table(self) -> Float:
+    def table(self) -> Floats:
         """Centre, scale, low and high, as compiled code reads them: float64 (10,)."""
         return np.concatenate([self.centre, [self.scale], self.low, self.high])
 
 
-def clip(low: Float, high: Float, origins: Float, directions: Float) -> tuple[Float, Float]:
+def clip(low: Floats, high: Floats, origins: Floats, directions: Floats) -> tuple[Floats, Floats]:
     """Local distances at which rays enter (0 when they start inside) and leave a box.
 
     A ray meets the box where ``entry <= leave``.
@@ -103,10 +103,10 @@ class LocalMesh:
     """
 
     frame: Frame
-    points: Float
-    rows: NDArray[np.int64]
-    corners: Float
-    index: NDArray[np.int32]
+    points: Floats
+    rows: Ints
+    corners: Floats
+    index: Ints32
     face_count: int
     opacity: LocalOpacity | None = None
 
@@ -148,21 +148,21 @@ def local_mesh(vertices: ArrayLike, faces: ArrayLike, opacity: Opacity | None = 
     return LocalMesh(frame, points, rows, corners, index, face_count, checked)
 
 
-def middle(low: Float, high: Float) -> tuple[Float, float]:
+def middle(low: Floats, high: Floats) -> tuple[Floats, float]:
     """Centre and scale of the frame of a box (3,), metres."""
     centre = low / 2 + high / 2
     half = float(np.maximum(high - centre, centre - low).max())
     return centre, math.ldexp(1.0, -math.frexp(half)[1]) if half > 0 else 1.0
 
 
-def _solid(corners: NDArray[np.float64]) -> NDArray[np.bool_]:
+def _solid(corners: Floats) -> Bools:
     """Whether each triangle has an area."""
     edges = corners[:, 1:] - corners[:, :1]
     x, y, z = np.cross(edges[:, 0], edges[:, 1]).astype(np.bool_).T
     return x | y | z
 
 
-def _check_faces(faces: ArrayLike, vertex_count: int) -> NDArray[np.int64]:
+def _check_faces(faces: ArrayLike, vertex_count: int) -> Ints:
     given = np.asarray(faces)
     if given.ndim != 2 or given.shape[1] != 3 or not len(given) or given.dtype.kind not in "iu":
         raise ValueError(

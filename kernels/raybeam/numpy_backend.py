@@ -15,19 +15,15 @@ from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import triangle as exact
+from .arrays import Bools, Floats, Floats32, Indices, Ints
 from .backend import Backend, Found
 from .instances import Scene
 from .mesh import TINY, clip
 from .opacity import join_masks
 from .rays import Rays
 from .tree import LEAF_BITS, PAD, WideTree, build_top, build_tree, join
-
-Float = NDArray[np.float64]
-Single = NDArray[np.float32]
-Index = NDArray[np.intp]
 
 _WIDTH = 8
 _LEAF_SIZE = 4
@@ -51,19 +47,19 @@ class _Best:
         Weights.
     """
 
-    t: Float
-    key: NDArray[np.int64]
-    u: Float
-    v: Float
+    t: Floats
+    key: Ints
+    u: Floats
+    v: Floats
 
 
 @dataclass(frozen=True)
 class _Visit:
     """Which rays are at which instances, and what their directions' lengths were: (m,) each."""
 
-    ray: Index
-    key: NDArray[np.int64]  # of triangle 0
-    length: Float
+    ray: Indices
+    key: Ints  # of triangle 0
+    length: Floats
 
 
 @dataclass(frozen=True)
@@ -88,11 +84,11 @@ class _Bundle:
         Where the rays come from, if they are at instances.
     """
 
-    entry: Float
-    scaled_origin: Single
-    inverse: Single
-    near: Index
-    limit: Single
+    entry: Floats
+    scaled_origin: Floats32
+    inverse: Floats32
+    near: Indices
+    limit: Floats32
     sheared: exact.ShearedRays
     visit: _Visit | None = None
 
@@ -101,11 +97,11 @@ class _Bundle:
 class _Pairs:
     """Rays that are to visit nodes, and where each enters the node's box; (m,) each."""
 
-    ray: Index
-    node: Index
-    enter: Single
+    ray: Indices
+    node: Indices
+    enter: Floats32
 
-    def only(self, rows: Index) -> _Pairs:
+    def only(self, rows: Indices) -> _Pairs:
         """Select pairs; as many rows as there are pairs select all of them."""
         if len(rows) == len(self.ray):
             return self
@@ -123,7 +119,7 @@ class _Nodes:
         ]
         self._child = tree.child.astype(np.intp)
 
-    def walk(self, rays: _Bundle, root: Index, test: Callable[[_Pairs], None]) -> None:
+    def walk(self, rays: _Bundle, root: Indices, test: Callable[[_Pairs], None]) -> None:
         """Take each ray down from its root, and call `test` with pairs of a ray and a leaf.
 
         The number of such a pair's node says what the leaf holds. `test` lowers `rays.limit`.
@@ -148,7 +144,7 @@ class _Nodes:
             if len(inner):
                 blocks.append(pairs.only(inner))
 
-    def _meets(self, rays: _Bundle, ray: Index, node: Index) -> tuple[Single, NDArray[np.bool_]]:
+    def _meets(self, rays: _Bundle, ray: Indices, node: Indices) -> tuple[Floats32, Bools]:
         """Where rays enter children's boxes, and whether before they leave: (m * width,) each."""
         enter = np.zeros((len(ray), _WIDTH), np.float32)
         leave = np.empty_like(enter)
@@ -234,14 +230,14 @@ class NumpyBackend(Backend):
             (key >> _SHIFT).astype(np.int32),
         )
 
-    def _walk(self, rays: _Bundle, root: Index, best: _Best, t_min: float) -> None:
+    def _walk(self, rays: _Bundle, root: Indices, best: _Best, t_min: float) -> None:
         self._nodes.walk(rays, root, lambda leaves: self._test(rays, best, t_min, leaves))
 
     def _visit(
         self,
         leaves: _Pairs,
-        origins: Float,
-        directions: Float,
+        origins: Floats,
+        directions: Floats,
         rays: _Bundle,
         best: _Best,
         t_min: float,
@@ -306,10 +302,10 @@ class NumpyBackend(Backend):
 
 
 def _bundle(
-    origins: Float,
-    directions: Float,
-    entry: Float,
-    t_max: Float | float,
+    origins: Floats,
+    directions: Floats,
+    entry: Floats,
+    t_max: Floats | float,
     visit: _Visit | None = None,
 ) -> _Bundle:
     # If the ray is too far away for float64 to place the start, it stays near the scene.
@@ -328,7 +324,7 @@ def _bundle(
     )
 
 
-def _limit(t: Float, entry: Float) -> Single:
+def _limit(t: Floats, entry: Floats) -> Floats32:
     """Distances from `entry` in float32, never less than the exact ones."""
     left = (t - entry) * (1 + _SLACK) + _SLACK
     return np.clip(left, -_ACROSS, _ACROSS).astype(np.float32)

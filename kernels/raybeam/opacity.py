@@ -9,9 +9,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Float = NDArray[np.float64]
+from .arrays import Bools, Bytes, Floats, Floats32, Indices, Ints, Ints32
 
 _FARTHEST = 2.0**31  # of texture coordinates, so that none is infinite at a ray
 
@@ -47,11 +47,11 @@ class LocalOpacity:
         float32 (k, 6): of each triangle of a `LocalMesh`, u and v of the three corners.
     """
 
-    mask: NDArray[np.uint8]
-    uv: NDArray[np.float32]
+    mask: Bytes
+    uv: Floats32
 
 
-def check_opacity(opacity: Opacity, face_count: int, index: NDArray[np.int32]) -> LocalOpacity:
+def check_opacity(opacity: Opacity, face_count: int, index: Ints32) -> LocalOpacity:
     """Check an opacity and select the triangles `index`; ValueError if it is invalid."""
     mask, uv = np.asarray(opacity.mask), np.asarray(opacity.uv)
     if mask.dtype != np.bool_ or mask.ndim != 2 or not mask.size:
@@ -90,14 +90,14 @@ class Masks:
         element, height and width; height 0 for a mesh that is opaque everywhere.
     """
 
-    uv: NDArray[np.float32]
-    mask: NDArray[np.uint8]
-    records: NDArray[np.int64]
+    uv: Floats32
+    mask: Bytes
+    records: Ints
 
     def opaque(
-        self, mesh: NDArray[np.intp], place: NDArray[np.intp], a: Float, b: Float, c: Float,
-        det: Float,
-    ) -> NDArray[np.bool_]:  # fmt: skip
+        self, mesh: Indices, place: Indices, a: Floats, b: Floats, c: Floats,
+        det: Floats,
+    ) -> Bools:  # fmt: skip
         """Whether rays that pass inside triangles are stopped there: (m,).
 
         Parameters
@@ -120,9 +120,7 @@ class Masks:
         return stopped
 
 
-def join_masks(
-    opacities: list[LocalOpacity | None], orders: list[NDArray[np.int32]]
-) -> Masks | None:
+def join_masks(opacities: list[LocalOpacity | None], orders: list[Ints32]) -> Masks | None:
     """Join the opacities of meshes, whose triangles have these orders; None if there is none.
 
     A mask that meshes share, as the same memory, is there once.

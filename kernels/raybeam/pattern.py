@@ -6,8 +6,9 @@ from functools import cached_property
 from operator import index
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import Floats, Ints
 from .poses import Motion, Poses, check_poses
 from .rays import check_origins, unit_directions
 
@@ -47,7 +48,7 @@ class Pattern:
     def __init__(self, directions: ArrayLike, origins: ArrayLike | None = None) -> None:
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False
-        self._origins: NDArray[np.float64] | None = None
+        self._origins: Floats | None = None
         if origins is not None:
             self._origins = np.empty((3, len(self)))
             self._origins[...] = check_origins(origins, len(self)).T
@@ -60,12 +61,12 @@ class Pattern:
         return f"Pattern({len(self)} directions{'' if self._origins is None else ', origins'})"
 
     @property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Floats:
         """Unit vectors (n, 3), read-only; transposed, they are contiguous."""
         return self._directions.T
 
     @property
-    def origins(self) -> NDArray[np.float64] | None:
+    def origins(self) -> Floats | None:
         """Starts of the rays (n, 3), metres, read-only and contiguous as `directions`; or None."""
         return None if self._origins is None else self._origins.T
 
@@ -92,7 +93,7 @@ class Pattern:
         start: int = 0,
         rays_per_pose: int | None = None,
         motion: Motion | None = None,
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    ) -> tuple[Floats, Floats]:
         """Origins and directions, in the mesh's axes, of some of the rays that a scan casts.
 
         They have the same bits as the rays that `RayCaster.scan` casts, in any batch.
@@ -129,9 +130,7 @@ class Pattern:
         poses = check_poses(positions, rotations, rays_per_pose, most, motion)
         return self.made(first, ray, poses)
 
-    def made(
-        self, first: int, ray: NDArray[np.int64], poses: Poses
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def made(self, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
         """Make checked rays; see `rays`, of which `first` is the start.
 
         Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
@@ -155,5 +154,5 @@ class Pattern:
         return (poses.positions if one else places.T), directions.T
 
 
-def _columns(table: NDArray[np.float64], row: NDArray[np.int64]) -> NDArray[np.float64]:
+def _columns(table: Floats, row: Ints) -> Floats:
     return np.stack([numbers.take(row) for numbers in table])

@@ -16,6 +16,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from .arrays import Floats32, Indices, Ints32
 from .sweep import divide
 
 _RADIUS = 8  # neighbours looked at on either side; twice as many gain 1 to 2 % of the tree's cost
@@ -40,19 +41,19 @@ class BinaryTree:
         range than their parent.
     """
 
-    low: NDArray[np.float32]
-    high: NDArray[np.float32]
-    left: NDArray[np.int32]
-    right: NDArray[np.int32]
+    low: Floats32
+    high: Floats32
+    left: Ints32
+    right: Ints32
     rounds: tuple[tuple[int, int], ...]
 
     @property
-    def area(self) -> NDArray[np.float32]:
+    def area(self) -> Floats32:
         """Half the surface of each node's box: (2n-1,)."""
         return _half_area(self.high - self.low)
 
 
-def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
+def build(low: Floats32, high: Floats32) -> BinaryTree:
     """Build a tree over n boxes, n at least 1.
 
     Parameters
@@ -94,12 +95,12 @@ def build(low: NDArray[np.float32], high: NDArray[np.float32]) -> BinaryTree:
 
 
 def _crown(
-    low: NDArray[np.float32],
-    high: NDArray[np.float32],
-    count: NDArray[np.int32],
-    ids: NDArray[np.int32],
+    low: Floats32,
+    high: Floats32,
+    count: Ints32,
+    ids: Ints32,
     made: int,
-) -> tuple[NDArray[np.int32], list[tuple[int, int]]]:
+) -> tuple[Ints32, list[tuple[int, int]]]:
     """Children (m - 1, 2) of the nodes above the last m clusters, the root last, and rounds.
 
     `count` and `ids` (m,) say how many boxes are in each cluster, and which node it is; `made` is
@@ -117,9 +118,7 @@ def _crown(
     return np.concatenate(children), rounds
 
 
-def _partners(
-    low: NDArray[np.float32], high: NDArray[np.float32]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _partners(low: Floats32, high: Floats32) -> tuple[Indices, Indices]:
     """Pairs of positions that are each other's nearest, the lower one first."""
     n = low.shape[1]
     here = np.arange(n)
@@ -147,12 +146,12 @@ def _partners(
     return first, best[first]
 
 
-def _half_area(size: NDArray[np.float32]) -> NDArray[np.float32]:
+def _half_area(size: Floats32) -> Floats32:
     x, y, z = size
     return x * y + y * z + z * x
 
 
-def _morton(low: NDArray[np.float32], high: NDArray[np.float32]) -> NDArray[np.uint64]:
+def _morton(low: Floats32, high: Floats32) -> NDArray[np.uint64]:
     """Position of each box's middle along a Z-order curve."""
     middle = low.astype(np.float64) + high
     start = middle.min(axis=1, keepdims=True)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from operator import index
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import AnyArray, Floats, Indices, Ints
 from .rays import finite_rows, real_rows, refuse_rows
 
 _SLACK = 2e-9  # on products of a rotation's rows
@@ -30,9 +30,9 @@ class Motion:
         100 degrees a second.
     """
 
-    delays: NDArray[np.float64]
-    velocities: NDArray[np.float64]
-    rates: NDArray[np.float64]
+    delays: Floats
+    velocities: Floats
+    rates: Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,15 +52,15 @@ class Poses:
         Within each pose; None if the lidar stands still for all of its rays.
     """
 
-    positions: NDArray[np.float64]
-    rotations: NDArray[np.float64] | None
+    positions: Floats
+    rotations: Floats | None
     rays: int
     motion: Motion | None = None
 
     def __len__(self) -> int:
         return len(self.positions)
 
-    def of(self, ray: NDArray[np.int64], room: NDArray[np.float64]) -> RayPoses:
+    def of(self, ray: Ints, room: Floats) -> RayPoses:
         """Look up the poses of rays (m,), into `room`, (18, m)."""
         pose = ray // self.rays
         delay, rates, velocities = np.zeros(1), None, None
@@ -76,9 +76,7 @@ class Poses:
             self._each(self.positions, pose, room[9:12]), rotations, delay, velocities, rates
         )
 
-    def _each(
-        self, table: NDArray[np.float64], pose: NDArray[np.intp], room: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _each(self, table: Floats, pose: Indices, room: Floats) -> Floats:
         columns = np.moveaxis(table, 0, -1).reshape(-1, len(self))
         if len(self) == 1:
             return columns
@@ -91,13 +89,13 @@ class Poses:
 class RayPoses:
     """Poses of m rays, see `Poses`: (numbers, m), or (numbers, 1) if all rays share one."""
 
-    positions: NDArray[np.float64]
-    rotations: NDArray[np.float64] | None
-    delay: NDArray[np.float64]
-    velocities: NDArray[np.float64] | None
-    rates: NDArray[np.float64] | None
+    positions: Floats
+    rotations: Floats | None
+    delay: Floats
+    velocities: Floats | None
+    rates: Floats | None
 
-    def turned(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def turned(self, vectors: Floats) -> Floats:
         """Rotate vectors (3, m) to the mesh's axes, with a fixed order of rounding.
 
         ``matrices @ vectors`` would do, but its last bit depends on the machine's BLAS.
@@ -117,7 +115,7 @@ class RayPoses:
         crosses += vectors
         return crosses
 
-    def moved(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
+    def moved(self, places: Floats) -> Floats:
         """Move positions (3, m), or (3, 1), by the delays of their rays."""
         if self.velocities is None:
             return places
@@ -179,7 +177,7 @@ def _check_motion(motion: Motion, poses: int, rays: int) -> Motion:
     return Motion(*arrays)
 
 
-def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
+def _check_rotations(rotations: ArrayLike) -> Floats:
     """Rotation matrices (k, 3, 3) in float64; raises ValueError for one that is not orthonormal."""
     matrices = by_number(real_rows("rotations", rotations, (3, 3)))
     # Written out for all matrices at once: products one by one take longer than casting their rays.
@@ -201,7 +199,7 @@ def _check_rotations(rotations: ArrayLike) -> NDArray[np.float64]:
     return matrices
 
 
-def by_number(table: NDArray[Any]) -> NDArray[np.float64]:
+def by_number(table: AnyArray) -> Floats:
     """Table (k, ...) in float64, each number contiguous over the k entries."""
     last = np.moveaxis(table, 0, -1)
     return np.moveaxis(np.ascontiguousarray(last, dtype=np.float64), -1, 0)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
+
+from .arrays import AnyArray, Bools, Floats
 
 # A vector with a squared length this close to 1 is a unit vector up to rounding, and is left as it
 # is, so that the last bits of normalised directions do not change.
@@ -31,8 +32,8 @@ class Rays:
         Hits nearer or farther than this are not reported, metres; both ends count.
     """
 
-    origins: NDArray[np.float64]
-    directions: NDArray[np.float64]
+    origins: Floats
+    directions: Floats
     t_min: float
     t_max: float
 
@@ -65,7 +66,7 @@ def check_rays(origins: ArrayLike, directions: ArrayLike, t_min: float, t_max: f
     return Rays(check_origins(origins, len(table)), table, *check_interval(t_min, t_max))
 
 
-def check_origins(origins: ArrayLike, rays: int) -> NDArray[Any]:
+def check_origins(origins: ArrayLike, rays: int) -> AnyArray:
     """Origins (n, 3) as given, or one (1, 3); ValueError for other shapes."""
     start = real_rows("origins", origins)
     if len(start) not in (1, rays):
@@ -88,7 +89,7 @@ def check_interval(t_min: float, t_max: float) -> tuple[float, float]:
     return t_min, t_max
 
 
-def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
+def unit_directions(directions: ArrayLike) -> Floats:
     """Directions as new float64 unit vectors (n, 3); raises ValueError for zero, NaN and inf.
 
     Their memory is in columns, so that the transposed array is contiguous.
@@ -101,7 +102,7 @@ def unit_directions(directions: ArrayLike) -> NDArray[np.float64]:
     return out
 
 
-def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
+def _normalised(table: Floats) -> Floats:
     """Normalise checked directions; returns the same array if they are unit vectors already."""
     x, y, z = table.T
     # No einsum or norm: those may fuse multiply and add, so the last bit would depend on the
@@ -121,7 +122,7 @@ def _normalised(table: NDArray[np.float64]) -> NDArray[np.float64]:
     return out
 
 
-def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> NDArray[Any]:
+def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> AnyArray:
     """Real numbers (n, *shape), copied only if they are no array; a single row may omit n."""
     given = np.asarray(values)
     if given.shape == shape:
@@ -135,7 +136,7 @@ def real_rows(name: str, values: ArrayLike, shape: tuple[int, ...] = (3,)) -> ND
     return given
 
 
-def finite_rows(block: NDArray[np.float64]) -> NDArray[np.bool_]:
+def finite_rows(block: Floats) -> Bools:
     """Whether each row (n, 3) has only finite numbers: (n,)."""
     x, y, z = np.isfinite(block).T
     return x & y & z
@@ -143,8 +144,8 @@ def finite_rows(block: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 def refuse_rows(
     what: str,
-    table: NDArray[Any],
-    good: Callable[[NDArray[np.float64]], NDArray[np.bool_]],
+    table: AnyArray,
+    good: Callable[[Floats], Bools],
     expected: str,
 ) -> None:
     """Raise ValueError for the first row that is not good."""
@@ -160,7 +161,7 @@ def refuse_rows(
         )
 
 
-def _check_directions(directions: ArrayLike) -> NDArray[Any]:
+def _check_directions(directions: ArrayLike) -> AnyArray:
     table = real_rows("directions", directions)
     refuse_rows(
         "Direction",
@@ -171,5 +172,5 @@ def _check_directions(directions: ArrayLike) -> NDArray[Any]:
     return table
 
 
-def _float64(table: NDArray[Any]) -> NDArray[np.float64]:
+def _float64(table: AnyArray) -> Floats:
     return np.ascontiguousarray(table, dtype=np.float64)

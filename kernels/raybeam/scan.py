@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from operator import index
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from .arrays import Floats, Indices, Integers, Ints, Ints32
 from .hits import Part, ScanReturns, joined
 from .pattern import Pattern
 from .poses import Motion, Poses, check_poses
@@ -49,7 +49,7 @@ class Scan:
     t_min: float
     t_max: float
     keep_every: int
-    groups: NDArray[np.int64]
+    groups: Ints
     tally: bool
 
     def __len__(self) -> int:
@@ -116,11 +116,11 @@ class Groups:
         `groups` and `keep_every` of `Scan`.
     """
 
-    def __init__(self, begins: NDArray[np.int64], every: int) -> None:
+    def __init__(self, begins: Ints, every: int) -> None:
         self._begins, self.every = begins, every
         self.hits = np.zeros(len(begins), np.int64)  # of each group, so far
 
-    def spans(self, start: int, stop: int) -> tuple[slice, NDArray[np.int64]]:
+    def spans(self, start: int, stop: int) -> tuple[slice, Ints]:
         """Find the groups of rays `start` to `stop`, and the first ray of all but the first.
 
         The rays are counted from `start`.
@@ -129,9 +129,7 @@ class Groups:
         last = int(np.searchsorted(self._begins, stop, side="left"))
         return slice(first, last), self._begins[first + 1 : last] - start
 
-    def count(
-        self, groups: slice, counts: NDArray[np.int64]
-    ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    def count(self, groups: slice, counts: Ints) -> tuple[Ints, Ints]:
         """Count hits of groups in a chunk; of each: the first that is kept, and how many are."""
         before = self.hits[groups].copy()  # of the first group, in the chunks before this one
         self.hits[groups] += counts
@@ -163,9 +161,7 @@ class Collector(Groups):
         self._tally = np.zeros(face_count, np.int64) if scan.tally else None
         self._kept: list[Part] = []
 
-    def keep(
-        self, ray: NDArray[np.integer[Any]], start: int, stop: int
-    ) -> slice | NDArray[np.intp]:
+    def keep(self, ray: Integers, start: int, stop: int) -> slice | Indices:
         """Count the hits of rays `start` to `stop` and select those to keep.
 
         Parameters
@@ -186,11 +182,11 @@ class Collector(Groups):
         if len(leave) == 1:
             return np.arange(leave[0], len(ray), self.every)
         offset = cuts[:-1] + leave - self.every * (np.cumsum(number) - number)
-        rows: NDArray[np.intp] = np.repeat(offset, number)
+        rows: Indices = np.repeat(offset, number)
         rows += self.every * np.arange(len(rows))
         return rows
 
-    def tally(self, rows: NDArray[np.integer[Any]]) -> None:
+    def tally(self, rows: Integers) -> None:
         """Count all hits of a chunk by their rows in the tally, if requested."""
         if self._tally is not None:
             np.add.at(self._tally, rows.astype(np.intp), 1)
@@ -198,10 +194,10 @@ class Collector(Groups):
     def add(
         self,
         start: int,
-        ray: NDArray[np.integer[Any]],
-        distance: NDArray[np.float64],
-        triangle: NDArray[np.int32],
-        instance: NDArray[np.int32],
+        ray: Integers,
+        distance: Floats,
+        triangle: Ints32,
+        instance: Ints32,
     ) -> None:
         """Add kept hits of a chunk, whose rays are counted from `start`."""
         number = ray.astype(np.uint32, copy=False)

@@ -11,11 +11,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Single = NDArray[np.float32]
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from .arrays import Floats, Floats32, Indices
 
 _APART = 8.0  # more than the distance of boxes within [-2, 2]
 # Levels that are divided by the heuristic; deeper ones are halved. Boxes that shrink along a line
@@ -35,12 +32,12 @@ class _Level:
         (k,): range of each node's boxes in them.
     """
 
-    orders: list[Index]
-    start: Index
-    stop: Index
+    orders: list[Indices]
+    start: Indices
+    stop: Indices
 
 
-def divide(low: Single, high: Single, weight: Float) -> list[Index]:
+def divide(low: Floats32, high: Floats32, weight: Floats) -> list[Indices]:
     """Divide boxes into two and two and so on, until each is alone.
 
     Parameters
@@ -59,7 +56,7 @@ def divide(low: Single, high: Single, weight: Float) -> list[Index]:
     middles = low.astype(np.float64) + high
     n = low.shape[1]
     level = _Level([np.argsort(m, kind="stable") for m in middles], np.array([0]), np.array([n]))
-    levels: list[Index] = []
+    levels: list[Indices] = []
     while n > 1 and len(level.start):
         node = np.repeat(np.arange(len(level.start)), level.stop - level.start)
         if len(levels) < _LEVELS:
@@ -72,8 +69,8 @@ def divide(low: Single, high: Single, weight: Float) -> list[Index]:
 
 
 def _cheapest(
-    low: Single, high: Single, weight: Float, level: _Level, node: Index
-) -> tuple[Index, Index]:
+    low: Floats32, high: Floats32, weight: Floats, level: _Level, node: Indices
+) -> tuple[Indices, Indices]:
     """Find the best division of each node: its axis, and the last place of the first part."""
     best = np.full(len(level.start), np.inf)
     axis, split = np.zeros((2, len(level.start)), np.intp)
@@ -90,7 +87,7 @@ def _cheapest(
     return axis, split
 
 
-def _costs(low: Single, high: Single, weight: Float, level: _Level, node: Index) -> Float:
+def _costs(low: Floats32, high: Floats32, weight: Floats, level: _Level, node: Indices) -> Floats:
     """Cost of dividing each place's node behind it, boxes and weights in order along an axis."""
     before = _areas(low, high, node)
     after = _areas(low[:, ::-1], high[:, ::-1], (node[-1] - node)[::-1])[::-1]
@@ -103,7 +100,7 @@ def _costs(low: Single, high: Single, weight: Float, level: _Level, node: Index)
     return cost
 
 
-def _areas(low: Single, high: Single, node: Index) -> Float:
+def _areas(low: Floats32, high: Floats32, node: Indices) -> Floats:
     """Half the surface of the box around each place's box and those of its node before it."""
     # Shifted apart node by node, so that one pass over all nodes restarts at each.
     shift = _APART * node
@@ -114,7 +111,7 @@ def _areas(low: Single, high: Single, node: Index) -> Float:
     return x * y + y * z + z * x
 
 
-def _divided(level: _Level, node: Index, axis: Index, split: Index) -> tuple[Index, _Level]:
+def _divided(level: _Level, node: Indices, axis: Indices, split: Indices) -> tuple[Indices, _Level]:
     """Children of each node, and the level below."""
     right = np.zeros(int(max(order.max() for order in level.orders)) + 1, np.bool_)
     for k, order in enumerate(level.orders):

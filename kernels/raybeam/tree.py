@@ -15,9 +15,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from . import ploc
+from .arrays import Bools, Floats, Floats32, Indices, Ints, Ints32
 
 PAD = 20 * 2.0**-24  # local units
 LEAF_BITS = 3
@@ -39,13 +39,13 @@ class WideTree:
         int32 (k,): triangles in the order of the leaves.
     """
 
-    low: NDArray[np.float32]
-    high: NDArray[np.float32]
-    child: NDArray[np.int32]
-    order: NDArray[np.int32]
+    low: Floats32
+    high: Floats32
+    child: Ints32
+    order: Ints32
 
 
-def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> WideTree:
+def build_tree(corners: Floats, width: int, leaf_size: int) -> WideTree:
     """Build a tree over triangles, or over boxes.
 
     Parameters
@@ -69,7 +69,7 @@ def build_tree(corners: NDArray[np.float64], width: int, leaf_size: int) -> Wide
     return _widen(binary, leaf, code, order, width)
 
 
-def build_top(boxes: NDArray[np.float64], width: int) -> WideTree:
+def build_top(boxes: Floats, width: int) -> WideTree:
     """Build a tree over instances' boxes (n, 2, 3), as `build_tree`, for one box a leaf.
 
     Its leaves' places are the instances' own numbers.
@@ -80,7 +80,7 @@ def build_top(boxes: NDArray[np.float64], width: int) -> WideTree:
     return WideTree(tree.low, tree.high, child, np.arange(len(boxes), dtype=np.int32))
 
 
-def join(trees: list[WideTree]) -> tuple[WideTree, NDArray[np.int64]]:
+def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     """Put trees one after the other; returns them as one, and the root of each.
 
     Triangles are numbered over all trees, in order.
@@ -104,7 +104,7 @@ def join(trees: list[WideTree]) -> tuple[WideTree, NDArray[np.int64]]:
     ), roots[:-1]
 
 
-def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
+def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[Ints32, Bools]:
     """Triangles under each node, and whether it is cheaper as one leaf.
 
     By the surface area heuristic, with equal costs of triangle and box tests.
@@ -124,7 +124,7 @@ def _leaves(tree: ploc.BinaryTree, leaf_size: int) -> tuple[NDArray[np.int32], N
     return count, leaf
 
 
-def _positions(tree: ploc.BinaryTree, count: NDArray[np.int32]) -> NDArray[np.int32]:
+def _positions(tree: ploc.BinaryTree, count: Ints32) -> Ints32:
     """Where each node's triangles begin when they are listed from left to right."""
     first = np.zeros(len(count), np.int32)
     for start, stop in reversed(tree.rounds):
@@ -136,9 +136,9 @@ def _positions(tree: ploc.BinaryTree, count: NDArray[np.int32]) -> NDArray[np.in
 
 def _widen(
     tree: ploc.BinaryTree,
-    leaf: NDArray[np.bool_],
-    code: NDArray[np.int32],
-    order: NDArray[np.int32],
+    leaf: Bools,
+    code: Ints32,
+    order: Ints32,
     width: int,
 ) -> WideTree:
     """Nodes of up to `width` children: level by level, the largest child is opened first."""
@@ -164,9 +164,7 @@ def _widen(
     )
 
 
-def _open(
-    tree: ploc.BinaryTree, area: NDArray[np.float32], roots: NDArray[np.intp], width: int
-) -> NDArray[np.intp]:
+def _open(tree: ploc.BinaryTree, area: Floats32, roots: Indices, width: int) -> Indices:
     """Binary nodes below each root, at most `width`; -1 fills up: (len(roots), width)."""
     slots = np.full((len(roots), width), -1)
     slots[:, 0] = roots

@@ -17,10 +17,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Index = NDArray[np.intp]
+from .arrays import Bools, Floats, Indices
 
 
 @dataclass(frozen=True)
@@ -37,18 +35,18 @@ class ShearedRays:
         The shear: direction along kx, ky over that along kz, and 1 over that along kz.
     """
 
-    kx: Index
-    ky: Index
-    kz: Index
-    ox: Float
-    oy: Float
-    oz: Float
-    sx: Float
-    sy: Float
-    sz: Float
+    kx: Indices
+    ky: Indices
+    kz: Indices
+    ox: Floats
+    oy: Floats
+    oz: Floats
+    sx: Floats
+    sy: Floats
+    sz: Floats
 
 
-def shear(origins: Float, directions: Float) -> ShearedRays:
+def shear(origins: Floats, directions: Floats) -> ShearedRays:
     """Prepare rays with local origins (n, 3) and unit directions (n, 3)."""
     kz = np.argmax(np.abs(directions), axis=1)
     kx = (kz + 1) % 3
@@ -69,8 +67,8 @@ def shear(origins: Float, directions: Float) -> ShearedRays:
 
 
 def intersect(
-    rays: ShearedRays, ray: Index, corners: Float, triangle: Index
-) -> tuple[Float, Float, Float, Float, Float]:
+    rays: ShearedRays, ray: Indices, corners: Floats, triangle: Indices
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """Signed areas and distance of pairs of a ray and a triangle.
 
     Parameters
@@ -97,9 +95,9 @@ def intersect(
     at_x, at_y, at_z = base + rays.kx[ray], base + rays.ky[ray], base + rays.kz[ray]
     ox, oy, oz = rays.ox[ray], rays.oy[ray], rays.oz[ray]
     sx, sy = rays.sx[ray], rays.sy[ray]
-    x: list[Float] = []
-    y: list[Float] = []
-    z: list[Float] = []
+    x: list[Floats] = []
+    y: list[Floats] = []
+    z: list[Floats] = []
     for corner in (0, 3, 6):
         depth = flat.take(at_z + corner) - oz
         x.append((flat.take(at_x + corner) - ox) - sx * depth)
@@ -114,7 +112,7 @@ def intersect(
     return a, b, c, det, t
 
 
-def inside(a: Float, b: Float, c: Float, det: Float) -> NDArray[np.bool_]:
+def inside(a: Floats, b: Floats, c: Floats, det: Floats) -> Bools:
     """Whether the ray's line passes through the triangle, its edges and corners included."""
     one_side = ((a >= 0) & (b >= 0) & (c >= 0)) | ((a <= 0) & (b <= 0) & (c <= 0))
     return one_side & (det != 0)

@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray
 from .allowance import Allowance
 from .errors import LidarpoolError
 
@@ -49,7 +49,7 @@ def open_archive(
         ) from error
 
 
-def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, NDArray[Any]]:
+def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, AnyArray]:
     """Read all arrays of an archive, and compare their checksums.
 
     They are taken from `allowance`. LidarpoolError if they are more; any exception if the archive
@@ -63,9 +63,7 @@ def read_arrays(data: bytes, allowance: Allowance | None = None) -> dict[str, ND
         return {name.removesuffix(".npy"): read_array(archive, name, allowance) for name in names}
 
 
-def read_array(
-    archive: zipfile.ZipFile, name: str, allowance: Allowance | None = None
-) -> NDArray[Any]:
+def read_array(archive: zipfile.ZipFile, name: str, allowance: Allowance | None = None) -> AnyArray:
     """Read an array to its end, where its checksum is compared; errors as of `read_arrays`.
 
     Archives are read by several threads. NumPy's reader parses headers with `ast`, which failed now

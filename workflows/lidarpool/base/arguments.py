@@ -24,8 +24,9 @@ from typing import (
 )
 
 import numpy as np
-from numpy.typing import ArrayLike, DTypeLike, NDArray
+from numpy.typing import ArrayLike, DTypeLike
 
+from ..base.arrays import AnyArray
 from .errors import LidarpoolError
 
 P = ParamSpec("P")
@@ -114,7 +115,7 @@ def checked_fields(cls: C) -> C:
     return cls
 
 
-def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> NDArray[Any]:
+def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
     """Return values as an array of numbers; LidarpoolError if they are not numbers."""
     try:
         return np.asarray(values, dtype)

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..base.arrays import Ints
 
 
-def one_of_each_part(count: int, most: int) -> NDArray[np.int64]:
+def one_of_each_part(count: int, most: int) -> Ints:
     """Choose at most `most` numbers below `count`, in order, one from each of equal parts.
 
     All are chosen if they are no more; else the choice within each part is random, and the same

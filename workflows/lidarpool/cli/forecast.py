@@ -15,12 +15,12 @@ from dask.system import CPU_COUNT
 from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
-from numpy.typing import NDArray
 
 from poolpart import Pool, PoolError
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
+from ..base.arrays import Floats, Ints
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError, Mistakes
 from ..base.storage import Storage
@@ -270,23 +270,23 @@ class _FewRays(Sensor):
         channels = self.whole.channels
         return first * channels // self.every, stop * channels // self.every
 
-    def _rays(self, firings: NDArray[np.int64]) -> tuple[NDArray[np.int64], ...]:
+    def _rays(self, firings: Ints) -> tuple[Ints, ...]:
         """Return firings of the other, and which of these and which channel each ray is of."""
         # Steps of the golden ratio spread the rays evenly over firings and channels.
         ray = firings * self.every + (firings * GOLDEN % 1 * self.every).astype(np.int64)
         fired, channel = np.divmod(ray, self.whole.channels)
         return *np.unique(fired, return_inverse=True), channel
 
-    def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def directions(self, firings: Ints) -> Floats:
         some, row, channel = self._rays(firings)
         return self.whole.directions(some)[row, channel, None]
 
-    def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    def origins(self, firings: Ints) -> Floats | None:
         some, row, channel = self._rays(firings)
         starts = self.whole.origins(some)
         return None if starts is None else starts[row, channel, None]
 
-    def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def begins_ns(self, firings: Ints) -> Floats:
         some, row, _ = self._rays(firings)
         return self.whole.begins_ns(some)[row] + self.whole.lead_ns
 

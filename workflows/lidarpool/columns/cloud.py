@@ -15,6 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from ..base import ports
 from ..base.arguments import as_array, checked, checked_fields
+from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from .table import TABLE, Column
@@ -115,7 +116,7 @@ class Cloud(Savable):
     """
 
     positions: NDArray[np.floating]
-    columns: Mapping[str, NDArray[Any]]
+    columns: Mapping[str, AnyArray]
     own: tuple[Column, ...] = ()
     sweeps: Callable[[], Any] | None = None
 
@@ -146,7 +147,7 @@ class Cloud(Savable):
     def __repr__(self) -> str:
         return described(self)
 
-    def __getitem__(self, name: str) -> NDArray[Any]:
+    def __getitem__(self, name: str) -> AnyArray:
         try:
             return self.columns[name]
         except KeyError:
@@ -155,8 +156,8 @@ class Cloud(Savable):
                 "in `positions`"
             ) from None
 
-    def __getattr__(self, name: str) -> NDArray[Any]:
-        columns: Mapping[str, NDArray[Any]] = self.__dict__.get("columns", {})
+    def __getattr__(self, name: str) -> AnyArray:
+        columns: Mapping[str, AnyArray] = self.__dict__.get("columns", {})
         if name in columns:
             return columns[name]
         raise AttributeError(f"a cloud has no attribute or column {name!r}")
@@ -268,7 +269,7 @@ def described(cloud: CloudLike) -> str:
     return f"<{type(cloud).__name__} of {len(cloud):,} points: {names}>"
 
 
-def _fitting(column: Column, values: ArrayLike) -> NDArray[Any]:
+def _fitting(column: Column, values: ArrayLike) -> AnyArray:
     """Convert `values` to the column's type; LidarpoolError if a cast would wrap around."""
     given, wanted = np.asarray(values), np.dtype(column.dtype)
     cast = given.astype(wanted, copy=False)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Ints
 from ..base.choice import one_of_each_part
 from .cloud import CHUNK_POINTS, Cloud
 from .ply_format import AXES, mapped_rows
@@ -65,7 +66,7 @@ class CloudFile:
         of = self._rows["scan"]
         return bisect_left(of, scans[0]), bisect_right(of, scans[1])
 
-    def values(self, name: str, rows: NDArray[np.int64] | slice) -> NDArray[Any]:
+    def values(self, name: str, rows: Ints | slice) -> AnyArray:
         """Values of a column, or of x, y or z, in some rows; those of a slice stay on the disk."""
         files = {column.name: column.in_files for column in self.table}
         return np.asarray(self._rows[files.get(name, name)][rows])
@@ -75,7 +76,7 @@ class CloudFile:
         return Cloud(_positions(rows, dtype), columns, self.table)
 
 
-def _positions(rows: NDArray[np.void], dtype: Any = None) -> NDArray[Any]:
+def _positions(rows: NDArray[np.void], dtype: Any = None) -> AnyArray:
     return np.stack([rows[axis] for axis in AXES], axis=1, dtype=dtype)
 
 

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.archives import read_array, read_arrays
+from ..base.arrays import AnyArray, Floats, Ints, Ints32
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage, target_of
@@ -77,10 +78,10 @@ class PartColumns:
     """Content of a part."""
 
     first: int  # scan
-    counts: NDArray[np.int64]  # (scans,): rows of each scan
-    columns: Mapping[str, NDArray[Any]]  # {name: (rows,)}, positions as cells
-    triangles: NDArray[np.int32]  # (k,): those that were hit
-    hits: NDArray[np.int64]  # (k,): all their hits
+    counts: Ints  # (scans,): rows of each scan
+    columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
+    triangles: Ints32  # (k,): those that were hit
+    hits: Ints  # (k,): all their hits
 
     def __len__(self) -> int:
         return int(self.counts.sum())
@@ -91,14 +92,14 @@ class PartColumns:
         return self.first + len(self.counts)
 
     @property
-    def cells(self) -> NDArray[np.int64] | None:
+    def cells(self) -> Ints | None:
         """Lowest and highest cell, (2, 3); None without rows."""
         if not len(self):
             return None
         axes = [self.columns[axis.name] for axis in AXES]
         return np.array([[a.min() for a in axes], [a.max() for a in axes]], np.int64)
 
-    def scan_column(self) -> NDArray[np.int32]:
+    def scan_column(self) -> Ints32:
         """Scan of each row."""
         scans = np.arange(self.first, self.stop, dtype=np.int32)
         return np.repeat(scans, self.counts)
@@ -107,7 +108,7 @@ class PartColumns:
         self,
         table: Sequence[Column],
         precision_m: float,
-        origin: NDArray[np.float64],
+        origin: Floats,
         rows: NDArray[np.integer] | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
@@ -187,7 +188,7 @@ def read_part(storage: Storage, name: str) -> PartColumns:
         ) from error
 
 
-def read_tally(storage: Storage, name: str) -> tuple[NDArray[np.int32], NDArray[np.int64]]:
+def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
     """Read the hits of each triangle of a part, and nothing else; errors as of `read_part`."""
     if not storage.is_local:
         part = read_part(storage, name)
@@ -210,9 +211,9 @@ class StoredCloud(Savable):
     firsts: Sequence[int]  # their first scans
     rows: Sequence[int]  # their numbers of points
     columns: Sequence[Column]  # of a part
-    cells: NDArray[np.int64] | None  # lowest and highest, (2, 3); None without points
+    cells: Ints | None  # lowest and highest, (2, 3); None without points
     precision_m: float  # size of the cells that positions were rounded to
-    origin: NDArray[np.float64]  # world position of the scene's local origin, (3,), metres
+    origin: Floats  # world position of the scene's local origin, (3,), metres
     keeper: Any = None  # kept alive while the parts can be read
     sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save`
 
@@ -226,7 +227,7 @@ class StoredCloud(Savable):
         return sum(self.rows)
 
     @property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
         if self.cells is None:
             return np.zeros((2, 3))
@@ -327,9 +328,7 @@ class StoredCloud(Savable):
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)
 
 
-def positions(
-    cells: NDArray[np.integer], precision_m: float, origin: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def positions(cells: NDArray[np.integer], precision_m: float, origin: Floats) -> Floats:
     """World coordinates, (n, 3), of points in these cells, (n, 3)."""
     found = cells * precision_m + origin
     # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from .table import Column
 
@@ -36,7 +37,7 @@ def held_type(column: Column) -> np.dtype[Any]:
     return np.dtype(_HELD.get(np.dtype(column.dtype).str[1:], "<f8"))
 
 
-def as_held(column: Column, values: NDArray[Any]) -> NDArray[Any]:
+def as_held(column: Column, values: AnyArray) -> AnyArray:
     """Values of a column in its type in a file; LidarpoolError if one would not be exact."""
     wanted = held_type(column)
     if wanted == np.float64 and values.dtype.kind in "iu" and len(values):

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.arguments import checked_fields
+from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
@@ -63,7 +63,7 @@ class Column:
     dtype: str
     unit: str
     meaning: str
-    source: str | Callable[[Any], NDArray[Any]] = ""
+    source: str | Callable[[Any], AnyArray] = ""
     coordinates: str = ""
     kind: Kind = "number"
     file_name: str = ""
@@ -87,7 +87,7 @@ class Column:
         """Name of the column in files."""
         return self.file_name or self.name
 
-    def make(self, returns: Any) -> NDArray[Any]:
+    def make(self, returns: Any) -> AnyArray:
         """Values of this column for the returns of a batch: (n,), of the column's type.
 
         LidarpoolError if its source gives another number of values, or values that the type cannot

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from ..base.arrays import AnyArray, Floats
 
 WAVEFORM = "waveform"  # name of the column in parts; in files of clouds it has no place but in LAS
 ZERO = 2048  # that a digitised sample of 0 has, since noise goes below
@@ -42,7 +43,7 @@ def column_type(samples: int) -> str:
     return f"V{record(samples).itemsize}"
 
 
-def records(column: NDArray[Any]) -> NDArray[np.void]:
+def records(column: AnyArray) -> NDArray[np.void]:
     """Return a column (n,) as records, see `record`."""
     return column.view(record((column.dtype.itemsize - _REST) // 2))
 
@@ -62,12 +63,12 @@ class Waveforms:
         When the return came back, (n,): at half of the speed of light its range.
     """
 
-    samples: NDArray[np.float64]
-    times_ns: NDArray[np.float64]
-    location_ns: NDArray[np.float64]
+    samples: Floats
+    times_ns: Floats
+    location_ns: Floats
 
     @classmethod
-    def of(cls, column: NDArray[Any]) -> Waveforms:
+    def of(cls, column: AnyArray) -> Waveforms:
         """Read a column of records."""
         rows = records(column)
         heights = rows["samples"].astype(np.float64) - ZERO

@@ -6,11 +6,11 @@ import re
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Ints
 from ..columns.cloud import Cloud
 from ..sensor.trajectory import matrices
-from .sweeps import Floats, Sweeps
+from .sweeps import Sweeps
 
 
 @dataclass(frozen=True, eq=False)
@@ -24,8 +24,8 @@ class Boxes:
     centres: Floats  # (a, 3): metres, world coordinates
     quaternions: Floats  # (a, 4): x, y, z, w of the rotation from the actor's axes to the world's
     sizes: Floats  # (a, 3): length, width and height, metres, along the actor's axes
-    points: NDArray[np.int64]  # (a,): how many points of the sweep are the actor's
-    there: NDArray[np.bool_]  # (a,): whether it is in the scene
+    points: Ints  # (a,): how many points of the sweep are the actor's
+    there: Bools  # (a,): whether it is in the scene
 
     @classmethod
     def of(cls, sweeps: Sweeps, sweep: int, points: Cloud) -> Boxes:

@@ -10,9 +10,9 @@ from itertools import count
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.archives import open_archive
+from ..base.arrays import AnyArray, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor import Sensor
@@ -31,12 +31,12 @@ class Image:
     """Where the points of a sweep are in its image: a row for each channel, firings in order."""
 
     sensor: Sensor
-    firings: NDArray[np.int64]  # (w,): all of the sweep, from the start of the station
-    scan: NDArray[np.int32]  # (w,): of each
+    firings: Ints  # (w,): all of the sweep, from the start of the station
+    scan: Ints32  # (w,): of each
     begin_ns: float  # of the station, since the survey's start
-    plane: NDArray[np.int64]  # (n,): which return of its pulse a point is, from 0
-    row: NDArray[np.int64]  # (n,): channel
-    column: NDArray[np.int64]  # (n,): firing
+    plane: Ints  # (n,): which return of its pulse a point is, from 0
+    row: Ints  # (n,): channel
+    column: Ints  # (n,): firing
     planes: int
 
     @classmethod
@@ -64,7 +64,7 @@ class Image:
         begin_ns = round(sweeps.begins_ns[sweep] - since)
         return cls(sensor, firings, of_scan, begin_ns, plane, row, column, planes)
 
-    def filled(self, values: NDArray[Any]) -> NDArray[Any]:
+    def filled(self, values: AnyArray) -> AnyArray:
         """Return values (n,) of the points as images (planes, channels, firings).
 
         Rays without a return have NaN, whole numbers -1, or 0 if their type has no sign.
@@ -74,7 +74,7 @@ class Image:
         out[self.plane, self.row, self.column] = values
         return out
 
-    def of_rays(self) -> dict[str, NDArray[Any]]:
+    def of_rays(self) -> dict[str, AnyArray]:
         """Return times and nominal angles of all rays, and the scan of each firing.
 
         Arrays of rays are (channels, firings). Times are nanoseconds since the survey's start,
@@ -153,7 +153,7 @@ class Reader(reading.Reader):
         further = {_key(name, plane) for name in images for plane in range(1, planes)}
         there = ~np.isnan(np.stack([images[_key("range", plane)] for plane in range(planes)]))
 
-        def of_points(name: str) -> NDArray[Any]:
+        def of_points(name: str) -> AnyArray:
             made = [images.get(_key(name, plane), images[name]) for plane in range(planes)]
             return np.stack(made).T[there.T]
 

@@ -7,13 +7,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
 from . import pieces, reading
 from .boxes import Boxes, type_of
 from .pieces import Data, Entry, as_data
-from .sweeps import Floats, Sweeps, plain_names
+from .sweeps import Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.

@@ -18,8 +18,8 @@ import laspy
 import lazrs
 import numpy as np
 from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Bytes
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..columns.cloud import Cloud, CloudLike
@@ -216,7 +216,7 @@ def _name(name: str) -> str:
     return "energy" if name == "intensity" else name[:32]
 
 
-def _at_most(values: NDArray[Any], most: int) -> NDArray[np.uint8]:
+def _at_most(values: AnyArray, most: int) -> Bytes:
     return np.minimum(values, most).astype(np.uint8)
 
 

@@ -22,6 +22,7 @@ from pydantic import Field
 
 from ..base.archives import open_archive
 from ..base.arguments import checked
+from ..base.arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.words import did_you_mean
@@ -32,7 +33,7 @@ from .formats import Format
 from .jobs import JobRow, Value, read_table
 from .pieces import Entry
 from .reading import Reader
-from .sweeps import SWEEPS_FILE, Floats, Sweeps
+from .sweeps import SWEEPS_FILE, Sweeps
 from .table import FORMATS
 
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
@@ -47,11 +48,11 @@ class SweepBoxes:
 
     names: tuple[str, ...]
     types: tuple[str, ...]  # "Car" of "Car 1"
-    objects: NDArray[np.int32]  # (k,): their numbers in the column `object`
+    objects: Ints32  # (k,): their numbers in the column `object`
     centres: Floats  # (k, 3): metres, in the sensor's axes
     quaternions: Floats  # (k, 4): x, y, z, w of the rotation from the box's axes to the sensor's
     sizes: Floats  # (k, 3): length, width and height, metres
-    points: NDArray[np.int64]  # (k,): how many points of the sweep are the actor's
+    points: Ints  # (k,): how many points of the sweep are the actor's
 
     def __len__(self) -> int:
         return len(self.names)
@@ -79,8 +80,8 @@ class Sweep:
     sensor: str  # name; "" where there is only one
     number: int  # among the sweeps of its sensor in the job, from 0
     time_ns: int  # its start, nanoseconds since the start of the survey
-    points: NDArray[np.float32]  # (n, 3): metres, in the sensor's axes
-    columns: Mapping[str, NDArray[Any]]  # {name: (n,)}: what the format holds beside
+    points: Floats32  # (n, 3): metres, in the sensor's axes
+    columns: Mapping[str, AnyArray]  # {name: (n,)}: what the format holds beside
     pose: Floats  # (4, 4): from the sensor's axes to the world's
     boxes: SweepBoxes
     object_names: tuple[str, ...]  # what the column `object` counts
@@ -93,7 +94,7 @@ class Sweep:
         return f"<Sweep {self.number}{sensor} in job {self.job}: {len(self):,} points>"
 
     @property
-    def intensity(self) -> NDArray[np.float32] | None:
+    def intensity(self) -> Floats32 | None:
         """float32 (n,): energy received, see the column; None if the data set lacks it."""
         return self.columns.get("intensity")
 
@@ -103,7 +104,7 @@ class Sweep:
         return self.columns.get("class")
 
     @property
-    def objects(self) -> NDArray[np.int32] | None:
+    def objects(self) -> Ints32 | None:
         """int32 (n,): instances, indices into `object_names`; None if the data set lacks them."""
         return self.columns.get("object")
 
@@ -217,7 +218,7 @@ class _OpenJob:
         self.place, self.job = place, job
         name = job_file(format, job.name, SWEEPS_FILE)
         self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
-        self.boxes: dict[str, NDArray[Any]] = {}
+        self.boxes: dict[str, AnyArray] = {}
         if self.sweeps.actors:
             name = job_file(format, job.name, BOXES_FILE)
             with open_archive(place.path(name), partial(place.read, name)) as arrays:

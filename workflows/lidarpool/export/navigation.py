@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats
 from ..sensor import Survey
 from ..sensor.navigation import fixes, geodetic, imu_samples
 from ..sensor.trajectory import Pose, quaternions_of
@@ -31,8 +31,6 @@ _PLACE = ("time_ns", "x_m", "y_m", "z_m")
 _GEODETIC = ("latitude_deg", "longitude_deg", "height_m")
 
 _ROW_BYTES, _MESSAGE_BYTES = 120, 500  # of a sample, at most: in its file, and in a bag
-
-Real = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -110,7 +108,7 @@ def instrument_bytes(survey: Survey, bags: int) -> int:
     return int(samples * (_ROW_BYTES + bags * _MESSAGE_BYTES))
 
 
-def write_instruments(folder: Path, survey: Survey, origin: Real) -> None:
+def write_instruments(folder: Path, survey: Survey, origin: Floats) -> None:
     """Write the files of a survey's instruments, so many samples at a time.
 
     `origin` is that of the scene, (3,). OSError if one cannot be written.
@@ -130,7 +128,7 @@ def _imu_lines(survey: Survey) -> Iterator[str]:
         yield "".join(form % row for row in rows)
 
 
-def _gnss_lines(survey: Survey, origin: Real) -> Iterator[str]:
+def _gnss_lines(survey: Survey, origin: Floats) -> Iterator[str]:
     to_geodetic = _to_geodetic(survey)
     yield ",".join(_PLACE if to_geodetic is None else (*_PLACE, *_GEODETIC)) + "\n"
     form = "%d" + ",%.4f" * 3
@@ -142,7 +140,7 @@ def _gnss_lines(survey: Survey, origin: Real) -> Iterator[str]:
         yield "".join(form % row for row in rows)
 
 
-def _to_geodetic(survey: Survey) -> Callable[[Real], Real] | None:
+def _to_geodetic(survey: Survey) -> Callable[[Floats], Floats] | None:
     """Return what makes latitudes, longitudes and heights of world coordinates, if they are known.
 
     Heights are taken for ellipsoidal ones.
@@ -156,7 +154,7 @@ def _to_geodetic(survey: Survey) -> Callable[[Real], Real] | None:
     transform = import_module("rasterio.warp").transform
     system = f"EPSG:{survey.epsg}"
 
-    def by_code(places: Real) -> Real:
+    def by_code(places: Floats) -> Floats:
         x, y, z = places.T
         longitude, latitude = transform(system, "EPSG:4326", x.tolist(), y.tolist())
         return np.column_stack([latitude, longitude, z])

@@ -11,9 +11,9 @@ from hashlib import md5
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from ..base.arrays import Bools, Ints
 from ..base.fingerprint import fingerprint
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
@@ -108,16 +108,14 @@ class Reader(reading.Reader):
         return np.ascontiguousarray(rows[:, :3]), columns
 
 
-def _samples(sweeps: Sweeps) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:
     """Sample of each sweep, and whether the sweep is its sensor's first in that."""
     begins = sweeps.begins_ns[sweeps.sensor == 0]
     sample = np.clip(np.searchsorted(begins, sweeps.begins_ns, "right") - 1, 0, None)
     return sample, np.diff(sample, prepend=-1).astype(bool) | (sweeps.numbers == 0)
 
 
-def _files(
-    sweeps: Sweeps, channels: Sequence[str], first: NDArray[np.bool_], entry: Entry | None
-) -> list[str]:
+def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry | None) -> list[str]:
     """Names of the files of all sweeps."""
     below = "" if entry is None else f"{entry.name}/"
     return [

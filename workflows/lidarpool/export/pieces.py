@@ -11,8 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from numpy.typing import NDArray
-
+from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
@@ -153,7 +152,7 @@ def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None
     return pieces
 
 
-def as_data(array: NDArray[Any]) -> Data:
+def as_data(array: AnyArray) -> Data:
     """Return the bytes of an array, without a copy of them."""
     return array.data.cast("B") if array.size else b""
 

@@ -10,15 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Floats32
 from ..base.storage import Storage
 from ..columns.cloud import Cloud
 from .pieces import Entry
 from .sweeps import Sweeps
 
 # Points, float32 (n, 3), metres in the sensor's axes, and {column: (n,)}, as the format holds them.
-Points = tuple[NDArray[np.float32], dict[str, NDArray[Any]]]
+Points = tuple[Floats32, dict[str, AnyArray]]
 
 
 class Reader:
@@ -52,7 +52,7 @@ class Reader:
         self.place.get(name, path)
         return path
 
-    def rows(self, name: str, row: np.dtype[Any]) -> NDArray[Any]:
+    def rows(self, name: str, row: np.dtype[Any]) -> AnyArray:
         """Read a file of rows; ValueError if it ends within one."""
         data = self.place.read(name)
         if len(data) % row.itemsize:

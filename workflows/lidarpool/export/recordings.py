@@ -16,9 +16,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import check_fits
+from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..base.errors import LidarpoolError, prefixed
 from ..base.fingerprint import fingerprint
 from ..base.words import did_you_mean, printable
@@ -29,7 +29,7 @@ from ..scene.polygon_files import read_ply_columns
 from ..sensor.trajectory import matrices
 from .dataset import INDEX_FILE
 from .loader import sweeps
-from .sweeps import SWEEPS_FILE, Floats, Sweeps
+from .sweeps import SWEEPS_FILE, Sweeps
 
 KINDS = (
     "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, or a "
@@ -41,9 +41,9 @@ _LIGHTS = ("intensity", "reflectivity", "i")
 _POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 _RECORD = 54  # least bytes of a variable-length record of .las
 
-Columns = Mapping[str, NDArray[Any]]
+Columns = Mapping[str, AnyArray]
 # Positions (n, 3), columns, and the pose of their axes in the world (3, 4); None if unknown.
-Read = tuple[NDArray[Any], Columns, Floats | None]
+Read = tuple[AnyArray, Columns, Floats | None]
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,14 +51,14 @@ class Turn:
     """Points of a sweep, or of a part of a cloud."""
 
     points: Floats  # (n, 3): metres
-    rings: NDArray[np.int64] | None = None  # (n,)
+    rings: Ints | None = None  # (n,)
     light: Floats | None = None  # (n,): intensities, of any scale
-    rays: NDArray[np.int64] | None = None  # (n,): which ray and return; not of parts
+    rays: Ints | None = None  # (n,): which ray and return; not of parts
 
     def __len__(self) -> int:
         return len(self.points)
 
-    def part(self, rows: NDArray[np.intp]) -> Turn:
+    def part(self, rows: Indices) -> Turn:
         """Select points."""
         return Turn(
             self.points[rows],
@@ -208,14 +208,14 @@ def _of_cloud(
     return Recording(name, len(numbers), sweep, light, times=lambda: times, **more)
 
 
-def _rays(columns: Columns) -> NDArray[np.int64]:
+def _rays(columns: Columns) -> Ints:
     """Return numbers (n,) that differ for all rays of a sweep, and for the returns of each."""
     if "time" in columns:
         rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
     else:
         rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
     _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
-    order: NDArray[np.int64] = np.arange(len(rays)) - first[ray]  # returns of a ray are together
+    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are together
     return rays << 8 | columns.get("return_number", order)
 
 

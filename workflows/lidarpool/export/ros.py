@@ -24,6 +24,7 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
+from ..base.arrays import AnyArray, Floats32
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
@@ -229,7 +230,7 @@ class Reader(reading.Reader):
         super().close()
 
 
-def columns_of(data: bytes) -> dict[str, NDArray[Any]]:
+def columns_of(data: bytes) -> dict[str, AnyArray]:
     """Take the fields of a PointCloud2, {name: (n,)}; ValueError if its lengths disagree."""
     message: Any = _types().deserialize_cdr(data, "sensor_msgs/msg/PointCloud2")
     kinds = {number: kind for kind, number in _KINDS.items()}
@@ -420,7 +421,7 @@ class _Messages:
                 message = stamped(self.header(WORLD, time_ns), point(float(x), float(y), float(z)))
                 yield "/gnss/position", message, time_ns
 
-    def image(self, values: NDArray[np.float32], frame: str, time_ns: int) -> Any:
+    def image(self, values: Floats32, frame: str, time_ns: int) -> Any:
         """Image of numbers (height, width)."""
         height, width = values.shape
         data = np.ascontiguousarray(values, "<f4").view(np.uint8).ravel()

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.archives import open_archive
+from ..base.arrays import Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
@@ -25,7 +26,6 @@ from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
 from .navigation import Instruments
 
-Floats = NDArray[np.float64]
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
     "The points are not in the order of their scans, or of another survey than the sweeps "
@@ -58,17 +58,17 @@ class Fired:
 
     sensors: tuple[Sensor, ...]
     returns: tuple[int, ...]  # that each sensor reports of a pulse at most; 1 if that is unknown
-    steps: NDArray[np.int64]  # (n,): first time step of each sweep, from that of its station
+    steps: Ints  # (n,): first time step of each sweep, from that of its station
 
 
 @dataclass(frozen=True, eq=False)
 class Sweeps:
     """All sweeps of a survey. A sweep is the scans of one turn, or of one frame, of a sensor."""
 
-    scans: NDArray[np.int64]  # (n + 1,): the first of each sweep, and one past the last of all
+    scans: Ints  # (n + 1,): the first of each sweep, and one past the last of all
     begins_ns: Floats  # (n,): nanoseconds since the survey's start
     ends_ns: Floats  # (n,): when the last firing of each begins
-    sensor: NDArray[np.uint8]  # (n,): its number
+    sensor: Bytes  # (n,): its number
     pose: Placed  # of the sensors
     mounts: Placed  # of each sensor in the carrier's axes
     sensors: tuple[str, ...]  # names
@@ -76,7 +76,7 @@ class Sweeps:
     actors: tuple[str, ...]  # they follow the objects in the column `object`
     actor_poses: tuple[Placed, ...]  # of each actor (2n,): at starts of sweeps, then at their ends
     actor_bounds: Floats  # (a, 2, 3): corners of each actor's box in its own axes, metres
-    actor_there: NDArray[np.bool_]  # (a, n): whether each actor is in the scene
+    actor_there: Bools  # (a, n): whether each actor is in the scene
     coordinates: str  # of the cloud's points, "world" or "sensor"
     precision_m: float  # step to which positions were rounded
     epsg: int | None = None  # code of the coordinate system of the world
@@ -101,7 +101,7 @@ class Sweeps:
         return _placed(self.pose.positions - levers, turns)
 
     @cached_property
-    def numbers(self) -> NDArray[np.int64]:
+    def numbers(self) -> Ints:
         """int64 (n,): number of each sweep among those of its sensor, from 0."""
         return np.arange(len(self)) - np.searchsorted(self.sensor, self.sensor)
 
@@ -281,7 +281,7 @@ def plain_names(names: Iterable[str]) -> list[str]:
     return out
 
 
-def _of_head(sensor: Sensor, steps: int) -> tuple[NDArray[np.int64], Floats, Floats]:
+def _of_head(sensor: Sensor, steps: int) -> tuple[Ints, Floats, Floats]:
     """First time step of each of so many sweeps, their starts and ends since the station's."""
     firsts = np.flatnonzero(np.diff(sensor.turns(np.arange(steps)), prepend=-1))
     lasts = np.append(firsts[1:], steps) - 1

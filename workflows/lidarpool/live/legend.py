@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bytes, Floats
 from ..render.colouring import TURBO, Colouring
 
 MOST_LABELS = 1000  # in a legend
@@ -36,13 +36,11 @@ def legend_of(colouring: Colouring) -> Legend:
     return scale_legend(title, marks, colouring.scale[::15])
 
 
-def scale_legend(
-    title: str, marks: Sequence[str], colours: NDArray[np.float64] = TURBO[::15]
-) -> Legend:
+def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
     """Legend of a scale of colours (n, 3), with evenly spread marks."""
     return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
 
 
-def as_bytes(colours: NDArray[np.float64]) -> NDArray[np.uint8]:
+def as_bytes(colours: Floats) -> Bytes:
     """Colours of 0 to 1 as bytes."""
     return np.round(255 * colours).astype(np.uint8)

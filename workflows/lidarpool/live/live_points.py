@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from contextlib import suppress
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.parts import read_part
@@ -81,7 +81,7 @@ class LivePoints:
             self.cloud = result.points.sample(self._most, PARTS_NOTED)
             self.version += 1
 
-    def hit_counts(self) -> NDArray[np.float64]:
+    def hit_counts(self) -> Floats:
         """Hits by counters of the scene, scaled up to all hits if some parts were not read."""
         with self._lock:
             return np.asarray(self._counts * (self._store.db.hits / max(self.hits, 1)))

@@ -5,18 +5,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Bools, Floats, Ints
 from ..base.choice import one_of_each_part
 from ..columns.cloud import Cloud
 from ..columns.ply_format import AXES
 from ..columns.table import Column
 
-Floats = NDArray[np.floating]
-Rows = NDArray[np.int64]
+AnyFloats = NDArray[np.floating]
 Scans = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK = 1 << 15  # rows that are read at a time
@@ -35,7 +35,7 @@ class Points(Protocol):
 
     def __len__(self) -> int: ...
 
-    def values(self, name: str, rows: Rows | slice) -> NDArray[Any]:
+    def values(self, name: str, rows: Ints | slice) -> AnyArray:
         """Values of a column, or of x, y or z in world coordinates, in some rows."""
 
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
@@ -51,7 +51,7 @@ class HeldPoints:
     def __len__(self) -> int:
         return len(self._cloud)
 
-    def values(self, name: str, rows: Rows | slice) -> NDArray[Any]:
+    def values(self, name: str, rows: Ints | slice) -> AnyArray:
         """Values of a column, or of x, y or z in world coordinates, in some rows."""
         if name in AXES:
             return np.asarray(self._cloud.positions[rows, AXES.index(name)])
@@ -90,7 +90,7 @@ class Filter:
                 found.append((name, float(low), float(high)))
         return cls(tuple(found))
 
-    def keeps(self, points: Points, rows: Rows | slice) -> NDArray[np.bool_]:
+    def keeps(self, points: Points, rows: Ints | slice) -> Bools:
         """Whether some points, (n,), are within all limits."""
         x, y, z = (points.values(axis, rows) for axis in AXES)
         kept = np.asarray(np.isfinite(x + y + z))
@@ -112,32 +112,32 @@ class Eye:
         numbers = np.array([float(number) for number in text.split(",")]).reshape(4, 4).T
         return cls(tuple(map(tuple, numbers.tolist())))
 
-    def seen(self, places: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    def seen(self, places: AnyFloats) -> tuple[AnyFloats, Bools]:
         """Project points (n, 3) to the picture, (n, 2) in -1 to 1, and whether they are in it."""
         x, y, z, w = self._clip(places)
         inside = (np.abs(x) < w) & (np.abs(y) < w) & (z > -w)
         return np.stack([x, y], axis=1) / np.where(inside, w, 1.0)[:, None], inside
 
-    def _clip(self, places: Floats) -> Floats:
+    def _clip(self, places: AnyFloats) -> AnyFloats:
         """Points (n, 3) in clip coordinates, (4, n)."""
         matrix = np.array(self.matrix)
         return np.asarray(matrix[:, :3] @ places.T + matrix[:, 3:])
 
-    def tiles(self, places: Floats) -> Rows:
+    def tiles(self, places: AnyFloats) -> Ints:
         """Part of the picture of each point (n, 3): (n,); -1 outside."""
         at, inside = self.seen(places)
         across, down = (np.clip(at, -1, 0.9999).T + 1) / 2
         column, row = (across * _ACROSS).astype(np.int64), (down * _DOWN).astype(np.int64)
         return np.where(inside, row * _ACROSS + column, -1)
 
-    def may_see(self, box: Floats) -> bool:
+    def may_see(self, box: AnyFloats) -> bool:
         """Whether a box (2, 3) may be partly in the picture."""
         x, y, z, w = self._clip(np.array(list(itertools.product(*box.T))))
         outside = (x > w, x < -w, y > w, y < -w, z < -w)
         return not any(bool(beyond.all()) for beyond in outside)
 
 
-def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
+def even_shares(counts: AnyArray, most: int) -> Floats:
     """Shares (t,) of the points (t,) of each part of a picture, so that each part shows as many.
 
     A part with fewer points shows all of them; they are `most` in all.
@@ -153,7 +153,7 @@ def even_shares(counts: NDArray[Any], most: int) -> NDArray[np.float64]:
     return np.minimum(each / np.maximum(counts, 1e-9), 1.0)
 
 
-def positions(points: Points, rows: Rows | slice) -> NDArray[np.float64]:
+def positions(points: Points, rows: Ints | slice) -> Floats:
     """Positions of some rows, float64 (n, 3), world coordinates, metres."""
     # Columns one after the other are what the matrix product of a camera reads fastest.
     return np.stack([points.values(axis, rows) for axis in AXES], dtype=np.float64).T
@@ -170,7 +170,7 @@ class PointFinder:
     hundred million points. `origin` is the world position of the local origin, (3,).
     """
 
-    def __init__(self, points: Points, origin: NDArray[np.float64]) -> None:
+    def __init__(self, points: Points, origin: Floats) -> None:
         self.points, self._origin = points, origin
         self._boxes = np.full((-(-len(points) // BLOCK), 2, 3), np.nan)  # NaN for unread blocks
 
@@ -181,7 +181,7 @@ class PointFinder:
         scans: Scans | None = None,
         eye: Eye | None = None,
         abandoned: Callable[[], bool] = lambda: False,
-    ) -> tuple[Rows, int]:
+    ) -> tuple[Ints, int]:
         """Find at most `most` points that pass a filter, in order.
 
         They are evenly spaced in the file, or with an eye over its picture, where all are then.
@@ -220,7 +220,7 @@ class PointFinder:
             return [(0, len(self.points))]
         return sorted(self.points.rows_of(some) for some in scans)
 
-    def _local(self, rows: Rows | slice) -> NDArray[np.float64]:
+    def _local(self, rows: Ints | slice) -> Floats:
         return positions(self.points, rows) - self._origin
 
     def _search(
@@ -229,9 +229,9 @@ class PointFinder:
         most: int,
         wanted: Filter,
         eye: Eye | None,
-        shares: NDArray[np.float64] | None,
+        shares: Floats | None,
         abandoned: Callable[[], bool],
-    ) -> tuple[Rows, int]:
+    ) -> tuple[Ints, int]:
         """Read blocks one after the other; the points that are kept become fewer on the way."""
         random, thin, found, kept = np.random.default_rng(0), 1.0, 0, [np.empty(0, np.int64)]
         for low, high in ranges:
@@ -264,7 +264,7 @@ class PointFinder:
         return eye is None or bool(np.isnan(box[0, 0])) or eye.may_see(box)
 
 
-def _spread(ranges: Sequence[tuple[int, int]], numbers: Rows) -> Rows:
+def _spread(ranges: Sequence[tuple[int, int]], numbers: Ints) -> Ints:
     """Rows of the n-th points of ranges of rows."""
     firsts = np.array([low for low, _ in ranges], np.int64)
     before = np.cumsum([0, *(high - low for low, high in ranges)])[:-1]

@@ -17,10 +17,10 @@ from pathlib import Path
 
 import click
 import numpy as np
-from numpy.typing import NDArray
 
 from poolpart import Partition
 
+from ..base.arrays import Floats, Floats32
 from ..columns.cloud_file import CloudFile
 from ..columns.table import SCAN, TABLE
 from ..export.sweeps import Sweeps
@@ -191,13 +191,13 @@ class LiveRun(Page):
         """Points that were committed."""
         return 0 if self._progress is None else self._progress.points
 
-    def _hits(self) -> NDArray[np.float64]:
+    def _hits(self) -> Floats:
         faces = len(self._drawn.scene.faces)
         if self._points is None:
             return np.zeros(faces)
         return np.asarray(self._drawn.hits(self._points.hit_counts())[:faces])
 
-    def _planned(self) -> NDArray[np.float64] | None:
+    def _planned(self) -> Floats | None:
         """Return the planned path, once all trials have ended."""
         planning, store = self._job.planning, self._store
         if planning is None or store is None or len(store.db.trials) < self._job.trials:
@@ -246,7 +246,7 @@ def view_of(job: Job, title: str) -> tuple[Drawn, View]:
     return drawn, view
 
 
-def _rays_of(frames: list[Frame]) -> NDArray[np.float32]:
+def _rays_of(frames: list[Frame]) -> Floats32:
     """Return some rays (n, 2, 3) of frames, local."""
     starts = [np.full_like(frame.samples, frame.pose.position) for frame in frames]
     ends = np.concatenate([frame.samples for frame in frames])

@@ -28,11 +28,11 @@ from importlib.resources import files
 from typing import Any
 
 import click
-from numpy.typing import NDArray
 from tornado.httpserver import HTTPServer
 from tornado.iostream import StreamClosedError
 from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandler
 
+from ..base.arrays import AnyArray
 from ..base.notebook import cell_display
 from .points import Abandoned
 
@@ -49,7 +49,7 @@ _PIECE = 1 << 20  # bytes that are written at a time
 _LOGGER = logging.getLogger(__name__)
 
 Arguments = Mapping[str, str]
-Answer = tuple[dict[str, Any], dict[str, NDArray[Any]]]  # what is written as JSON, and arrays
+Answer = tuple[dict[str, Any], dict[str, AnyArray]]  # what is written as JSON, and arrays
 
 
 # Answers a question with its arguments: KeyError or ValueError if there is no such question or an
@@ -57,7 +57,7 @@ Answer = tuple[dict[str, Any], dict[str, NDArray[Any]]]  # what is written as JS
 Source = Callable[[str, Arguments, Callable[[], bool]], Answer]
 
 
-def bundle(header: dict[str, Any], arrays: Mapping[str, NDArray[Any]]) -> list[bytes]:
+def bundle(header: dict[str, Any], arrays: Mapping[str, AnyArray]) -> list[bytes]:
     """Write JSON and arrays as one message.
 
     It begins with the length of the JSON text, uint32, which lists the arrays: name, type, shape,

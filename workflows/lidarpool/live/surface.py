@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Floats, Floats32, Ints
 from ..columns.table import OBJECT
 from ..render.colouring import colours_of
 from ..render.hits import hit_colours
@@ -34,12 +32,12 @@ class Surface:
     def __init__(
         self,
         scene: Scene,
-        reflectance: NDArray[np.float64] | None = None,
+        reflectance: Floats | None = None,
         most: int = MOST_TRIANGLES,
     ) -> None:
         self._scene, self._reflectance = scene, reflectance
         self.coarse, self._objects = scene, scene.face_object
-        self._stands: NDArray[np.int64] | None = None  # for each triangle of the scene
+        self._stands: Ints | None = None  # for each triangle of the scene
         if len(scene.faces) > most:
             self.coarse, self._stands = simplified(scene, most)
             self._objects = self.coarse.face_object
@@ -48,8 +46,8 @@ class Surface:
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
 
     def coloured(
-        self, by: str, hit_counts: NDArray[Any], points: NDArray[np.float32]
-    ) -> tuple[dict[str, NDArray[Any]], Legend | None]:
+        self, by: str, hit_counts: AnyArray, points: Floats32
+    ) -> tuple[dict[str, AnyArray], Legend | None]:
         """Corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and their legend.
 
         `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
@@ -57,7 +55,7 @@ class Surface:
         """
         if by == "hits":
             return self._by_hits(hit_counts, points)
-        arrays: dict[str, NDArray[Any]] = {"corners": self.corners, "objects": self._objects}
+        arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend = None
         if by == "object":
             colouring = colours_of(self._objects, OBJECT, self._scene.names)
@@ -74,8 +72,8 @@ class Surface:
         return arrays | {"colours": corners}, legend
 
     def _by_hits(
-        self, hit_counts: NDArray[Any], points: NDArray[np.float32]
-    ) -> tuple[dict[str, NDArray[Any]], Legend | None]:
+        self, hit_counts: AnyArray, points: Floats32
+    ) -> tuple[dict[str, AnyArray], Legend | None]:
         hits = hit_counts.astype(np.float64)
         if self._stands is not None:
             left = self._stands >= 0
@@ -85,13 +83,13 @@ class Surface:
         corners, owner, colours, (low, high) = hit_colours(*shown, hits, points, most)
         middle = (low * high) ** 0.5
         marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
-        arrays: dict[str, NDArray[Any]] = {
+        arrays: dict[str, AnyArray] = {
             "corners": corners, "objects": self._objects[owner], "colours": as_bytes(colours),
         }  # fmt: skip
         return arrays, scale_legend(TITLE, marks) if hits.any() else None
 
 
-def colours_for(scene: Scene, reflectance: NDArray[np.float64] | None) -> tuple[str, ...]:
+def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
     """List the ways to colour a scene, with or without known reflectance, and its own colours."""
     own = ("colour",) if scene.coloured else ()
     more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()

@@ -11,10 +11,10 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import RayCaster
 
+from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
@@ -30,7 +30,6 @@ from .points import Eye, Filter, PointFinder, Points, Scans, positions
 from .server import Answer, Arguments
 from .surface import Surface, colours_for
 
-Floats = NDArray[np.float64]
 Bounds = tuple[Floats, Floats]  # the local origin, (3,), and a box (2, 3) from there
 
 MOST_POINTS = 20_000_000  # in an answer
@@ -57,8 +56,8 @@ class View:
     points: Points
     pictured: Pictured | None = None
     sweeps: Sweeps | None = None
-    hits: Callable[[], NDArray[Any]] | None = None  # returns those of each triangle, (f,)
-    rays: NDArray[np.float32] = field(default_factory=lambda: np.zeros((0, 2, 3), np.float32))
+    hits: Callable[[], AnyArray] | None = None  # returns those of each triangle, (f,)
+    rays: Floats32 = field(default_factory=lambda: np.zeros((0, 2, 3), np.float32))
     note: str = ""  # a remark on what is shown
 
     def __post_init__(self) -> None:
@@ -157,7 +156,7 @@ class View:
         """Tell all but points and surfaces."""
         near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
         box = self._bounds if near is None else near
-        arrays: dict[str, NDArray[Any]] = {"rays": self.rays_shown, "corners": self._corners(near)}
+        arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": self._corners(near)}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
@@ -217,7 +216,7 @@ class View:
         return np.concatenate([*corners, self._ends(self._bounds[0, 2])])
 
     @property
-    def rays_shown(self) -> NDArray[np.float32]:
+    def rays_shown(self) -> Floats32:
         """Not too many rays, (n, 2, 3)."""
         return self.rays[:: len(self.rays) // MOST_RAYS + 1]
 
@@ -245,7 +244,7 @@ class View:
         colours = np.full((len(rows), 4), 255, np.uint8)
         colours[:, :3] = as_bytes(colouring.paint(values))
         legend: Legend = legend_of(colouring) | {"column": name, "meaning": column.meaning}
-        arrays: dict[str, NDArray[Any]] = {
+        arrays: dict[str, AnyArray] = {
             "positions": (positions(finder.points, rows) - self.origin).astype(np.float32),
             "colours": colours,
             "rows": rows.astype(np.uint32),
@@ -265,7 +264,7 @@ class View:
             known[name, wanted] = colours_of(values, column, self._names(name))
         return known[name, wanted]
 
-    def _sample(self, name: str) -> NDArray[Any]:
+    def _sample(self, name: str) -> AnyArray:
         """Finite values of a column in an evenly spaced sample of the points."""
         values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
         return values[np.isfinite(values)]
@@ -338,7 +337,7 @@ class View:
         floor, cut = floor_and_cut(scene, caster, np.concatenate(poses))
         return {"floor": floor, "roof_cut": cut}
 
-    def _on_statics(self) -> NDArray[np.float32]:
+    def _on_statics(self) -> Floats32:
         """Positions (n, 3) of some points on static objects, local."""
         rows, _ = self._finder.find(_HITS_SAMPLE)
         if self.pictured is not None and "object" in self.columns:
@@ -371,8 +370,8 @@ class View:
 
 
 def range_image(
-    places: Floats, ranges: Floats, channels: NDArray[np.int64] | None, limits: tuple[float, float]
-) -> NDArray[np.uint8]:
+    places: Floats, ranges: Floats, channels: Ints | None, limits: tuple[float, float]
+) -> Bytes:
     """Range image of points in their sensor's axes, RGBA (rows, columns, 4), the nearest ahead.
 
     Rows are channels, the highest above, or steps of elevation if the sensor has few or very
@@ -421,9 +420,7 @@ def _corners_of(box: Floats) -> Floats:
     return np.array(list(itertools.product(*box.T)))
 
 
-def _actor_arrays(
-    name: str, actor: Actor, duration_ns: float, count: int
-) -> dict[str, NDArray[Any]]:
+def _actor_arrays(name: str, actor: Actor, duration_ns: float, count: int) -> dict[str, AnyArray]:
     """Poses of an actor over time."""
     times, places, turns = actor.samples(duration_ns, count)
     return {

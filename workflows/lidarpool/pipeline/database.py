@@ -19,8 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Ints
 from ..base.errors import LidarpoolError
 from ..columns.parts import part_name
 from ..plan import Trial
@@ -121,7 +121,7 @@ class RunDatabase:
         return [self.parts[first] for first in self._firsts]
 
     @property
-    def cells(self) -> NDArray[np.int64] | None:
+    def cells(self) -> Ints | None:
         """Lowest and highest cell of all points, (2, 3); None without points."""
         found = [part.cells for part in self.parts.values() if part.cells]
         if not found:

@@ -9,10 +9,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass, field
 
 import numpy as np
-from numpy.typing import NDArray
 
 from poolpart import TaskRecord
 
+from ..base.arrays import Floats32
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..sensor import Pose
@@ -156,7 +156,7 @@ class Frame:
     rays: int
     hits: int
     count: int
-    samples: NDArray[np.float32]
+    samples: Floats32
     _read: Callable[[int], Cloud] = field(repr=False, compare=False)
 
     def points(self) -> Cloud:

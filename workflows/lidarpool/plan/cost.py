@@ -12,11 +12,10 @@ import itertools
 from typing import TypeAlias
 
 import numpy as np
-from numpy.typing import NDArray
 
-from .geometry import Floats
+from ..base.arrays import Floats, Floats32
 
-Singles: TypeAlias = NDArray[np.float32]
+Singles: TypeAlias = Floats32
 
 # Discs are made larger by this share of their distance and size: some 30 rounding errors of
 # single precision, so that a path which passes here also passes the exact check.

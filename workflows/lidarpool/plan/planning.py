@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arguments import checked_fields
+from ..base.arrays import Floats
 from ..base.declared import Seed, told
 from ..base.errors import LidarpoolError
-from .geometry import Floats, segment_distances
+from .geometry import segment_distances
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

@@ -13,15 +13,12 @@ from pydantic import Field
 from raybeam import RayCaster
 
 from ..base.arguments import checked
+from ..base.arrays import Bools, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..scene.drawn import Drawn
 from ..scene.floor import SLAB_M
 from ..scene.scene import Scene
 from ..sensor import Sensor, Spin
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 STATIONS_MOST = 100
 LEAST_GAIN = 0.01  # of what can be seen, that each adds if no number and no coverage is given

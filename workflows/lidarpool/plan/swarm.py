@@ -6,10 +6,9 @@ import itertools
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats, Floats32
 from .cost import PathCost, Singles
-from .geometry import Floats
 
 _GROUPS = 5
 _LEAST_GROUP = 20  # particles
@@ -32,12 +31,12 @@ class Randoms:
     def __init__(self, seed: int) -> None:
         self._bits = np.random.SFC64(seed)
 
-    def uniform(self, count: int) -> NDArray[np.float32]:
+    def uniform(self, count: int) -> Floats32:
         """Numbers uniform in [0, 1), multiples of 2**-24: (count,)."""
         high = self._bits.random_raw(count) >> np.uint64(40)
         return high.astype(np.float32) * np.float32(2**-24)
 
-    def normal(self, count: int) -> NDArray[np.float32]:
+    def normal(self, count: int) -> Floats32:
         """Numbers of mean 0 and variance 1, nearly normal: (count,).
 
         Each is the sum of four uniform ones (Irwin-Hall), the four quarters of a raw number,
@@ -136,7 +135,7 @@ def _group_count(particles: int) -> int:
     )
 
 
-def _spreads(groups: int, widest: float) -> NDArray[np.float64]:
+def _spreads(groups: int, widest: float) -> Floats:
     """Return each group's initial spread about the straight line: (groups,)."""
     widest = max(_LEAST_WIDEST, widest)
     if groups == 1:

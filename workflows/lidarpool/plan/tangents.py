@@ -14,9 +14,10 @@ from collections import defaultdict
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from .geometry import Floats, PathAxes, segment_distances
+from ..base.arrays import Floats, Indices
+from .geometry import PathAxes, segment_distances
 
 # A tangent this close to a disc, as a share of the scene's size, passes it. Three discs with one
 # common tangent are usual in constructed scenes, and rounding must not close the path.
@@ -29,7 +30,7 @@ Graph = dict[int, list[tuple[int, float]]]  # {node: [(neighbour, length of the 
 class _Tangents(NamedTuple):
     """Common tangents; tangent t touches circle `circles[t, 0]` at `contacts[t, 0]`, and so on."""
 
-    circles: NDArray[np.intp]  # (t, 2)
+    circles: Indices  # (t, 2)
     contacts: Floats  # (t, 2, 2)
 
 

@@ -8,9 +8,10 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from .cost import PathCost
-from .geometry import Floats, PathAxes, clearance, path_length, segment_distances
+from .geometry import PathAxes, clearance, path_length, segment_distances
 from .planning import Planning
 from .swarm import Randoms, Swarm
 from .tangents import shortest_path_length

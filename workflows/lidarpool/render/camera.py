@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-Floats = NDArray[np.float64]
+from ..base.arrays import AnyArray, Floats
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Camera:
         pixels = np.stack([side / ahead, -up / ahead], axis=1) * self.focal + self.centre
         return pixels, np.sqrt(np.einsum("ij,ij->i", offset, offset))
 
-    def look_up(self, image: NDArray[Any], pixels: ArrayLike, outside: float) -> NDArray[Any]:
+    def look_up(self, image: AnyArray, pixels: ArrayLike, outside: float) -> AnyArray:
         """Values (n,) of an image at pixel coordinates (n, 2); `outside` beside it, or for NaN."""
         place = np.asarray(pixels)
         inside = np.all((place >= 0) & (place < np.array(self.size)), axis=1)

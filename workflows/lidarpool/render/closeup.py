@@ -6,16 +6,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import RayCaster
 
+from ..base.arrays import Floats, Ints
 from ..scene.mesh import triangle_areas
 from ..scene.scene import Scene
 from .surface import spiral
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
 # lowest point, and least metres.

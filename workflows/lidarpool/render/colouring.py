@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Floats
 from ..columns.table import COLOURS, NO_SURFACE, OBJECT, Column
 from ..scene.colours import packed, unpacked
 from .theme import mapped, object_colours
@@ -32,16 +31,16 @@ class Colouring:
     """How points are coloured, and a legend: a scale between two limits, or labels."""
 
     # Returns colours (n, 3) in 0 to 1 of values (n,).
-    paint: Callable[[NDArray[Any]], NDArray[np.float64]]
+    paint: Callable[[AnyArray], Floats]
     name: str  # of the column
     unit: str  # of the limits
     meaning: str
     limits: tuple[float, float] | None = None  # ends of the scale; None for labels
     logarithmic: bool = False
     # Name and colour of existing labels, those with most points first if there are many.
-    labels: tuple[tuple[str, NDArray[np.float64]], ...] = ()
+    labels: tuple[tuple[str, Floats], ...] = ()
     values: tuple[int, ...] = ()  # of the column, that the labels stand for
-    scale: NDArray[np.float64] = field(default_factory=lambda: TURBO)  # (256, 3)
+    scale: Floats = field(default_factory=lambda: TURBO)  # (256, 3)
 
 
 def with_rgb(columns: Mapping[str, Column]) -> dict[str, Column]:
@@ -50,7 +49,7 @@ def with_rgb(columns: Mapping[str, Column]) -> dict[str, Column]:
     return {**columns, **({RGB.name: RGB} if made else {})}
 
 
-def values_of(column: Column, read: Callable[[str], NDArray[Any]]) -> NDArray[Any]:
+def values_of(column: Column, read: Callable[[str], AnyArray]) -> AnyArray:
     """Values of a column, by a function that reads those of a name; of `RGB` packed colours."""
     if column is RGB:
         return packed(np.stack([read(name) for name in COLOURS], axis=1))
@@ -64,7 +63,7 @@ def word_of(value: int, column: Column, names: Sequence[str] = ()) -> str:
     return NO_SURFACE if value < 0 and column.name == OBJECT.name else f"{column.name} {value}"
 
 
-def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) -> Colouring:
+def colours_of(values: AnyArray, column: Column, names: Sequence[str] = ()) -> Colouring:
     """Choose colours for the values (n,) of a column; `names` are those of its values 0, 1, 2, ….
 
     Labels have a colour each; labels without names and with too many values for a legend are on a
@@ -85,7 +84,7 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
                 found = found[np.argsort(-counts, kind="stable")]
             palette, none = np.vstack([palette, [_GREY] * 3]), len(palette)
 
-            def label(values: NDArray[Any]) -> NDArray[np.float64]:
+            def label(values: AnyArray) -> Floats:
                 numbers = values.astype(np.int64)
                 surface = (numbers >= 0) | (column.name != OBJECT.name)
                 return np.asarray(palette[np.where(surface, numbers % none, none)])
@@ -113,7 +112,7 @@ def colours_of(values: NDArray[Any], column: Column, names: Sequence[str] = ()) 
     logarithmic = bool(low > 0 and (skewed or (not unit and high > _MANIFOLD * low)))
     ends = np.log([low, high]) if logarithmic else (low, high)
 
-    def shade(values: NDArray[Any]) -> NDArray[np.float64]:
+    def shade(values: AnyArray) -> Floats:
         known, numbers = np.isfinite(values), values.astype(np.float64) / size
         if logarithmic:
             numbers = np.log(np.clip(numbers, low, high))

@@ -5,13 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Ints
 from .surface import Surface, dot
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 MOST_SENSORS = 8  # sensors that are tested for what they see
 MAX_LAYERS = 12  # walls have two faces, roofs have beams; more surfaces are not a wall

@@ -4,18 +4,14 @@ from __future__ import annotations
 
 import itertools
 import math
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
 from ..scene.mesh import triangle_areas
 from ..scene.scene import Scene
 from .colouring import TURBO
 from .theme import UNSEEN, rgb
-
-Floats = NDArray[np.float64]
-Reals = NDArray[np.float32]
 
 _LEVELS = 24  # of a grid whose cells are half as wide each time
 _ENOUGH = 12  # hits from which a density is estimated; points in a cell of the grid
@@ -24,8 +20,8 @@ _WIDEST_RANGE = 300.0  # densest to sparsest colour
 
 
 def hit_colours(
-    scene: Scene, corners: Reals, hits: Floats, points: Reals, most: int
-) -> tuple[Reals, NDArray[np.int64], Floats, tuple[float, float]]:
+    scene: Scene, corners: Floats32, hits: Floats, points: Floats32, most: int
+) -> tuple[Floats32, Ints, Floats, tuple[float, float]]:
     """Colour triangles by hits per square metre, large ones with many hits in pieces.
 
     Large triangles have the density of a grid of points, the finest with enough of them around;
@@ -71,7 +67,7 @@ def hit_colours(
     return pieces, owner, colours, limits
 
 
-def hit_density(scene: Scene, hit_counts: NDArray[Any]) -> Floats:
+def hit_density(scene: Scene, hit_counts: AnyArray) -> Floats:
     """Hits per square metre at each triangle, (f,), from the hits of each, (f,).
 
     If triangles are so small that most have one hit or none, hits are shared with neighbours:
@@ -96,7 +92,7 @@ def _rounds(hits: Floats) -> int:
     return min(_MOST_ROUNDS, math.floor(_ENOUGH / typical / 2))
 
 
-def _share(faces: NDArray[np.int32], hits: Floats, area: Floats, vertices: int) -> Floats:
+def _share(faces: Ints32, hits: Floats, area: Floats, vertices: int) -> Floats:
     """Spread hits (f,) over the triangles that share a corner, in proportion to area (f,)."""
     given, room = np.zeros(vertices), np.zeros(vertices)
     for corner in faces.T:
@@ -123,9 +119,7 @@ def _density_range(density: Floats, areas: Floats) -> tuple[float, float]:
     return float(low), float(max(high, 2 * low))
 
 
-def _density_colours(
-    density: Floats, hit: NDArray[np.bool_], limits: tuple[float, float]
-) -> Floats:
+def _density_colours(density: Floats, hit: Bools, limits: tuple[float, float]) -> Floats:
     """Colours (..., 3) by density and whether there were hits, both (...,).
 
     Shared hits fade out to grey; triangles that were hit themselves are never grey.
@@ -138,8 +132,8 @@ def _density_colours(
 
 
 def _divided(
-    pieces: Reals, hit: NDArray[np.bool_], points: Reals, most: int
-) -> tuple[Reals, NDArray[np.int64], Floats, Floats]:
+    pieces: Floats32, hit: Bools, points: Floats32, most: int
+) -> tuple[Floats32, Ints, Floats, Floats]:
     """Divide triangles that were hit (f,), for as long as there are points enough around.
 
     Returns pieces, owners and areas, and points per square metre, NaN for whole triangles.
@@ -181,13 +175,13 @@ def _divided(
 class _Grid:
     """Sums of weights (n,) of places (n, 3) in the cells of a grid."""
 
-    def __init__(self, places: Reals, weights: Floats, width: float, low: Reals) -> None:
+    def __init__(self, places: Floats32, weights: Floats, width: float, low: Floats32) -> None:
         self._width, self._low = width, low
         cells = np.floor((places - low) / width).astype(np.int64)
         self._keys, cells = np.unique(_keys(cells), return_inverse=True)
         self._sums = np.bincount(cells, weights)
 
-    def around(self, places: NDArray[np.float32]) -> Floats:
+    def around(self, places: Floats32) -> Floats:
         """Sum (n,) at each place, interpolated between the eight cells that are nearest to it."""
         at, total = (places - self._low) / self._width - 0.5, np.zeros(len(places))
         cells = np.floor(at).astype(np.int64)
@@ -200,18 +194,18 @@ class _Grid:
         return total
 
 
-def _keys(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+def _keys(cells: Ints) -> Ints:
     cells = cells + 1  # the neighbours of the lowest are not negative
     return (cells[:, 0] << 42) | (cells[:, 1] << 21) | cells[:, 2]
 
 
-def _longest(pieces: NDArray[np.float32]) -> tuple[NDArray[np.intp], NDArray[np.float32]]:
+def _longest(pieces: Floats32) -> tuple[Indices, Floats32]:
     """Return the longest edge of each piece, (k,), and its length."""
     lengths = np.linalg.norm(pieces - np.roll(pieces, -1, axis=1), axis=2)
     return lengths.argmax(axis=1), lengths.max(axis=1)
 
 
-def _halved(pieces: NDArray[np.float32]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+def _halved(pieces: Floats32) -> tuple[Floats32, Floats32]:
     """Cut each piece through the middle of its longest edge."""
     rows, edge = np.arange(len(pieces)), _longest(pieces)[0]
     a, b, c = (pieces[rows, (edge + k) % 3] for k in range(3))

@@ -6,14 +6,11 @@ from dataclasses import dataclass
 from itertools import product
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Floats32
 from .camera import Camera
 from .cutaway import Cutaway, blocked
 from .surface import Surface, dot, spiral
-
-Floats = NDArray[np.float64]
-Reals = NDArray[np.float32]
 
 STRIDE = 2  # shadows are computed at every second pixel of every second row
 SKY_LIGHTS, SUN_LIGHTS = 24, 4
@@ -30,13 +27,13 @@ class LightMap:
 
     camera: Camera
     sun: Floats  # (3,) unit vector towards it
-    openness: Reals  # (rows, columns) in 0 to 1: the unblocked share of the light
-    position: Reals  # (rows, columns, 3) metres; NaN where there is no surface
-    normal: Reals  # (rows, columns, 3)
+    openness: Floats32  # (rows, columns) in 0 to 1: the unblocked share of the light
+    position: Floats32  # (rows, columns, 3) metres; NaN where there is no surface
+    normal: Floats32  # (rows, columns, 3)
 
     def brightness(
-        self, pixels: Floats, position: Reals, normal: Reals, ground: NDArray[np.bool_]
-    ) -> Reals:
+        self, pixels: Floats, position: Floats32, normal: Floats32, ground: Bools
+    ) -> Floats32:
         """Brightness (n,) of points: Lambert's law for the sun, and the open part of the sky.
 
         `pixels` (n, 2) are where points (n, 3) are in the picture, and `ground` (n,) whether they
@@ -47,7 +44,7 @@ class LightMap:
         lit = AMBIENT + openness * (SKY * (0.6 + 0.4 * normal[:, 2]) + SUN * facing)
         return np.asarray(np.where(ground, 0.6 + 0.4 * openness, lit))
 
-    def _openness_at(self, pixels: Floats, position: Reals, normal: Reals) -> Reals:
+    def _openness_at(self, pixels: Floats, position: Floats32, normal: Floats32) -> Floats32:
         """Interpolate openness (n,) between the nine grid points around that are on the surface."""
         rows, columns = self.openness.shape
         tolerance = plane_tolerance(self.camera, position, STRIDE)
@@ -70,7 +67,9 @@ class LightMap:
         return summed / total
 
 
-def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance: Reals) -> Reals:
+def alike(
+    position: Floats32, normal: Floats32, spot: Floats32, facing: Floats32, tolerance: Floats32
+) -> Floats32:
     """How well points (n, 3) share a surface with spots (n, 3): from 0, for not, to 0.4.
 
     Those on it lie within `tolerance` (n,), in metres, of each other's plane.
@@ -80,7 +79,7 @@ def alike(position: Reals, normal: Reals, spot: Reals, facing: Reals, tolerance:
         return np.where(near, np.clip(dot(facing, normal) - 0.6, 0, None), 0)
 
 
-def plane_tolerance(camera: Camera, position: Reals, stride: int) -> Reals:
+def plane_tolerance(camera: Camera, position: Floats32, stride: int) -> Floats32:
     """Tolerance in metres for points of one plane that are `stride` pixels apart."""
     offset = position - camera.eye.astype(np.float32)
     distance = np.sqrt(dot(offset, offset))
@@ -98,8 +97,8 @@ def make_light_map(
     surface: Surface,
     cutaway: Cutaway | None,
     camera: Camera,
-    position: Reals,
-    normal: Reals,
+    position: Floats32,
+    normal: Floats32,
     reach: float,
 ) -> LightMap:
     """Cast rays from a grid of surface points to lights all over the sky, many of them the sun.

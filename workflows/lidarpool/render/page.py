@@ -22,11 +22,10 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import LogLocator
 from numpy.typing import NDArray
 
+from ..base.arrays import Floats
 from ..base.errors import explained
 from . import theme
 from .shot import Shot
-
-Floats = NDArray[np.float64]
 
 DPI = 200
 FONT = "DejaVu Sans"  # comes with matplotlib

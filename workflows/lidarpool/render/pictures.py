@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from textwrap import fill
-from typing import Any
 
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
 from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Floats, Floats32, Ints, UInts32
 from ..base.words import counted
 from ..columns.cloud import Cloud
 from ..columns.table import Column, Z
@@ -19,8 +19,6 @@ from .colouring import TURBO, colours_of, values_of
 from .hits import hit_colours
 from .page import LEGEND_ROWS, Page, whole_of, without_common_prefix
 from .shot import Shot
-
-Floats = NDArray[np.float64]
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
 MOST_HITS, MOST_PIECES = 200_000, 100_000  # to count, and to colour
@@ -64,7 +62,7 @@ def draw_scene(shot: Shot, triangles: int) -> Page:
 
 
 def draw_hits(
-    shot: Shot, hit_counts: NDArray[Any], points: Floats, sample_rays: NDArray[np.floating]
+    shot: Shot, hit_counts: AnyArray, points: Floats, sample_rays: NDArray[np.floating]
 ) -> Page:
     """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
 
@@ -134,7 +132,7 @@ def draw_cloud(
     return page
 
 
-def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[str]]:
+def _kinds(names: Sequence[str], actors: int) -> tuple[Ints, list[str]]:
     """Kinds of objects (objects,), and their names; the last objects are actors.
 
     Each actor is a kind, and all links of a robot are one.
@@ -152,7 +150,7 @@ def _kinds(names: Sequence[str], actors: int) -> tuple[NDArray[np.int64], list[s
     return np.array(kinds), list(found)
 
 
-def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
+def _object_colours(scene: Scene, kinds: Ints) -> Floats:
     """Colours of a scene's objects, (objects, 3) in 0 to 1, one for each of their kinds.
 
     Floors and halls are grey, so that objects in them stand out.
@@ -170,8 +168,8 @@ def _object_colours(scene: Scene, kinds: NDArray[np.int64]) -> Floats:
 
 
 def with_points(
-    image: NDArray[np.float32], shot: Shot, points: Floats, colours: Floats, solid: bool = False
-) -> NDArray[np.float32]:
+    image: Floats32, shot: Shot, points: Floats, colours: Floats, solid: bool = False
+) -> Floats32:
     """Draw points (n, 3) as discs over an image; `solid` makes them close the gaps between them.
 
     Only points on the surface of their pixel are drawn: others are hidden, or on a wall that was
@@ -223,6 +221,6 @@ def with_points(
     return drawn
 
 
-def _packed(colours: NDArray[np.floating]) -> NDArray[np.uint32]:
+def _packed(colours: NDArray[np.floating]) -> UInts32:
     """Colours (..., 4) in 0 to 1 as one number each, with a byte for each part."""
     return np.round(255 * colours).astype(np.uint8).view(np.uint32)[..., 0]

@@ -7,11 +7,12 @@ from dataclasses import dataclass, fields, replace
 from itertools import product
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from PIL import Image, ImageDraw
 
 from raybeam import RayCaster
 
+from ..base.arrays import Bools, Floats, Floats32, Ints
 from ..base.words import counted
 from ..scene.scene import Scene
 from . import theme
@@ -21,10 +22,6 @@ from .cutaway import cast_through, plan_cutaway
 from .light import STRIDE, alike, make_light_map, plane_tolerance
 from .stage import Stage
 from .surface import Surface, apart, unit
-
-Floats = NDArray[np.float64]
-Reals = NDArray[np.float32]
-Bools = NDArray[np.bool_]
 
 SIZE = (1600, 1000)  # pixels of a finished picture
 # Where the scene is: the title is above it, legend and colour bar are right of it.
@@ -39,14 +36,14 @@ _APART, _NEAR = 5e-6, 1e-6
 class Samples:
     """Hits of the camera's rays; every array has one row for each ray."""
 
-    triangle: NDArray[np.int64]  # (n,) or SKY, GROUND
-    distance: Reals  # (n,) metres, infinite for the sky
-    position: Reals  # (n, 3) metres, NaN for the sky
-    normal: Reals  # (n, 3) unit length, NaN for the sky
-    light: Reals  # (n,) brightness: 1 on open ground
-    weights: Reals  # (n, 3) of the triangle's corners
+    triangle: Ints  # (n,) or SKY, GROUND
+    distance: Floats32  # (n,) metres, infinite for the sky
+    position: Floats32  # (n, 3) metres, NaN for the sky
+    normal: Floats32  # (n, 3) unit length, NaN for the sky
+    light: Floats32  # (n,) brightness: 1 on open ground
+    weights: Floats32  # (n, 3) of the triangle's corners
 
-    def among(self, which: NDArray[np.int64], count: int) -> Samples:
+    def among(self, which: Ints, count: int) -> Samples:
         """Put the samples at `which` (n,) among `count`; the others are sky."""
         whole = Samples(
             np.full(count, SKY), np.full(count, np.inf, np.float32),
@@ -57,7 +54,7 @@ class Samples:
             getattr(whole, field.name)[which] = getattr(self, field.name)
         return whole
 
-    def paint(self, face_colours: Floats, contrast: float) -> Reals:
+    def paint(self, face_colours: Floats, contrast: float) -> Floats32:
         """Colours (n, 4) of the samples; see `Shot.paint`."""
         image = np.zeros((len(self.triangle), 4), np.float32)
         surface, ground = (
@@ -88,7 +85,7 @@ class Shot:
     stage: Stage
     camera: Camera
     whole: Samples  # through the middle of each pixel
-    edges: NDArray[np.int64]  # (e,) pixels that show the edge of something
+    edges: Ints  # (e,) pixels that show the edge of something
     finer: Samples  # several of each of these in turn
 
     @property
@@ -97,11 +94,11 @@ class Shot:
         return self.part.scene
 
     @property
-    def depth(self) -> Reals:
+    def depth(self) -> Floats32:
         """Metres (height, width) from the eye to the surface in each pixel, infinite for none."""
         return self.whole.distance.reshape(self.camera.size[::-1])
 
-    def paint(self, face_colours: Floats, contrast: float = 1.0) -> Reals:
+    def paint(self, face_colours: Floats, contrast: float = 1.0) -> Floats32:
         """Colour the shot.
 
         `face_colours` are (f, 3) in 0 to 1, or (f, 3, 3) at the corners; a `contrast` of 0 is for
@@ -118,7 +115,7 @@ class Shot:
             image[self.edges] = finer.reshape(len(self.edges), -1, 4).mean(axis=1)
         return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
 
-    def divided(self, pieces: Reals, owner: NDArray[np.int64]) -> Shot:
+    def divided(self, pieces: Floats32, owner: Ints) -> Shot:
         """Return the same shot of triangles divided into pieces (k, 3, 3), to paint these.
 
         The first piece of each triangle has its number, and `owner` (k,) says whose each is.

@@ -6,9 +6,8 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-Floats = NDArray[np.float64]
+from ..base.arrays import Floats
 
 # Numbers of more digits than this are not read: far coordinates are labelled from an offset.
 MOST_DIGITS = 5

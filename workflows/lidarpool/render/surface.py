@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import RayCaster
 
+from ..base.arrays import Floats, Integers, Ints
 from ..scene.scene import Scene
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 # Faces that meet at a flatter angle than this are shaded as one smooth surface.
 CREASE_COSINE = np.cos(np.radians(35))
@@ -60,7 +57,7 @@ class Surface:
         return smooth
 
 
-def apart(scene: Scene, objects: NDArray[np.integer[Any]], step: float) -> Scene:
+def apart(scene: Scene, objects: Integers, step: float) -> Scene:
     """Move surfaces inwards a little, so that objects that touch do not show through each other.
 
     Each vertex moves against the mean of the normals around it, weighted by angle (Thürmer and
@@ -85,7 +82,7 @@ def apart(scene: Scene, objects: NDArray[np.integer[Any]], step: float) -> Scene
     return replace(scene, vertices=vertices - (inwards[:, None] * mean)[place])
 
 
-def _places(scene: Scene, objects: NDArray[np.integer[Any]]) -> Ints:
+def _places(scene: Scene, objects: Integers) -> Ints:
     """Return a number (v,) for each vertex, the same for those of one object at one place.
 
     Files such as .stl have three vertices for each triangle, which must not come apart.

@@ -12,17 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from poolpart import TaskRecord
 
+from ..base.arrays import Bools, Floats
 from ..export.jobs import JobRow, Value
 from ..pipeline.task_book import StageTotals
 
 FAILED_MOST, SLOWEST_MOST = 200, 10  # jobs that are kept whole
 _COUNTS = ("scans", "sweeps", "rays", "hits", "points")
-
-Floats = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,7 +194,7 @@ class Figures:
         return np.array(self._each[name])
 
     @property
-    def failures(self) -> NDArray[np.bool_]:
+    def failures(self) -> Bools:
         """Whether each job failed (n,)."""
         return np.array(self._each["failed"]) > 0
 

@@ -9,17 +9,14 @@ from functools import cached_property
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Ints
 from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..render import theme
 from ..render.page import FONT, Page, shortened, without_common_prefix
 from .campaign_figures import Figures, Varied
 from .page.words import NARROW
-
-Floats = NDArray[np.float64]
-Bools = NDArray[np.bool_]
 
 WIDTH = 1600
 MOST_VARIED = 8  # quantities in a picture
@@ -67,7 +64,7 @@ class Scale:
         return cls(varied.values, np.linspace(low, high, bins + 1))
 
     @cached_property
-    def bin_of(self) -> NDArray[np.int64]:
+    def bin_of(self) -> Ints:
         """int64 (n,): bin of each value; -1 without one."""
         found = np.searchsorted(self.edges, self.places, "right") - 1
         found = found.clip(0, len(self.edges) - 2)

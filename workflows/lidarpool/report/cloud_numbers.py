@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import Column
 
@@ -26,7 +26,7 @@ class CountedCloud:
         self._cloud = cloud
         self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
         self.limits: dict[str, tuple[float, float]] = {}
-        self.bounds: NDArray[np.float64] = np.asarray(cloud.bounds, dtype=np.float64)
+        self.bounds: Floats = np.asarray(cloud.bounds, dtype=np.float64)
         # A cell that a surface crosses has about the square of its side of that surface.
         self._side = float(np.ptp(self.bounds, axis=0).max()) / _CELLS or 1.0
         self._cells = np.zeros(_CELLS**3, np.int64)

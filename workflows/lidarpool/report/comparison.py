@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from .._version import __version__
 from ..base.arguments import checked
+from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..base.errors import LidarpoolError, explained
 from ..base.open3d_module import load_open3d
 from ..base.words import counted
@@ -24,8 +24,6 @@ from ..export.recordings import Recording, Turn, open_recording
 from ..sensor.noise import Purpose, uniform
 from .page.words import millimetres, ratio
 from .range_image import RangeImages, paired_images, range_images
-
-Floats = NDArray[np.float64]
 
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
@@ -193,11 +191,11 @@ class _Comparing:
         self.images: RangeImages | None = None
         self.above: list[Above] = []
         # Of cells with a return in both: residual, ring, intensities of A and B.
-        self.cells: list[tuple[NDArray[Any], ...]] = []
+        self.cells: list[tuple[AnyArray, ...]] = []
         # Of points of A, and of B: distance to the other, own intensity, that of the nearest.
         self.pairs: tuple[list[Any], list[Any]] = ([], [])
         # {ring: its elevation, cells with a return in both, in none, only in B, only in A}
-        self.rings: dict[int, tuple[float, NDArray[np.int64]]] = {}
+        self.rings: dict[int, tuple[float, Ints]] = {}
 
     def note(self, text: str) -> None:
         """Say something once."""
@@ -311,7 +309,7 @@ class _Comparing:
         above = self.above[0], self.above[1]
         return Comparison(figures, self.images, residuals, (to_b, to_a), lights, above)
 
-    def _of_images(self, residuals: Floats, rings: NDArray[np.int64]) -> dict[str, Any]:
+    def _of_images(self, residuals: Floats, rings: Ints) -> dict[str, Any]:
         images = self.images
         assert images is not None
         gaps = not any(one.thinned for one in self.recordings)
@@ -336,14 +334,14 @@ class _Comparing:
         }
 
 
-def chosen(count: int, most: int, group: int) -> NDArray[np.intp]:
+def chosen(count: int, most: int, group: int) -> Indices:
     """Choose about `most` numbers below `count`, in order, by their hashes; all of fewer."""
     if count <= most:
         return np.arange(count)
     return np.flatnonzero(uniform(0, Purpose.CHOICE, group, np.arange(count)) < most / count)
 
 
-def nearest(points: Floats, others: Floats) -> tuple[Floats, NDArray[np.int64]]:
+def nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
     """Distances (n,) of points to the nearest of others, metres, and the numbers of these."""
     core = load_open3d().core
     origin = others.mean(axis=0)  # far from zero, squares would lose their digits
@@ -353,7 +351,7 @@ def nearest(points: Floats, others: Floats) -> tuple[Floats, NDArray[np.int64]]:
     return np.sqrt(square.numpy()[:, 0]), index.numpy()[:, 0]
 
 
-def rank_correlation(a: NDArray[Any], b: NDArray[Any]) -> float | None:
+def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
     """Spearman's rank correlation, ties with their mean rank; None if one is constant or empty."""
     if not len(a):
         return None

@@ -11,8 +11,8 @@ from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray
 from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..render import theme
@@ -23,7 +23,6 @@ from .page.words import MINUS, millimetres, ratio
 if TYPE_CHECKING:
     from .comparison import Comparison
 
-Floats = NDArray[np.float64]
 
 WIDTH = 1600
 LEFT, RIGHT = 0.075, 0.845  # of charts, as shares of the width
@@ -298,7 +297,7 @@ def _limit(found: Comparison) -> float:
     return max(1000 * (abs(told["median_m"]) + SCALE * told["mad_m"]), 0.1) if told["cells"] else 1
 
 
-def _bins(values: NDArray[Any]) -> NDArray[Any]:
+def _bins(values: AnyArray) -> AnyArray:
     """Edges of bins of intensities, between whole numbers if they are such."""
     most = max(float(np.quantile(values, 0.995)), 1e-12)
     if most <= 300 and (values == np.round(values)).all():

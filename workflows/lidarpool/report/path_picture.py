@@ -11,16 +11,14 @@ from matplotlib.collections import LineCollection, PatchCollection
 from matplotlib.lines import Line2D
 from matplotlib.patches import Circle
 from matplotlib.patheffects import withStroke
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats
 from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..plan import Plan, Planning
 from ..render import theme
 from ..render.page import FONT, Page
 from ..render.stage import make_axis, nice_step
-
-Floats = NDArray[np.float64]
 
 FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
 MOST_TRIALS = 1000

@@ -6,13 +6,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Indices, Ints
 from ..base.errors import LidarpoolError
 from ..base.words import counted
 from ..export.recordings import Turn
-
-Floats = NDArray[np.float64]
 
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
 _SAME = 0.15  # by how much single steps may differ from their mean
@@ -29,19 +27,19 @@ _FINEST_DEG = 1e-3  # points nearer in azimuth are of one pulse
 class RangeImages:
     """Ranges of two sweeps in the same cells, (rings, columns)."""
 
-    rings: NDArray[np.int64]  # (r,): as B numbers them, the highest first
+    rings: Ints  # (r,): as B numbers them, the highest first
     elevation_deg: Floats  # (r,): medians of the points
     step_deg: float  # width of a column
     begin_deg: float  # azimuth of the first
     ranges: Floats  # (2, r, c): of A and B, metres; NaN without a return
     hidden: tuple[float, float]  # shares of points of A and B that others in their cells hide
     notes: tuple[str, ...]
-    row: NDArray[np.int64]  # (k,): of all cells, or of all rays that have a return
+    row: Ints  # (k,): of all cells, or of all rays that have a return
     compared: Floats  # (2, 2, k): range and intensity of these in A and in B, NaN where unknown
     paired_by: str = "cells"  # or "rays"
 
     @property
-    def there(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def there(self) -> tuple[Bools, Bools]:
         """Where A and B have returns."""
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 
@@ -57,9 +55,9 @@ class _Polar:
 
     azimuth: Floats  # (n,): degrees, 0 to 360
     ranges: Floats
-    ring: NDArray[np.int64]  # (n,): index into `rings`
+    ring: Ints  # (n,): index into `rings`
     light: Floats | None
-    rings: NDArray[np.int64]  # (r,): numbers
+    rings: Ints  # (r,): numbers
     elevation: Floats  # (r,): medians, degrees
 
     @classmethod
@@ -109,7 +107,7 @@ class _Polar:
             found = alike(found).mean()
         return float(found)
 
-    def phases(self, rows: NDArray[np.int64], count: int, step: float) -> Floats:
+    def phases(self, rows: Ints, count: int, step: float) -> Floats:
         """Where pulses are within a step, in steps: (count, blocks), NaN where there are none."""
         place = rows[self.ring] * _BLOCKS + self._block
         turn = np.exp(2j * np.pi * self.azimuth / step)
@@ -121,11 +119,11 @@ class _Polar:
         return np.where(none, np.nan, phases).reshape(count, _BLOCKS)
 
     @property
-    def _block(self) -> NDArray[np.int64]:
+    def _block(self) -> Ints:
         return (self.azimuth * (_BLOCKS / 360)).astype(np.int64).clip(0, _BLOCKS - 1)
 
     def image(
-        self, rows: NDArray[np.int64], phases: Floats, step: float, shape: tuple[int, int]
+        self, rows: Ints, phases: Floats, step: float, shape: tuple[int, int]
     ) -> tuple[Floats, float]:
         """Ranges and lights of cells (2, *shape), and the share of points that others there hide.
 
@@ -228,10 +226,10 @@ def _spacing(elevation: Floats) -> float:
 class _Common(NamedTuple):
     """Rings of A and B in common rows, the highest first."""
 
-    rings: NDArray[np.int64]  # (r,): as B numbers them
+    rings: Ints  # (r,): as B numbers them
     elevation: Floats  # (r,)
-    rows_a: NDArray[np.int64]  # of each ring of A
-    rows_b: NDArray[np.int64]
+    rows_a: Ints  # of each ring of A
+    rows_b: Ints
     notes: tuple[str, ...]
 
 
@@ -278,7 +276,7 @@ def _common(a: _Polar, b: _Polar, names: tuple[str, str]) -> _Common:
     return _Common(rings[order], elevation[order], rows_a, rows_b, tuple(notes))
 
 
-def _field(seen: NDArray[np.intp], columns: int, step: float) -> tuple[NDArray[np.int64], float]:
+def _field(seen: Indices, columns: int, step: float) -> tuple[Ints, float]:
     """Columns within the field of view, and the azimuth of the first, -180 to 180 degrees."""
     gaps = np.diff(seen, append=seen[:1] + columns)
     widest = int(gaps.argmax())

@@ -5,18 +5,14 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Ints
 from ..base.words import counted
 from ..plan.stations import Sight, StationPlan
 from ..render import theme
 from ..render.page import Page
 from ..render.shot import SIZE, Samples, Shot, take_shot
 from ..scene.scene import Scene
-
-Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
-Bools = NDArray[np.bool_]
 
 COVERED, UNCOVERED, HIDDEN = range(3)  # hidden from all candidates
 COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY)])

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.archives import open_archive
+from ..base.arrays import AnyArray, Floats, Floats32
 from ..base.words import counted
 from ..columns.table import CAUSES, TABLE, Column
 from ..plan import Plan, Planning
@@ -39,13 +39,13 @@ _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 class SensorWay:
     """Positions of a sensor over time."""
 
-    times_ns: NDArray[np.float64]  # (k,), ascending, nanoseconds since the survey's start
-    positions: NDArray[np.float64]  # (k, 3), metres, local coordinates
+    times_ns: Floats  # (k,), ascending, nanoseconds since the survey's start
+    positions: Floats  # (k, 3), metres, local coordinates
     moves: bool = False  # from each position to the next; else it stands until the next time
     name: str = ""  # "" for a single sensor
     model: str = ""
 
-    def at(self, time_ns: float) -> NDArray[np.float64]:
+    def at(self, time_ns: float) -> Floats:
         """Its position at a time, (3,)."""
         if self.moves:
             return np.array([np.interp(time_ns, self.times_ns, x) for x in self.positions.T])
@@ -59,16 +59,16 @@ class Pictured:
 
     scene: Scene  # trajectories of its actors have a thousand poses at most
     sensors: Sequence[SensorWay]
-    hit_counts: NDArray[Any]  # (f,): of each triangle, those of actors after the others
-    sample_rays: NDArray[np.float32]  # (k, 2, 3): ends of some rays, metres, local coordinates
+    hit_counts: AnyArray  # (f,): of each triangle, those of actors after the others
+    sample_rays: Floats32  # (k, 2, 3): ends of some rays, metres, local coordinates
     planning: Planning | None
     plan: Plan | None
     # (w, 2) each: corners of the paths of all trials between the two ends, metres.
-    trials: Sequence[NDArray[np.float64]]
+    trials: Sequence[Floats]
     duration_ns: float = 0.0  # of the survey, by its own clock
     own: Sequence[Column] = ()  # columns of the cloud's file that are not in the table of columns
     # (objects,): share of light that each reflects, actors after the others; None if unknown.
-    reflectance: NDArray[np.float64] | None = None
+    reflectance: Floats | None = None
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
     triangles: int = 0  # of the scene, though simpler instances may be drawn
 
@@ -227,7 +227,7 @@ class Pictured:
         return cls(scene, sensors, counts, rays, planning, plan, trials, *rest)
 
 
-def reflectances_of(scene: Scene, survey: Survey) -> NDArray[np.float64]:
+def reflectances_of(scene: Scene, survey: Survey) -> Floats:
     """Share of light that each object reflects, at the wavelength of the first sensor."""
     light = survey.carried[0].sensor.optics
     names, voxels = scene.all_names, scene.has_voxels
@@ -256,7 +256,7 @@ def sensor_ways(survey: Survey) -> list[SensorWay]:
 
 def ways_of(
     sensors: Sequence[SensorWay], actors: Sequence[Actor], duration_ns: float
-) -> list[NDArray[np.float64]]:
+) -> list[Floats]:
     """Trajectories (k, 3) of moving sensors, else of actors and the sensors; none without motion.
 
     Pictures and pages look at their surroundings.

@@ -6,11 +6,9 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
 
-import numpy as np
-from numpy.typing import NDArray
-
 from poolpart import TaskRecord
 
+from ..base.arrays import Floats32, Ints
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..pipeline.task_book import StageTotals
@@ -65,8 +63,8 @@ class RunResult:
     resumed: int
     notes: tuple[str, ...]
     identity: Mapping[str, str]
-    _hit_counts: Callable[[], NDArray[np.int64]] = field(repr=False)
-    sample_rays: NDArray[np.float32] = field(repr=False)
+    _hit_counts: Callable[[], Ints] = field(repr=False)
+    sample_rays: Floats32 = field(repr=False)
     seconds: float = 0.0
     survey_seconds: float = 0.0
     planning_seconds: float = 0.0
@@ -84,6 +82,6 @@ class RunResult:
         return self.points.load()
 
     @cached_property
-    def hit_counts(self) -> NDArray[np.int64]:
+    def hit_counts(self) -> Ints:
         """Hits by `counters` of the scene, read when first asked for."""
         return self._hit_counts()

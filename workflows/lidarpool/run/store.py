@@ -17,9 +17,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.arguments import checked
+from ..base.arrays import Floats32, Ints
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
 from ..columns.cloud import Cloud
@@ -388,7 +388,7 @@ class RunStore(KeptRun):
         rows = slice(int(ends[at] - columns.counts[at]), int(ends[at]))
         return self.points().cloud_of(columns, rows)
 
-    def hit_counts(self) -> NDArray[np.int64]:
+    def hit_counts(self) -> Ints:
         """Hits by counters of the scene, see `Scene.counters`."""
         counts = np.zeros(self.job.scene.counters, np.int64)
         for part in self.db.ordered:
@@ -396,7 +396,7 @@ class RunStore(KeptRun):
             counts[triangles] += hits
         return counts
 
-    def sample_rays(self) -> NDArray[np.float32]:
+    def sample_rays(self) -> Floats32:
         """Return the ends of some rays, (k, 2, 3), metres, local coordinates."""
         survey = self.job.survey
         samples = samples_of_scan(survey.scan_count)

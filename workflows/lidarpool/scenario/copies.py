@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import check_fits
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.words import counted
 from ..scene.instances import Instance
@@ -27,8 +27,6 @@ DRAWS_LEAST = 1 << 21
 
 _PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
-
-Float = NDArray[np.float64]
 
 
 def copies_of(
@@ -70,7 +68,7 @@ def copies_of(
     return Instance.several(mesh, matrices, entry.name)
 
 
-def _of_table(path: Path, columns: dict[str, str]) -> tuple[Float, Float, Float]:
+def _of_table(path: Path, columns: dict[str, str]) -> tuple[Floats, Floats, Floats]:
     """Places, z nan if there is none, angles in degrees, and scales of a table: (n, 3) each."""
     try:
         check_fits(path)
@@ -93,14 +91,14 @@ def _of_table(path: Path, columns: dict[str, str]) -> tuple[Float, Float, Float]
     if count > COPIES_MOST:
         raise LidarpoolError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
 
-    def some(names: Sequence[str], default: Any) -> Float:
+    def some(names: Sequence[str], default: Any) -> Floats:
         return np.stack([at.get(name, np.full(count, default)) for name in names], axis=1)
 
     scales = some(("scale",) * 3 if "scale" in at else _SCALES, 1.0)
     return some(_PLACE, np.nan), some(_ANGLES, 0.0), scales
 
 
-def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Float, Float, Float]:
+def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, Floats, Floats]:
     """Places, angles in degrees and scales of copies at random: (n, 3) each.
 
     Places are drawn in a rectangle and kept if the highest surface there is one of those named:
@@ -112,7 +110,7 @@ def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Float, Fl
     seeds = [given.seed, *name.encode()]
     draw = np.random.Generator(np.random.PCG64([0, *seeds]))
     room = _Room(given.spacing_m)
-    found: list[Float] = []
+    found: list[Floats] = []
     drawn = 0
     while len(found) < given.count:
         if drawn > max(DRAWS_LEAST, DRAWS_MOST * given.count):

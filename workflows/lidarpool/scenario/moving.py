@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Strict, model_validator
 
+from ..base.arrays import Floats
 from ..base.declared import Text, TextOrTexts, Triple, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
@@ -146,7 +146,7 @@ class TrajectorySection(Section):
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
         )
 
-    def _level(self, folder: Path, origin: NDArray[np.float64], start_s: float | None) -> Track:
+    def _level(self, folder: Path, origin: Floats, start_s: float | None) -> Track:
         """Return it without surfaces."""
         start_s = self.start_s if start_s is None else start_s
         smooth = self.interpolation == "smooth"

@@ -8,16 +8,15 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..base.arrays import Floats
 from ..base.words import counted
 from ..scene.drawn import Drawn
 from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
 from ..scene.surroundings import Surroundings, Views, in_the_way, is_open
 from ..sensor import Mounted, Pose
-
-Real = NDArray[np.float64]
 
 # Heights above a floor; and the least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
@@ -76,7 +75,7 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
     return Placing(poses, note, around=True)
 
 
-def _standing(scene: Scene, at: Real) -> tuple[Pose, ...]:
+def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
     """Poses above the floor at a place (3,), of which x and y count, in world coordinates."""
     x, y, _ = at.tolist()
     floor, ceiling = room_at(scene, x, y)
@@ -86,7 +85,7 @@ def _standing(scene: Scene, at: Real) -> tuple[Pose, ...]:
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 
-def _aside(scene: Scene, middle: Real) -> tuple[Pose, ...]:
+def _aside(scene: Scene, middle: Floats) -> tuple[Pose, ...]:
     """Poses beside the middle (3,) of a scene where nothing is in the way; none if there are none.
 
     World coordinates.
@@ -106,7 +105,7 @@ def _aside(scene: Scene, middle: Real) -> tuple[Pose, ...]:
     return ()
 
 
-def _local(poses: Sequence[Pose], scene: Scene) -> Real:
+def _local(poses: Sequence[Pose], scene: Scene) -> Floats:
     """Positions in a scene's coordinates, (k, 3)."""
     return np.array([pose.position for pose in poses]) - scene.origin
 
@@ -172,7 +171,7 @@ def _field_deg(carried: Mounted) -> tuple[float, float]:
     sensor, turn = carried.sensor, carried.mount.rotation
     count = min(sensor.period or _LOOKED_AT, _LOOKED_AT)
     firings = np.linspace(0, sensor.period or count, count, endpoint=False).astype(np.int64)
-    rays: NDArray[np.float64] = sensor.directions(firings).reshape(-1, 3)
+    rays: Floats = sensor.directions(firings).reshape(-1, 3)
     rays = rays if turn is None else rays @ turn.T
     facing = np.abs(np.degrees(np.arctan2(rays[:, 1], rays[:, 0]))) <= _FACING_DEG
     if not facing.any():

@@ -16,6 +16,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import PrivateAttr, Strict, ValidationError
 
+from ..base.arrays import Floats
 from ..base.declared import Text, declared, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted, did_you_mean
@@ -551,7 +552,7 @@ class Scenario(Section):
         mistakes.tell()
         return out
 
-    def _scattered_in(self) -> list[np.ndarray[Any, np.dtype[np.float64]]]:
+    def _scattered_in(self) -> list[Floats]:
         """Corners of where copies are scattered, and places of lists, each (n, 2)."""
         scattered = [entry.scatter for entry in self.scene.copies if entry.scatter is not None]
         listed = [[one.position[:2] for one in entry.at] for entry in self.scene.copies]
@@ -848,7 +849,7 @@ class Scenario(Section):
             self._placing = place(scene, self._carried()[0], landscape=bool(self._rasters))
         return self._placing
 
-    def _discs(self, scene: Scene) -> tuple[np.ndarray[Any, np.dtype[np.float64]], list[str]]:
+    def _discs(self, scene: Scene) -> tuple[Floats, list[str]]:
         """Obstacles as local x, y, radius (m, 3), and a label for each."""
         if self.planning.obstacles is None:
             tall = np.flatnonzero(np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M)
@@ -876,7 +877,7 @@ class Scenario(Section):
 
 def _check_free(
     ends: dict[str, tuple[float, float]],
-    discs: np.ndarray[Any, np.dtype[np.float64]],
+    discs: Floats,
     labels: list[str],
 ) -> None:
     """Refuse a path that begins or ends in an obstacle, and name the obstacle."""

@@ -7,10 +7,10 @@ from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import RayCaster, available_backends
 
+from ..base.arrays import Floats, Indices, Ints32
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..scene.drawn import Drawn
@@ -22,8 +22,6 @@ from ..sensor.trajectory import quaternions_of
 STEP_M = 0.5  # of a trajectory that follows a surface
 STEPS_MOST = 1_000_000
 
-Float = NDArray[np.float64]
-
 
 class Standing:
     """What one can stand on in a scene: the triangles of some objects that face up.
@@ -31,12 +29,12 @@ class Standing:
     Of several above a place the highest counts. None is a scene without triangles.
     """
 
-    def __init__(self, scene: Scene | None, objects: NDArray[np.intp] | None = None) -> None:
+    def __init__(self, scene: Scene | None, objects: Indices | None = None) -> None:
         self._scene, self._objects = scene, objects
         self._parts: dict[tuple[str, ...], Standing] = {}  # {names: of these objects}
 
     @property
-    def origin(self) -> Float:
+    def origin(self) -> Floats:
         """Of the scene, (3,)."""
         return np.zeros(3) if self._scene is None else self._scene.origin
 
@@ -67,7 +65,7 @@ class Standing:
         return made
 
     @cached_property
-    def _tops(self) -> tuple[Float, NDArray[np.int32]]:
+    def _tops(self) -> tuple[Floats, Ints32]:
         """Triangles that face up, local (f, 3, 3), and their objects (f,)."""
         assert self._scene is not None
         drawn, shared = self._scene, self._scene.instances
@@ -89,7 +87,7 @@ class Standing:
         return RayCaster(corners, np.arange(len(corners)).reshape(-1, 3), backend)
 
     @property
-    def rectangle(self) -> Float:
+    def rectangle(self) -> Floats:
         """Lowest and highest x and y, world metres: (4,)."""
         assert self._scene is not None
         x, y = self._tops[0][..., :2].reshape(-1, 2).T
@@ -97,11 +95,11 @@ class Standing:
         return np.array([x.min(), y.min(), x.max(), y.max()]) + at
 
     @cached_property
-    def owners(self) -> NDArray[np.int32]:
+    def owners(self) -> Ints32:
         """Objects that have triangles here."""
         return np.unique(self._tops[1])
 
-    def under(self, places: Float) -> tuple[Float, NDArray[np.int32]]:
+    def under(self, places: Floats) -> tuple[Floats, Ints32]:
         """Heights below places (n, 2), world metres, nan for none; and their objects, -1."""
         heights, objects = np.full(len(places), np.nan), np.full(len(places), -1, np.int32)
         if self._scene is None or not len(self._tops[0]):

@@ -14,7 +14,6 @@ from typing import Annotated, Literal
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.declared import Text, TextOrTexts, Triple, told
 from ..base.errors import LidarpoolError
@@ -32,8 +31,6 @@ ACTORS_MOST = 10_000
 _PIECE = 1 << 20  # bytes of a file that are read at a time
 _MOVING = ("vehicle", "person", "container")
 _ROW = ("x", "y", "angle", "z", "slope")
-
-Float = NDArray[np.float64]
 
 
 class VehicleSection(ShapeSection):

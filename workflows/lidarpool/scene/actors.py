@@ -6,9 +6,9 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.arguments import checked_fields
+from ..base.arrays import Floats, Indices
 from ..base.errors import LidarpoolError
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
@@ -62,9 +62,7 @@ class Actor:
         # Masks do not show.
         return Mesh(self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours)
 
-    def samples(
-        self, duration_ns: float, count: int
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    def samples(self, duration_ns: float, count: int) -> tuple[Floats, Floats, Floats]:
         """Return times (k,), nanoseconds, positions (k, 3) and quaternions (k, 4), for drawings.
 
         They are even over the part of a survey of `duration_ns` in which it is in the scene.
@@ -93,7 +91,7 @@ def samples_each(actors: Sequence[Actor], most: int) -> int:
     return max(20, min(most, SAMPLES_MOST // max(len(actors), 1)))
 
 
-def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], NDArray[np.intp]]:
+def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], Indices]:
     """Meshes (m,) of actors, each once, and which of them each actor (a,) has.
 
     Meshes are the same if they share their arrays.

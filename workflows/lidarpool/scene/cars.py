@@ -5,12 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats, Ints
 from .city_kinds import loft, lying, regular
 from .mesh import Mesh, stacked
-
-Float = NDArray[np.float64]
 
 _RECESS_M, _FRAME = 0.03, 0.12  # of a window: depth, and share of its width that is frame
 
@@ -86,7 +84,7 @@ def all_cars() -> tuple[Mesh, ...]:
     return tuple(car(model) for model in MODELS)
 
 
-def _body(model: Model) -> tuple[Float, NDArray[np.int64]]:
+def _body(model: Model) -> tuple[Floats, Ints]:
     """Rings of eight corners around the stations, joined by quadrangles."""
     rings = []
     for x, half, belt, roof in model.stations:
@@ -95,7 +93,7 @@ def _body(model: Model) -> tuple[Float, NDArray[np.int64]]:
         right = [(0.9 * half, low), (half, 0.55 * belt), (0.97 * half, belt), (top, roof)]
         rings.append([(x, -y, z) for y, z in right] + [(x, y, z) for y, z in right[::-1]])
     ring = np.array(rings)
-    quads: list[Float] = []
+    quads: list[Floats] = []
     for k in range(len(ring) - 1):
         for side in range(8):
             after = (side + 1) % 8
@@ -111,7 +109,7 @@ def _body(model: Model) -> tuple[Float, NDArray[np.int64]]:
     return corners.reshape(-1, 3), np.concatenate([number[:, :3], number[:, [0, 2, 3]]])
 
 
-def _window(quad: Float) -> list[Float]:
+def _window(quad: Floats) -> list[Floats]:
     """Frame of four quadrangles, the sides of a recess, and the pane."""
     middle = quad.mean(axis=0)
     normal = np.cross(quad[2] - quad[0], quad[3] - quad[1])

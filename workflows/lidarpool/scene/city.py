@@ -7,13 +7,13 @@ blocks at once, by arrays, so that ten million triangles take a few seconds more
 
 from __future__ import annotations
 
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from ..base.arguments import checked
+from ..base.arrays import AnyArray, Floats, Ints
 from ..base.declared import Seed
 from . import city_kinds
 from .city_furniture import MOST_CARS, parked_cars, street_trees
@@ -23,10 +23,7 @@ from .plants import MOST_TREES
 from .scene import Scene
 from .terrain import grid_faces
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 # One row for each thing: position and size; `block` is counted from the centre.
-Things = NDArray[Any]
 _THING = np.dtype({
     "names": ["kind", "owner", "block", "place", "yaw", "scale"],
     "formats": ["i8", "i8", "i8", "3f8", "f8", "3f8"],
@@ -96,7 +93,7 @@ def city(
     return Scene.from_meshes([*scene.meshes(), *_furniture(scene, things, trees, cars, seed)])
 
 
-def _furniture(scene: Scene, things: Things, trees: int, cars: int, seed: int) -> list[Instance]:
+def _furniture(scene: Scene, things: AnyArray, trees: int, cars: int, seed: int) -> list[Instance]:
     """Place trees and cars among things."""
     pavement = things[things["owner"] == PAVEMENT]
     blocks = np.stack([pavement["place"][:, :2], pavement["scale"][:, :2]], axis=1)
@@ -118,7 +115,7 @@ def _furniture(scene: Scene, things: Things, trees: int, cars: int, seed: int) -
     ]
 
 
-def _things(kinds: dict[str, list[Solid]], sizes: Int, budget: int, seed: int) -> Things:
+def _things(kinds: dict[str, list[Solid]], sizes: Ints, budget: int, seed: int) -> AnyArray:
     """Select things from the centre outwards, within the budget of triangles."""
     rings = 1
     while True:
@@ -130,7 +127,7 @@ def _things(kinds: dict[str, list[Solid]], sizes: Int, budget: int, seed: int) -
         rings = max(rings + 1, int(np.sqrt(budget / used[-1]) * rings))
 
 
-def _ground(things: Things, triangles: int) -> Solid:
+def _ground(things: AnyArray, triangles: int) -> Solid:
     """Flat ground under everything, of the remaining triangles."""
     blocks = things[things["owner"] == PAVEMENT]
     reach = (np.abs(blocks["place"]) + blocks["scale"] / 2).max(axis=0) + _MARGIN_M
@@ -142,7 +139,7 @@ def _ground(things: Things, triangles: int) -> Solid:
     return Solid(points.reshape(-1, 3), grid_faces(columns, rows).swapaxes(0, 1).reshape(-1, 3))
 
 
-def _scene(solids: list[Solid], things: Things, ground: Solid) -> Scene:
+def _scene(solids: list[Solid], things: AnyArray, ground: Solid) -> Scene:
     """Place copies of the solids."""
     points = np.array([len(solid.vertices) for solid in solids])[things["kind"]]
     sides = np.array([len(solid.faces) for solid in solids])[things["kind"]]
@@ -164,7 +161,7 @@ def _scene(solids: list[Solid], things: Things, ground: Solid) -> Scene:
     return Scene(vertices, faces, owner, ("ground", "pavement", *_names(things)), np.zeros(3))
 
 
-def _copies(solid: Solid, things: Things) -> Float:
+def _copies(solid: Solid, things: AnyArray) -> Floats:
     """Vertices of a solid at every place: (things, v, 3)."""
     out = solid.vertices * things["scale"][:, None]
     cos, sin = np.cos(things["yaw"])[:, None], np.sin(things["yaw"])[:, None]
@@ -175,7 +172,7 @@ def _copies(solid: Solid, things: Things) -> Float:
     return out
 
 
-def _names(things: Things) -> list[str]:
+def _names(things: AnyArray) -> list[str]:
     """Name all but the pavement by class, numbered from 1 from the centre outwards."""
     numbers = dict.fromkeys(CLASSES, 0)
     names = []
@@ -223,7 +220,7 @@ class _City:
         park[:4] = False  # never at the centre
         self._middle, self._size, self._park = middle[order], size[order], park
 
-    def things(self) -> Things:
+    def things(self) -> AnyArray:
         """All things, block by block, within a block in random order after its pavement."""
         n = len(self._middle)
         slab = np.column_stack([self._size, np.ones(n)])
@@ -242,13 +239,13 @@ class _City:
         self,
         owner: int,
         group: str,
-        kind: Int | int,
-        block: Int,
-        xy: Float,
-        yaw: Float | float,
-        scale: Float | float,
+        kind: Ints | int,
+        block: Ints,
+        xy: Floats,
+        yaw: Floats | float,
+        scale: Floats | float,
         z: float = _KERB_M,
-    ) -> Things:
+    ) -> AnyArray:
         """Rows of one class, `kind` being counted within its group."""
         out = np.empty(len(block), _THING)
         out["kind"], out["owner"], out["block"] = self._start[group] + kind, owner, block
@@ -256,7 +253,7 @@ class _City:
         out["yaw"], out["scale"] = yaw, scale
         return out
 
-    def _lots(self) -> list[Things]:
+    def _lots(self) -> list[AnyArray]:
         """Towers and houses, and the trees behind the houses."""
         rng = self._rng
         built = np.flatnonzero(~self._park)
@@ -302,14 +299,14 @@ class _City:
         ])  # fmt: skip
         return [towers, homes, self._trees(block[behind], xy)]
 
-    def _park_trees(self) -> Things:
+    def _park_trees(self) -> AnyArray:
         parks = np.flatnonzero(self._park)
         block = np.repeat(parks, (self._size[parks].prod(axis=1) / 50).astype(np.int64))
         room = self._size[block] / 2 - _PAVEMENT_M - 2
         xy = self._middle[block] + room * self._rng.uniform(-1, 1, (len(block), 2))
         return self._trees(block, xy)
 
-    def _trees(self, block: Int, xy: Float) -> Things:
+    def _trees(self, block: Ints, xy: Floats) -> AnyArray:
         rng, n = self._rng, len(block)
         kind = rng.integers(self._count["tree"], size=n)
         size = rng.uniform(0.75, 1.3, (n, 1)) * rng.uniform(0.9, 1.1, (n, 3))
@@ -317,7 +314,7 @@ class _City:
 
     def _along_streets(
         self, owner: int, *, inwards: float, spacing: float, chance: float
-    ) -> Things:
+    ) -> AnyArray:
         """Rows of one class along all four edges of each block, with gaps."""
         rng, n = self._rng, len(self._middle)
         block = np.tile(np.arange(n), 4)

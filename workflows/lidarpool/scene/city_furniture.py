@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats, Ints
 from ..base.errors import LidarpoolError
 from .cars import all_cars
 from .instances import Instance
 from .plants import SCALES, SPECIES, all_trees, placed
-
-Float = NDArray[np.float64]
 
 MOST_CARS = 50_000
 
@@ -27,7 +25,7 @@ _ROOT_M = 0.1
 
 
 def street_trees(
-    blocks: Float, boxes: list[Float], lamps: list[Float], z: float, count: int, seed: int
+    blocks: Floats, boxes: list[Floats], lamps: list[Floats], z: float, count: int, seed: int
 ) -> list[Instance]:
     """Place trees along streets, in yards and parks, whose crowns touch no building.
 
@@ -73,7 +71,7 @@ def street_trees(
     return placed(meshes, kind, at, rng.uniform(0, 2 * np.pi, count), scale)
 
 
-def parked_cars(blocks: Float, count: int, seed: int) -> list[Instance]:
+def parked_cars(blocks: Floats, count: int, seed: int) -> list[Instance]:
     """Place cars at the kerbs of blocks (b, 2, 2), middles and sizes, along the streets.
 
     Raises
@@ -98,7 +96,7 @@ def parked_cars(blocks: Float, count: int, seed: int) -> list[Instance]:
     return placed(meshes, kind, np.column_stack([xy, np.zeros(count)]), yaw, np.ones(count))
 
 
-def _choose(weights: Float, count: int, what: str, rng: np.random.Generator) -> NDArray[np.int64]:
+def _choose(weights: Floats, count: int, what: str, rng: np.random.Generator) -> Ints:
     """Choose places by weights (n,): (count,)."""
     if len(weights) < count:
         raise LidarpoolError(
@@ -108,7 +106,7 @@ def _choose(weights: Float, count: int, what: str, rng: np.random.Generator) -> 
     return rng.choice(len(weights), count, replace=False, p=weights / weights.sum())
 
 
-def _along(size: Float, apart: float, inwards: float, corner: float) -> tuple[Float, Float]:
+def _along(size: Floats, apart: float, inwards: float, corner: float) -> tuple[Floats, Floats]:
     """Places (n, 2) along the edges of a block around zero, and yaw (n,) with it at the right."""
     places, yaws = [], []
     for turn in range(4):
@@ -122,7 +120,7 @@ def _along(size: Float, apart: float, inwards: float, corner: float) -> tuple[Fl
     return np.concatenate(places), np.concatenate(yaws)
 
 
-def _yard(size: Float, rng: np.random.Generator) -> Float:
+def _yard(size: Floats, rng: np.random.Generator) -> Floats:
     """Places (n, 2) spread over a block around zero, behind those at its streets."""
     inner = size - 2 * (_TREE_INWARDS_M + _YARD_M / 2)
     n = (inner / _YARD_M).astype(np.int64)

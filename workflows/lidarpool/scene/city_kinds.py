@@ -7,8 +7,9 @@ from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..base.arrays import Floats, Ints
 from .mesh import stacked
 from .shapes import revolve
 
@@ -19,8 +20,8 @@ class Solid(NamedTuple):
     `vertices` are float64 (v, 3), `faces` int64 (f, 3), counter-clockwise seen from outside.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Ints
 
     def moved(self, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Solid:
         """Return a moved copy."""
@@ -208,12 +209,12 @@ def loft(outline: ArrayLike, profile: Sequence[tuple[float, float]]) -> Solid:
     return Solid(rings.reshape(-1, 3), np.concatenate(faces))
 
 
-def rectangle(width: float, depth: float) -> NDArray[np.float64]:
+def rectangle(width: float, depth: float) -> Floats:
     """Outline around zero: (4, 2)."""
     return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * [width / 2, depth / 2]
 
 
-def regular(sides: int, radius: float) -> NDArray[np.float64]:
+def regular(sides: int, radius: float) -> Floats:
     """Outline of a regular polygon around zero: (sides, 2)."""
     angle = 2 * np.pi * (np.arange(sides) + 0.5) / sides
     return radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)

@@ -14,9 +14,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import Floats, Ints
 from ..base.words import counted
 from .colours import Colours, as_bytes
 from .mesh import Mesh
@@ -155,7 +155,7 @@ class _City:
             else:
                 self._left[str(kind)[:40]] += 1
 
-    def _place(self, name: str, geometry: _Json, points: NDArray[np.float64]) -> None:
+    def _place(self, name: str, geometry: _Json, points: Floats) -> None:
         """Place a template at a point."""
         if self._templates is None:
             given = self._head["geometry-templates"]
@@ -169,7 +169,7 @@ class _City:
         self._placed += [Place(mesh, matrix, name) for mesh in meshes]
 
     def _built(
-        self, points: NDArray[np.float64], wanted: list[tuple[str, list[_Json]]], document: _Json
+        self, points: Floats, wanted: list[tuple[str, list[_Json]]], document: _Json
     ) -> list[list[Mesh]]:
         """Make a mesh of the surfaces of each object, or none if it has no triangles.
 
@@ -177,7 +177,7 @@ class _City:
         """
         corners, sizes = [np.zeros(0, np.int64)], []  # of polygons without holes
         owners: list[tuple[int, int]] = []  # of each its object and material
-        cut: list[NDArray[np.int64]] = []  # triangles of those with holes
+        cut: list[Ints] = []  # triangles of those with holes
         cut_owners: list[tuple[int, int]] = []
         for number, (name, geometries) in enumerate(wanted):
             own: list[int] = []
@@ -283,7 +283,7 @@ class _City:
         return (self._head.get("metadata") or {}).get("referenceSystem")
 
 
-def _points(rows: Any) -> NDArray[np.float64]:
+def _points(rows: Any) -> Floats:
     """Coordinates (v, 3); ValueError if they are not."""
     points = np.array(rows or np.zeros((0, 3)), np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
@@ -291,7 +291,7 @@ def _points(rows: Any) -> NDArray[np.float64]:
     return points
 
 
-def _whole(numbers: Sequence[int]) -> NDArray[np.int64]:
+def _whole(numbers: Sequence[int]) -> Ints:
     """Whole numbers (n,); ValueError if they are not."""
     array = np.array(numbers or np.zeros(0, np.int64))
     if array.ndim != 1 or array.dtype != np.int64:

@@ -8,12 +8,11 @@ from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..base.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.errors import LidarpoolError
 from ..base.words import counted
-
-Bytes = NDArray[np.uint8]
 
 # What has no colour is grey, of half of the light, as the default reflectance is.
 GREY = np.full((1, 1, 3), 188, np.uint8)
@@ -58,8 +57,8 @@ class Colours:
     """
 
     images: tuple[Bytes, ...]
-    image: NDArray[np.int32]
-    uv: NDArray[np.float32] | None = None
+    image: Ints32
+    uv: Floats32 | None = None
     corners: Bytes | None = None
 
     def __len__(self) -> int:
@@ -75,13 +74,13 @@ class Colours:
         """Give each face a colour of its own, (f, 3)."""
         return replace(cls.plain(WHITE, len(colours)), corners=colours[:, None].repeat(3, axis=1))
 
-    def take(self, rows: NDArray[np.integer[Any]] | slice) -> Colours:
+    def take(self, rows: Integers | slice) -> Colours:
         """Select faces."""
         uv = None if self.uv is None else self.uv[rows]
         corners = None if self.corners is None else self.corners[rows]
         return Colours(self.images, self.image[rows], uv, corners)
 
-    def divided(self, rows: NDArray[np.integer[Any]], weights: NDArray[np.float64]) -> Colours:
+    def divided(self, rows: Integers, weights: Floats) -> Colours:
         """Colours of pieces of faces (k,), whose corners have these weights of theirs (k, 3, 3)."""
         whole = self.take(rows)
         uv = None if whole.uv is None else (weights @ whole.uv).astype(np.float32)
@@ -130,7 +129,7 @@ FEW_FACES = 20_000
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
-def _within(numbers: NDArray[np.int32], count: int) -> bool:
+def _within(numbers: Ints32, count: int) -> bool:
     return not len(numbers) or 0 <= numbers.min() <= numbers.max() < count
 
 
@@ -145,7 +144,7 @@ class Lookup:
         (k, 3, 3) each: corners of the faces, one block after the other.
     """
 
-    def __init__(self, colours: Colours, corners: Iterable[NDArray[np.float64]]) -> None:
+    def __init__(self, colours: Colours, corners: Iterable[Floats]) -> None:
         images, tints = colours.images, colours.corners
         self._image = colours.image
         self._texels = np.concatenate([packed(one.reshape(-1, 3)) for one in images])
@@ -170,7 +169,7 @@ class Lookup:
         self._texture = _Planes.of(own, textures)
         self._light = _Planes.of(tinted, lights)
 
-    def at(self, rows: NDArray[np.integer[Any]], points: NDArray[np.float64]) -> NDArray[np.uint32]:
+    def at(self, rows: Integers, points: Floats) -> UInts32:
         """Colours of points (n, 3) on faces (n,), packed; of images the nearest element."""
         image = self._image.take(rows)
         at = self._first.take(image)
@@ -192,21 +191,19 @@ class Lookup:
 class _Planes(NamedTuple):
     """Values on faces that are linear in the position."""
 
-    place: NDArray[np.int32]  # (f,): row of `slopes` that each face has; -1 for none
-    slopes: NDArray[np.float64]  # (k, 4 w): of each of w values, along x, y and z, and at zero
+    place: Ints32  # (f,): row of `slopes` that each face has; -1 for none
+    slopes: Floats  # (k, 4 w): of each of w values, along x, y and z, and at zero
     everywhere: bool
 
     @classmethod
-    def of(cls, there: NDArray[np.bool_], blocks: list[NDArray[np.float64]]) -> _Planes | None:
+    def of(cls, there: Bools, blocks: list[Floats]) -> _Planes | None:
         """Join blocks (k, 4 w), of the faces (f,) that have some; None if there are none."""
         if not there.any():
             return None
         place = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
         return cls(place, np.concatenate(blocks), bool(there.all()))
 
-    def at(
-        self, rows: NDArray[np.integer[Any]], points: NDArray[np.float64]
-    ) -> tuple[Any, NDArray[np.float64]]:
+    def at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
         """Which of the faces (n,) have values, and the values at points (3, n): (w, m)."""
         on: Any = slice(None)
         place = self.place.take(rows)
@@ -224,7 +221,7 @@ class _Planes(NamedTuple):
         return on, out
 
 
-def _planes(corners: NDArray[np.float64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _planes(corners: Floats, values: Floats) -> Floats:
     """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w), see `_Planes`.
 
     Flat triangles, which are not hit, have the value of their first corner.
@@ -241,31 +238,31 @@ def _planes(corners: NDArray[np.float64], values: NDArray[np.float64]) -> NDArra
     return out.reshape(len(corners), 4 * values.shape[2])
 
 
-def _element(place: NDArray[np.float64], size: NDArray[np.int64]) -> NDArray[np.int64]:
+def _element(place: Floats, size: Ints) -> Ints:
     """Which of so many elements of an image that repeats a texture coordinate is in: (n,)."""
     within = place - np.floor(place)
     within *= size
     return np.minimum(within.astype(np.int64), size - 1)
 
 
-def packed(colours: Bytes) -> NDArray[np.uint32]:
+def packed(colours: Bytes) -> UInts32:
     """Colours (n, 3) as one number each, red in its lowest byte."""
     out = np.zeros((len(colours), 4), np.uint8)
     out[:, :3] = colours
     return out.view("<u4")[:, 0]
 
 
-def unpacked(colours: NDArray[np.uint32]) -> Bytes:
+def unpacked(colours: UInts32) -> Bytes:
     """Undo `packed`."""
     return np.ascontiguousarray(colours, "<u4").view(np.uint8).reshape(-1, 4)[:, :3]
 
 
-def as_float(red: Bytes, green: Bytes, blue: Bytes) -> NDArray[np.float32]:
+def as_float(red: Bytes, green: Bytes, blue: Bytes) -> Floats32:
     """Colours (n,) as PCL and ROS have them in a field `rgb`: the bits 0x00RRGGBB as a float."""
     return packed(np.column_stack([blue, green, red])).view("<f4")
 
 
-def luminance(colours: NDArray[np.uint32]) -> NDArray[np.float64]:
+def luminance(colours: UInts32) -> Floats:
     """Luminance (n,) of packed colours in linear light, 0 to 1."""
     red, green, blue = map(np.take, _SHARES, unpacked(colours).T)
     return np.asarray(red + green + blue)

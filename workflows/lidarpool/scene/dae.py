@@ -18,13 +18,13 @@ from urllib.parse import unquote
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import Bytes, Floats, Ints
 from ..base.xmlfile import xml_root
 from .beside import file_beside, spellings
 from .colours import Colours, as_bytes
-from .masks import Colour, MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
+from .masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
 from .mesh import Mesh
 from .nodes import (
     SMALLER,
@@ -39,9 +39,6 @@ from .nodes import (
 )
 from .polygons import check_corners, fanned, triangulated, unrolled, with_holes
 from .transform import rotation_about
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 _WRAPS: dict[str, Wrap] = {"CLAMP": "clamp", "BORDER": "clamp", "MIRROR": "mirror"}
 _SURFACES = ("triangles", "polylist", "polygons", "tristrips", "trifans")
@@ -135,7 +132,7 @@ class _Document:
         for kind in ("convex_mesh", "brep"):
             if geometry.find(kind) is not None:
                 raise MeshFileError(f"has a <{kind}>, which is not read: export it as triangles")
-        faces: dict[Element, list[Int]] = {}  # {where their points are: faces}
+        faces: dict[Element, list[Ints]] = {}  # {where their points are: faces}
         painted: list[Piece] = []
         for primitive in geometry.findall("mesh/*"):
             if primitive.tag in _SURFACES:
@@ -161,7 +158,7 @@ class _Document:
         return tuple((symbol, material) for symbol, material in found if material is not None)
 
     def _painted(
-        self, primitive: Element, points: Float, offset: int, stride: int, material: Element
+        self, primitive: Element, points: Floats, offset: int, stride: int, material: Element
     ) -> Piece:
         """Triangles of a primitive, in the colours of a material."""
         assert self._paint is not None
@@ -186,7 +183,7 @@ class _Document:
                     colours = Colours.plain(shade, len(faces))
         return Piece(points, faces, colours=colours)
 
-    def _coordinates(self, primitive: Element) -> tuple[Float, int]:
+    def _coordinates(self, primitive: Element) -> tuple[Floats, int]:
         """Texture coordinates (c, 2) of a primitive, and the place of their numbers in <p>."""
         inputs = [e for e in primitive.findall("input") if e.get("semantic") == "TEXCOORD"]
         if not inputs:
@@ -207,7 +204,7 @@ class _Document:
             raise ValueError(f"<{primitive.tag}> has no vertices")
         return *found, stride
 
-    def _read_points(self, vertices: Element) -> Float:
+    def _read_points(self, vertices: Element) -> Floats:
         """Positions (v, 3) of <vertices>."""
         entry = vertices.find("input[@semantic='POSITION']")
         if entry is None:
@@ -223,7 +220,7 @@ class _Document:
         self._allowance.take(24 * len(rows))
         return rows[:, columns]
 
-    def _rows(self, source: Element) -> Float:
+    def _rows(self, source: Element) -> Floats:
         """Numbers (count, stride) of a <source>."""
         accessor = source.find("technique_common/accessor")
         if accessor is None:
@@ -246,9 +243,7 @@ class _Effects:
         self._path, self._wanted, self._allowance = path, wanted, allowance
         self._texture = remembered(self._read_texture)
 
-    def shade(
-        self, effect: Element, ids: dict[tuple[str, str], Element]
-    ) -> Texture | Colour | None:
+    def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
         """Image or colour, (1, 1, 3), of an effect; None if it has none."""
         diffuse = effect.find(".//technique/*/diffuse")
         if diffuse is None:
@@ -289,7 +284,9 @@ class _Effects:
         return Texture(image, (along, across), self._allowance)
 
 
-def _faces(primitive: Element, points: Float, corners: Callable[[Element], Int]) -> Iterator[Int]:
+def _faces(
+    primitive: Element, points: Floats, corners: Callable[[Element], Ints]
+) -> Iterator[Ints]:
     """Triangles (t, 3) of a primitive, piece by piece; `corners` are those of a <p> or <h>."""
     lists = [corners(p) for p in primitive.findall("p")]
     if primitive.tag == "triangles":
@@ -312,26 +309,26 @@ def _faces(primitive: Element, points: Float, corners: Callable[[Element], Int])
             yield with_holes(points, [corners(ring) for ring in holed])
 
 
-def _corners(element: Element, offset: int, stride: int) -> Int:
+def _corners(element: Element, offset: int, stride: int) -> Ints:
     """Numbers of vertices in a <p> or <h>."""
     return _integers(element)[offset::stride]
 
 
-def _integers(element: Element) -> Int:
+def _integers(element: Element) -> Ints:
     return np.array((element.text or "").split(), np.int64)
 
 
-def _numbers(element: Element) -> Float:
+def _numbers(element: Element) -> Floats:
     return np.array((element.text or "").split(), np.float64)
 
 
-def _translate(numbers: Float) -> Float:
+def _translate(numbers: Floats) -> Floats:
     out = np.eye(4)
     out[:3, 3] = numbers
     return out
 
 
-def _rotate(numbers: Float) -> Float:
+def _rotate(numbers: Floats) -> Floats:
     """Rotation about an axis, in degrees; some programs write no axis."""
     *axis, degrees = numbers
     out = np.eye(4)
@@ -340,7 +337,7 @@ def _rotate(numbers: Float) -> Float:
     return out
 
 
-def _look_at(numbers: Float) -> Float:
+def _look_at(numbers: Floats) -> Floats:
     eye, target, up = numbers.reshape(3, 3)
     z = (eye - target) / np.linalg.norm(eye - target)
     x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Floats, Indices, Ints, Ints32
 from .colours import Colours, joined
 from .instances import Instances, Part
 from .mesh import stacked, triangle_areas
@@ -28,13 +27,11 @@ class Drawn:
     """
 
     scene: Scene
-    counter: NDArray[np.intp]
+    counter: Indices
     same: bool = False
 
     @classmethod
-    def of(
-        cls, scene: Scene, most: int = DRAWN_TRIANGLES, near: Sequence[NDArray[np.float64]] = ()
-    ) -> Drawn:
+    def of(cls, scene: Scene, most: int = DRAWN_TRIANGLES, near: Sequence[Floats] = ()) -> Drawn:
         """Copy all instances to their places, with at most about so many triangles.
 
         Those close to places `near`, (k, 3) each, local coordinates, have more of them.
@@ -69,7 +66,7 @@ class Drawn:
         )
         return cls(drawn, np.concatenate(counters))
 
-    def hits(self, counts: NDArray[Any]) -> NDArray[Any]:
+    def hits(self, counts: AnyArray) -> AnyArray:
         """Hits of each triangle that is drawn, from counters; those of actors follow."""
         if self.same:
             return counts
@@ -121,9 +118,7 @@ def _cut(part: Part, most: float) -> Part:
     return Part(vertices, np.arange(len(vertices), dtype=np.int32).reshape(-1, 3), colours=colours)
 
 
-def _shares(
-    shared: Instances, most: int, near: Sequence[NDArray[np.float64]]
-) -> NDArray[np.float64]:
+def _shares(shared: Instances, most: int, near: Sequence[Floats]) -> Floats:
     """Share of its triangles that each instance has in a drawing, (n,).
 
     Half of all are shared evenly, the others by the square of the distance to the nearest place:
@@ -147,9 +142,7 @@ def _shares(
         full *= 0.9
 
 
-def _fewer(
-    part: Part, most: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.intp]]:
+def _fewer(part: Part, most: int) -> tuple[Floats, Ints32, Indices]:
     """Vertices and at most so many faces that stand for a part, and which each was.
 
     Of many small pieces, as a tree's leaves are, merged vertices would leave little. There the
@@ -174,7 +167,7 @@ def _fewer(
     return larger.reshape(-1, 3), np.arange(3 * most, dtype=np.int32).reshape(-1, 3), kept
 
 
-def simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
+def simplified(scene: Scene, most: int) -> tuple[Scene, Ints]:
     """Give a scene of fewer triangles; and for each triangle of this one which stands for it.
 
     That is -1 where nothing is left of a small object.
@@ -186,9 +179,7 @@ def simplified(scene: Scene, most: int) -> tuple[Scene, NDArray[np.int64]]:
     return made, stands
 
 
-def _merged(
-    points: NDArray[np.float64], corners: NDArray[np.int32], most: int
-) -> tuple[NDArray[np.float64], NDArray[np.int32], NDArray[np.intp], NDArray[np.int64]]:
+def _merged(points: Floats, corners: Ints32, most: int) -> tuple[Floats, Ints32, Indices, Ints]:
     """Merge vertices in the same cell of a grid (Rossignac and Borrel, 1993).
 
     Returns vertices, faces (f, 3), those that are kept, at most so many, and what `simplified`
@@ -220,7 +211,7 @@ def _merged(
     return vertices, faces, kept, stands
 
 
-def _numbered(rows: NDArray[Any]) -> NDArray[np.int64]:
+def _numbered(rows: AnyArray) -> Ints:
     """Numbers (n,) of rows of natural numbers (n, 3), in their order: sorted fast, unlike rows."""
     number = np.zeros(len(rows), np.int64)
     for column in rows.T.astype(np.int64):

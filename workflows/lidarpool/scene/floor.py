@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..base.arrays import Bools, Floats, Indices
 from .scene import Scene
-
-Float = NDArray[np.float64]
 
 # More than the thickness of floors: a sensor stands inside thicker things, such as a box hall.
 SLAB_M = 0.5
@@ -29,13 +28,13 @@ def room_at(scene: Scene, x: float, y: float) -> tuple[float, float]:
     return float(floor + scene.origin[2]), float(ceiling + scene.origin[2])
 
 
-def heights_at(scene: Scene, x: float, y: float) -> Float:
+def heights_at(scene: Scene, x: float, y: float) -> Floats:
     """Heights (k,), world metres, at which a vertical line at a place crosses triangles."""
     heights, _ = _crossings(scene, np.array([x, y]) - scene.origin[:2])
     return heights + scene.origin[2]
 
 
-def reaching(scene: Scene, low: ArrayLike, high: ArrayLike) -> NDArray[np.intp]:
+def reaching(scene: Scene, low: ArrayLike, high: ArrayLike) -> Indices:
     """Triangles that may reach into a box, or a rectangle seen from above, local: (k,)."""
     found = np.arange(len(scene.faces))
     for axis, (least, most) in enumerate(zip(np.asarray(low), np.asarray(high), strict=True)):
@@ -44,7 +43,7 @@ def reaching(scene: Scene, low: ArrayLike, high: ArrayLike) -> NDArray[np.intp]:
     return found
 
 
-def _crossings(scene: Scene, at: Float) -> tuple[Float, NDArray[np.bool_]]:
+def _crossings(scene: Scene, at: Floats) -> tuple[Floats, Bools]:
     """Heights (k,) at which a vertical line crosses triangles, and which of them face up."""
     a, b, c = np.moveaxis(scene.vertices[scene.faces[reaching(scene, at, at)]], 1, 0)
     # Twice the areas of the triangles that the place makes with each side, seen from above.
@@ -55,7 +54,7 @@ def _crossings(scene: Scene, at: Float) -> tuple[Float, NDArray[np.bool_]]:
     return (corners * parts[here]).sum(axis=1) / whole[here], whole[here] > 0
 
 
-def _areas(p: Float, q: Float, at: Float) -> Float:
+def _areas(p: Floats, q: Floats, at: Floats) -> Floats:
     """Twice the areas of p, q and a place from above, positive where they turn left: (f,)."""
     to_p, to_q = p[:, :2] - at, q[:, :2] - at
     return np.asarray(to_p[:, 0] * to_q[:, 1] - to_p[:, 1] * to_q[:, 0])

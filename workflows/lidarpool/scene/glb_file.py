@@ -12,9 +12,9 @@ from itertools import groupby
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
+from ..base.arrays import AnyArray, Bytes, Floats, Indices
 from ..base.errors import LidarpoolError
 from .colours import LINEAR
 from .instances import Instance
@@ -52,7 +52,7 @@ def glb_of(scene: Scene) -> bytes:
 class _Writer:
     """The JSON object of a file, and its buffer."""
 
-    def __init__(self, origin: NDArray[np.float64]) -> None:
+    def __init__(self, origin: Floats) -> None:
         self._origin = origin
         self._pieces: list[bytes] = []
         self._size = 0
@@ -128,9 +128,9 @@ class _Writer:
     def _corners(
         self,
         mesh: Mesh,
-        rows: NDArray[np.intp],
-        uv: NDArray[Any] | None,
-        tints: NDArray[np.uint8] | None,
+        rows: Indices,
+        uv: AnyArray | None,
+        tints: Bytes | None,
     ) -> dict[str, int]:
         """Attributes of some triangles (k,), whose corners have their own (k, 3, …)."""
         corners = mesh.vertices[mesh.faces[rows]].reshape(-1, 3) @ UP_AXES["y"]
@@ -142,7 +142,7 @@ class _Writer:
             attributes["COLOR_0"] = self._array(light, "VEC3")
         return attributes
 
-    def _array(self, rows: NDArray[Any], kind: str) -> int:
+    def _array(self, rows: AnyArray, kind: str) -> int:
         """Add an accessor of attributes, or of indices (scalars); its number."""
         view = self._view(rows.tobytes(), target=34963 if kind == "SCALAR" else 34962)
         limits = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
@@ -159,7 +159,7 @@ class _Writer:
         self._size += len(data)
         return self._put("bufferViews", view)
 
-    def _material(self, image: NDArray[Any]) -> int:
+    def _material(self, image: AnyArray) -> int:
         """Return the number of the material of a mask, bool (h, w), or of an image or colour."""
         key = id(image)
         if key not in self._materials:

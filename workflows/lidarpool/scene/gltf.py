@@ -20,15 +20,14 @@ from typing import Any, TypeVar
 from urllib.parse import unquote_to_bytes
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import AnyArray, Bytes, Floats, Ints
 from ..base.words import counted
 from .beside import file_beside, spellings
 from .colours import LINEAR, WHITE, Colours, as_srgb
 from .masks import (
     FACE_BYTES,
-    Colour,
     MaskError,
     MaskNotes,
     Texture,
@@ -180,7 +179,7 @@ class _Reader:
                 copies = self._copies(instancing.get("attributes", {}))
         return Node(name, _matrix(found), meshes, found.get("children", ()), copies)
 
-    def _copies(self, attributes: dict[str, Any]) -> NDArray[np.float64] | None:
+    def _copies(self, attributes: dict[str, Any]) -> Floats | None:
         """Matrices (k, 4, 4) of the copies of a node's mesh; None if it has one place."""
         named = ("TRANSLATION", "ROTATION", "SCALE")
         indices = {name: attributes[name] for name in named if name in attributes}
@@ -211,7 +210,7 @@ class _Reader:
             return ()
         return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
 
-    def _world(self, index: int) -> NDArray[np.float64]:
+    def _world(self, index: int) -> Floats:
         """Matrix (4, 4) from a node's coordinates to those of the scene."""
         matrix, seen = np.eye(4), set()
         at: int | None = index
@@ -250,7 +249,7 @@ class _Reader:
 
         return joined(name, map(piece, surfaces), self._allowance)
 
-    def _joints(self, skin: int) -> NDArray[np.float64]:
+    def _joints(self, skin: int) -> Floats:
         """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
         found = self._part("skins", skin)
         worlds = np.array([self._world(joint) for joint in found["joints"]])
@@ -259,9 +258,7 @@ class _Reader:
             worlds = worlds @ columns.reshape(-1, 4, 4).transpose(0, 2, 1)
         return worlds
 
-    def _skinned(
-        self, vertices: NDArray[np.float64], at: dict[str, Any], joints: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:
         """Blend places of vertices (v, 3) by the joints that hold them."""
         blend, total = np.zeros((len(vertices), 4, 4)), np.zeros(len(vertices))
         sets = (name.removeprefix("JOINTS") for name in sorted(at) if name.startswith("JOINTS_"))
@@ -311,9 +308,7 @@ class _Reader:
                 piece = piece._replace(colours=self._coloured(primitive, piece.faces, mesh))
         return self._cut(piece, primitive, mesh)
 
-    def _coloured(
-        self, primitive: dict[str, Any], faces: NDArray[np.int64], mesh: Any
-    ) -> Colours | None:
+    def _coloured(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colours | None:
         """Colours of triangles; None if they have none."""
         number, corners, colours = primitive.get("material"), None, None
         if not self._allowance.fits(FACE_BYTES * len(faces)):
@@ -333,7 +328,7 @@ class _Reader:
                 colours = Colours.plain(base, len(faces))
         return colours and replace(colours, corners=corners)
 
-    def _read_base(self, number: int) -> tuple[Texture | Colour, dict[str, Any]]:
+    def _read_base(self, number: int) -> tuple[Texture | Bytes, dict[str, Any]]:
         """Return the texture of a material's base colour, and its use, or one colour (1, 1, 3)."""
         material = self._part("materials", number)
         info, factor = _base_of(material)
@@ -414,7 +409,7 @@ class _Reader:
         assert opacity is not None
         return Texture(opacity >= least, (along, across), self._allowance)
 
-    def _read_opacity(self, index: int) -> NDArray[np.uint8] | None:
+    def _read_opacity(self, index: int) -> Bytes | None:
         """Opacity of an image; None if it is opaque everywhere."""
         return self._image(index, read_opacity)
 
@@ -455,7 +450,7 @@ class _Reader:
             uv = uv @ np.array([[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
         return uv
 
-    def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> NDArray[Any]:
+    def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
         """Numbers (v, width) of the vertices of a primitive."""
         accessor = primitive["attributes"][name]
         if mesh is None:
@@ -465,7 +460,7 @@ class _Reader:
         normal = self._part("accessors", accessor).get("normalized")
         return self._normalised(rows) if normal else rows
 
-    def _read_accessor(self, index: int) -> NDArray[Any]:
+    def _read_accessor(self, index: int) -> AnyArray:
         """Numbers (count, width) of an accessor; those of a buffer are not copied."""
         accessor = self._part("accessors", index)
         count, width = _natural(accessor["count"]), _WIDTHS[accessor["type"]]
@@ -487,7 +482,7 @@ class _Reader:
             numbers[rows] = self._array(values, kind, sparse["count"], width)
         return self._normalised(numbers) if accessor.get("normalized") else numbers
 
-    def _normalised(self, numbers: NDArray[Any]) -> NDArray[Any]:
+    def _normalised(self, numbers: AnyArray) -> AnyArray:
         """Fractions that integers stand for; glTF 2.0, 3.6.2.2."""
         if numbers.dtype.kind not in "iu":
             return numbers
@@ -575,7 +570,7 @@ def _natural(number: Any) -> int:
     return number
 
 
-def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
+def _matrix(node: dict[str, Any]) -> Floats:
     """Matrix (4, 4) of a node, from its columns or from translation, rotation and scale."""
     if "matrix" in node:
         return np.array(node["matrix"], np.float64).reshape(4, 4).T
@@ -588,10 +583,10 @@ def _matrix(node: dict[str, Any]) -> NDArray[np.float64]:
 
 
 def _matrices(
-    translation: NDArray[np.float64] | None,
-    rotation: NDArray[np.float64] | None,
-    scale: NDArray[np.float64] | None,
-) -> NDArray[np.float64] | None:
+    translation: Floats | None,
+    rotation: Floats | None,
+    scale: Floats | None,
+) -> Floats | None:
     """Matrices (k, 4, 4) of translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
     rows = next((one for one in (translation, rotation, scale) if one is not None), None)
     if rows is None:

@@ -6,12 +6,13 @@ from collections.abc import Iterator
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..base.arguments import checked_fields
+from ..base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..sensor import Pose
 from .colours import Colours
@@ -21,8 +22,6 @@ from .transform import Transform
 # Nothing on Earth is farther from the origin of its map; see also `sections.Coordinate`.
 FARTHEST_M = 1e8
 BLOCK_POINTS = 1 << 15  # points that are placed at a time, to fit a cache
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,7 +63,7 @@ class Instance:
         object.__setattr__(self, "name", self.name or self.mesh.name)
 
     @classmethod
-    def several(cls, mesh: Mesh, transforms: Float, name: str) -> list[Instance]:
+    def several(cls, mesh: Mesh, transforms: Floats, name: str) -> list[Instance]:
         """Instances of a mesh at (n, 4, 4), checked all at once; LidarpoolError as of one."""
         linear = transforms[:, :3, :3]
         well = np.isfinite(transforms).all() and (np.abs(transforms[:, :3, 3]) <= FARTHEST_M).all()
@@ -77,11 +76,11 @@ class Instance:
         return made
 
     @property
-    def matrix(self) -> Float:
+    def matrix(self) -> Floats:
         """Its transform as a matrix, (4, 4)."""
         return np.asarray(self.transform)
 
-    def moved(self, name: str, linear: Float, offset: Float) -> Instance:
+    def moved(self, name: str, linear: Floats, offset: Floats) -> Instance:
         """Return it under a name, its place taken through p -> linear @ p + offset."""
         matrix = np.eye(4)
         matrix[:3, :3] = linear @ self.matrix[:3, :3]
@@ -93,7 +92,7 @@ class Instance:
         return self.mesh.moved(self.name, self.matrix[:3, :3], self.matrix[:3, 3])
 
 
-def check_near(position: Float) -> None:
+def check_near(position: Floats) -> None:
     """Check that a place (3,) is on Earth; LidarpoolError if it is farther than `FARTHEST_M`."""
     if not (np.abs(position) <= FARTHEST_M).all():
         raise LidarpoolError(
@@ -105,10 +104,10 @@ def check_near(position: Float) -> None:
 class Part(NamedTuple):
     """Triangles that instances share, all opaque or all with one mask."""
 
-    vertices: Float  # (v, 3), in the axes of their mesh
-    faces: NDArray[np.int32]  # (f, 3)
-    mask: NDArray[np.bool_] | None = None  # (h, w), see `Cutout`
-    uv: NDArray[np.float32] | None = None  # (f, 3, 2)
+    vertices: Floats  # (v, 3), in the axes of their mesh
+    faces: Ints32  # (f, 3)
+    mask: Bools | None = None  # (h, w), see `Cutout`
+    uv: Floats32 | None = None  # (f, 3, 2)
     colours: Colours | None = None
     voxels: Voxels | None = None  # leaves within
 
@@ -127,7 +126,7 @@ def parts_of(mesh: Mesh) -> Iterator[Part]:
         start = stop
 
 
-def _used(vertices: Float, faces: NDArray[Any]) -> tuple[Float, NDArray[np.int32]]:
+def _used(vertices: Floats, faces: AnyArray) -> tuple[Floats, Ints32]:
     used, corners = np.unique(faces, return_inverse=True)
     return vertices[used], corners.reshape(-1, 3).astype(np.int32)
 
@@ -149,15 +148,15 @@ class Instances:
     """
 
     parts: tuple[Part, ...]
-    part: NDArray[np.intp]
-    transforms: Float
-    owner: NDArray[np.int32]
+    part: Indices
+    transforms: Floats
+    owner: Ints32
 
     def __len__(self) -> int:
         return len(self.part)
 
     @cached_property
-    def sizes(self) -> NDArray[np.int64]:
+    def sizes(self) -> Ints:
         """Triangles of each instance, (n,)."""
         return np.array([len(part.faces) for part in self.parts], np.int64)[self.part]
 
@@ -166,7 +165,7 @@ class Instances:
         """Triangles of all instances."""
         return int(self.sizes.sum())
 
-    def placed(self) -> Iterator[tuple[NDArray[np.intp], Float]]:
+    def placed(self) -> Iterator[tuple[Indices, Floats]]:
         """Vertices of some instances (k,) of one part, local to the scene: (k, 3, v)."""
         for number in np.unique(self.part):
             part, rows = self.parts[number], np.flatnonzero(self.part == number)
@@ -183,14 +182,14 @@ class Instances:
                 yield some, points
 
     @cached_property
-    def bounds(self) -> Float:
+    def bounds(self) -> Floats:
         """Lowest and highest corner of each instance, local: (n, 2, 3)."""
         out = np.empty((len(self), 2, 3))
         for rows, points in self.placed():
             out[rows] = np.stack([points.min(axis=2), points.max(axis=2)], axis=1)
         return out
 
-    def reach(self, centres: Float) -> Float:
+    def reach(self, centres: Floats) -> Floats:
         """Farthest that each instance is from a point of its own (n, 2), seen from above: (n,)."""
         out = np.empty(len(self))
         for rows, points in self.placed():
@@ -198,7 +197,7 @@ class Instances:
             out[rows] = np.sqrt((x * x + y * y).max(axis=1))
         return out
 
-    def moved(self, owner: int, position: Float, rotation: Float | None) -> Instances:
+    def moved(self, owner: int, position: Floats, rotation: Floats | None) -> Instances:
         """Return them with those of an object in another place, at their present scale."""
         check_near(position)
         rows = np.flatnonzero(self.owner == owner)
@@ -215,7 +214,7 @@ class Instances:
         return made
 
 
-def scale_of(matrix: Float) -> Float:
+def scale_of(matrix: Floats) -> Floats:
     """Take the rotation off a matrix (3, 3), by polar decomposition: what it scales and mirrors.
 
     It is rounded to 12 digits: a factor of 1.4 stays one however often something is moved.

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 from PIL import Image
 
 from ..base.allowance import Allowance
+from ..base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
 from ..base.words import printable
 from .colours import Colours
 from .mesh import UV_MOST, Cutout
@@ -26,8 +26,6 @@ FACE_BYTES = 120  # of a triangle while its texture coordinates are made
 NAMED = 3  # materials that a note names
 SIDE_MOST = 4096  # pixels of an image of colours; larger ones are made smaller
 
-Mask = NDArray[np.bool_]
-Colour = NDArray[np.uint8]
 Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
 K = TypeVar("K", bound=Hashable)
 V = TypeVar("V")
@@ -37,9 +35,7 @@ class MaskError(Exception):
     """Why a mask cannot be read, as a clause."""
 
 
-def read_opacity(
-    image: Path | bytes, allowance: Allowance, *, grey: bool = False
-) -> NDArray[np.uint8] | None:
+def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = False) -> Bytes | None:
     """Opacity of an image: its alpha channel, or else, with `grey`, its brightness.
 
     Returns
@@ -54,7 +50,7 @@ def read_opacity(
     return _read(image, lambda opened: _decoded(opened, allowance, grey))
 
 
-def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Colour:
+def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
     """Colours of an image: (h, w, 3), sRGB.
 
     It is made smaller if it is more than `SIDE_MOST` wide or high, and noted.
@@ -109,7 +105,7 @@ def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
     return once
 
 
-def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np.uint8] | None:
+def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> Bytes | None:
     if not (grey or image.has_transparency_data):
         return None
     pixels = image.width * image.height
@@ -129,7 +125,7 @@ def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> NDArray[np
     return np.asarray(image.convert("L"))
 
 
-def _in_colour(image: Image.Image, allowance: Allowance, notes: MaskNotes) -> Colour:
+def _in_colour(image: Image.Image, allowance: Allowance, notes: MaskNotes) -> Bytes:
     if not allowance.fits(PIXEL_BYTES * image.width * image.height):
         raise _TooLargeError
     if image.mode.startswith("I;16"):  # which Pillow would clip
@@ -154,7 +150,7 @@ class Texture:
     """
 
     def __init__(
-        self, image: Mask | Colour, wraps: tuple[Wrap, Wrap], allowance: Allowance
+        self, image: Bools | Bytes, wraps: tuple[Wrap, Wrap], allowance: Allowance
     ) -> None:
         self._wraps, self._allowance = wraps, allowance
         _take(allowance, image.size)
@@ -164,18 +160,16 @@ class Texture:
                 image = np.concatenate([image, np.flip(image, axis)], axis)
         self._image = image
 
-    def cutout(self, coordinates: NDArray[Any], corners: NDArray[np.int64]) -> Cutout:
+    def cutout(self, coordinates: AnyArray, corners: Ints) -> Cutout:
         """Cut it out of triangles, see `on`."""
         return Cutout(*self.on(coordinates, corners))
 
-    def colours(self, coordinates: NDArray[Any], corners: NDArray[np.int64]) -> Colours:
+    def colours(self, coordinates: AnyArray, corners: Ints) -> Colours:
         """Colour triangles with it, see `on`."""
         image, uv = self.on(coordinates, corners)
         return Colours((image,), np.zeros(len(uv), np.int32), uv)
 
-    def on(
-        self, coordinates: NDArray[Any], corners: NDArray[np.int64]
-    ) -> tuple[NDArray[Any], NDArray[np.float32]]:
+    def on(self, coordinates: AnyArray, corners: Ints) -> tuple[AnyArray, Floats32]:
         """Put it on triangles, as in glTF.
 
         `coordinates` are (c, 2), and `corners` (k, 3) which of them each triangle has. Returns it
@@ -201,9 +195,7 @@ class Texture:
                 image = self._continued(image, uv[..., column], 1 - column, wrap == "black")
         return image, uv.astype(np.float32)
 
-    def _continued(
-        self, image: NDArray[Any], places: NDArray[np.float64], axis: int, black: bool
-    ) -> NDArray[Any]:
+    def _continued(self, image: AnyArray, places: Floats, axis: int, black: bool) -> AnyArray:
         """Continue an image as far as `places` (k, 3), which are changed, ask for it.
 
         By its edges, or black. A hundredth of a texel is the rounding of a program.

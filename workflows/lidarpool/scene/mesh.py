@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.arguments import as_array, checked_fields
+from ..base.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError
 from .colours import Colours
 
@@ -33,8 +34,8 @@ class Cutout:
         the mask repeats beyond.
     """
 
-    mask: NDArray[np.bool_]
-    uv: NDArray[np.float32]
+    mask: Bools
+    uv: Floats32
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,10 +51,10 @@ class Voxels:
         begins at zero, to coordinates of the mesh.
     """
 
-    density: NDArray[np.float32]
-    matrix: NDArray[np.float64]
+    density: Floats32
+    matrix: Floats
 
-    def moved(self, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Voxels:
+    def moved(self, linear: Floats, offset: Floats) -> Voxels:
         """Return it at p -> linear @ p + offset; the densities are shared, and stay per m³."""
         shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
         return Voxels(self.density, linear @ self.matrix + shift)
@@ -87,8 +88,8 @@ class Mesh:
     """
 
     name: str
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int64]
+    vertices: Floats
+    faces: Ints
     cutouts: tuple[Cutout, ...] = ()
     colours: Colours | None = None
     voxels: Voxels | None = None
@@ -119,11 +120,11 @@ class Mesh:
                 raise LidarpoolError(f"{self.name!r} has voxels and cutouts: leave out one.")
 
     @cached_property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """Lowest and highest corner of its vertices, (2, 3)."""
         return np.stack([self.vertices.min(axis=0), self.vertices.max(axis=0)])
 
-    def moved(self, name: str, linear: NDArray[np.float64], offset: NDArray[np.float64]) -> Mesh:
+    def moved(self, name: str, linear: Floats, offset: Floats) -> Mesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
         faces, cutouts, colours = self.faces, self.cutouts, self.colours
         if np.linalg.det(linear) < 0:
@@ -168,8 +169,8 @@ def _check_cutouts(name: str, cutouts: tuple[Cutout, ...], faces: int) -> None:
 
 
 def stacked(
-    parts: Iterable[tuple[NDArray[Any], NDArray[Any]]],
-) -> tuple[NDArray[Any], NDArray[Any]]:
+    parts: Iterable[tuple[AnyArray, AnyArray]],
+) -> tuple[AnyArray, AnyArray]:
     """Vertices and faces of several (vertices, faces), one after the other."""
     vertices, faces, first = [], [], 0
     for points, corners in parts:
@@ -179,7 +180,7 @@ def stacked(
     return np.concatenate(vertices), np.concatenate(faces)
 
 
-def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:
+def points_array(name: str, points: ArrayLike) -> Floats:
     """`points` as a contiguous float64 (n, 3) array of finite numbers.
 
     Raises
@@ -199,7 +200,7 @@ def points_array(name: str, points: ArrayLike) -> NDArray[np.float64]:
     return array
 
 
-def triangle_areas(corners: NDArray[np.floating[Any]]) -> NDArray[np.float64]:
+def triangle_areas(corners: NDArray[np.floating[Any]]) -> Floats:
     """Areas (n,) of triangles with these corners (n, 3, 3)."""
     sides = corners[:, 1:] - corners[:, :1]
     doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)

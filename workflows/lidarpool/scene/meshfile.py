@@ -11,10 +11,10 @@ from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import check_fits
 from ..base.arguments import checked
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, prefixed
 from ..base.vocabulary import UNITS_M
 from ..base.words import counted, did_you_mean, printable
@@ -412,7 +412,7 @@ def _at_first(actor: Actor) -> Mesh:
     return actor.mesh.moved(actor.name, turn, positions[0])
 
 
-def _corners(one: Mesh | Instance) -> NDArray[np.float64]:
+def _corners(one: Mesh | Instance) -> Floats:
     """Points that an object lies between, in the world."""
     if isinstance(one, Mesh):
         return one.bounds

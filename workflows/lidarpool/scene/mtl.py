@@ -10,23 +10,13 @@ from pathlib import Path, PureWindowsPath
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import Bytes, Floats, Ints
 from ..base.words import as_text
 from .beside import file_beside
 from .colours import Colours, as_bytes
-from .masks import (
-    HALF,
-    Colour,
-    MaskError,
-    MaskNotes,
-    Texture,
-    Wrap,
-    read_colours,
-    read_opacity,
-    remembered,
-)
+from .masks import HALF, MaskError, MaskNotes, Texture, Wrap, read_colours, read_opacity, remembered
 from .mesh import Cutout
 from .nodes import SMALLER, MeshFileError, Wanted
 
@@ -69,7 +59,7 @@ class _Image:
         """Whether it does not repeat."""
         return [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
 
-    def numbers(self, option: bytes, usual: float) -> NDArray[np.float64]:
+    def numbers(self, option: bytes, usual: float) -> Floats:
         """Two numbers of an option."""
         given = [float(word) for word in self.options.get(option, [])]
         return np.array((given + [usual] * 2)[:2])
@@ -80,7 +70,7 @@ class _Entry:
     """What a file says of a material."""
 
     images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
-    colour: Colour | None = None  # uint8 (1, 1, 3)
+    colour: Bytes | None = None  # uint8 (1, 1, 3)
 
 
 @dataclass
@@ -88,18 +78,18 @@ class ObjTexture:
     """The mask or the image of a material."""
 
     texture: Texture
-    scale: NDArray[np.float64]  # (2,)
-    offset: NDArray[np.float64]
+    scale: Floats  # (2,)
+    offset: Floats
 
-    def cutout(self, vt: NDArray[np.float64], corners: NDArray[np.int64]) -> Cutout:
+    def cutout(self, vt: Floats, corners: Ints) -> Cutout:
         """As `Texture.cutout`, but v of the coordinates (c, 2) grows upwards."""
         return self.texture.cutout(self._turned(vt), corners)
 
-    def colours(self, vt: NDArray[np.float64], corners: NDArray[np.int64]) -> Colours:
+    def colours(self, vt: Floats, corners: Ints) -> Colours:
         """As `Texture.colours`, but v of the coordinates (c, 2) grows upwards."""
         return self.texture.colours(self._turned(vt), corners)
 
-    def _turned(self, vt: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _turned(self, vt: Floats) -> Floats:
         u, v = (vt * self.scale + self.offset).T
         return np.column_stack([u, 1 - v])
 
@@ -139,9 +129,9 @@ class Materials:
                         found[name] = texture
         return found
 
-    def colours(self, used: Sequence[bytes]) -> dict[bytes, ObjTexture | Colour]:
+    def colours(self, used: Sequence[bytes]) -> dict[bytes, ObjTexture | Bytes]:
         """Images or colours, (1, 1, 3), of the used materials that have one."""
-        found: dict[bytes, ObjTexture | Colour] = {}
+        found: dict[bytes, ObjTexture | Bytes] = {}
         for name in used:
             entry = self._entries.get(name, _Entry())
             if (image := entry.images.get(b"map_kd")) is not None:
@@ -210,7 +200,7 @@ class Materials:
         wrap: Wrap = "clamp" if clamped else "repeat"
         return Texture(mask, (wrap, wrap), self._allowance)
 
-    def _read_opacity(self, key: tuple[str, bool]) -> NDArray[np.uint8] | None:
+    def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
         name, grey = key
         return read_opacity(self._there(name), self._allowance, grey=grey)
 

@@ -11,9 +11,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, bytes_of, memory_share
+from ..base.arrays import AnyArray, Floats, Ints
 from . import colours
 from .colours import Colours
 from .instances import Instance
@@ -58,10 +58,10 @@ class Moving(NamedTuple):
 
     name: str
     objects: Sequence[Mesh | Instance]
-    times_s: NDArray[np.float64]  # (k,), ascending, since the survey's start; before and after
+    times_s: Floats  # (k,), ascending, since the survey's start; before and after
     # them it stands
-    positions: NDArray[np.float64]  # (k, 3)
-    rotations: NDArray[np.float64]  # (k, 3, 3), perhaps rounded or scaled
+    positions: Floats  # (k, 3)
+    rotations: Floats  # (k, 3, 3), perhaps rounded or scaled
 
 
 @dataclass
@@ -88,18 +88,18 @@ class Node:
     """A node, which places meshes and other nodes."""
 
     name: str  # empty where the file has none
-    matrix: NDArray[np.float64]  # (4, 4), from its coordinates to those of its parent
+    matrix: Floats  # (4, 4), from its coordinates to those of its parent
     meshes: Sequence[Mesh] = ()  # in its coordinates; the same objects wherever a mesh is used
     children: Iterable[Hashable] = ()  # keys of the nodes in it
     # (k, 4, 4), to its coordinates: its meshes are in all these places; None for one
-    copies: NDArray[np.float64] | None = None
+    copies: Floats | None = None
 
 
 class Place(NamedTuple):
     """A mesh in its own coordinates, and where a scene graph places it."""
 
     mesh: Mesh
-    matrix: NDArray[np.float64]  # (4, 4), to the coordinates of the file
+    matrix: Floats  # (4, 4), to the coordinates of the file
     name: str
     path: tuple[str, ...] = ()  # names of the nodes that it is in, of the innermost few
 
@@ -191,8 +191,8 @@ def settled(placed: Sequence[Place]) -> Content:
 class Piece(NamedTuple):
     """Triangles of a mesh, all opaque or all with one mask."""
 
-    vertices: NDArray[Any]  # (v, 3)
-    faces: NDArray[np.int64]  # (f, 3)
+    vertices: AnyArray  # (v, 3)
+    faces: Ints  # (f, 3)
     cutout: Cutout | None = None
     colours: Colours | None = None
 

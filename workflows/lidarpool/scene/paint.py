@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools
 from .colours import Colours
 from .scene import Scene
 
@@ -49,7 +49,7 @@ def painted(scene: Scene) -> Scene:
     image = np.array(paints, np.int32)[owner]
     kind = np.array([_NAMES.index(kind) if kind in _PAINTS else -1 for kind in kinds])[owner]
 
-    def paint(which: str, where: NDArray[np.bool_], colour: str) -> None:
+    def paint(which: str, where: Bools, colour: str) -> None:
         image[(kind == _NAMES.index(which)) & where] = _FIRST[colour]
 
     paint("building", up > _UP, "tiles")

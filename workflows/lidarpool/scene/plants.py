@@ -10,12 +10,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats, Ints
 from .instances import Instance
 from .mesh import Mesh, stacked
-
-Float = NDArray[np.float64]
 
 SCALES = (0.7, 1.3)  # least and most of trees in a scene
 MOST_TREES = 100_000  # readers of mesh files take 200,000 nodes
@@ -105,7 +103,7 @@ def all_trees(seed: int, root_m: float) -> tuple[Mesh, ...]:
 
 
 def placed(
-    meshes: Sequence[Mesh], kind: NDArray[np.int64], places: Float, yaw: Float, scale: Float
+    meshes: Sequence[Mesh], kind: Ints, places: Floats, yaw: Floats, scale: Floats
 ) -> list[Instance]:
     """Place meshes upright: `kind` (n,) at places (n, 3), turned by `yaw` (n,), and scaled (n,)."""
     matrices = np.tile(np.eye(4), (len(kind), 1, 1))
@@ -116,7 +114,7 @@ def placed(
     return [Instance(meshes[k], matrix) for k, matrix in zip(kind, matrices, strict=True)]
 
 
-def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Float, Float]:
+def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Floats, Floats]:
     """Points (k, 3) from the root to the top, and radii (k,)."""
     share = np.linspace(0, 1, _STEM_STEPS)
     sway = np.cumsum(rng.normal(0, 0.012 * species.height_m, (_STEM_STEPS, 2)), axis=0)
@@ -130,8 +128,8 @@ def _stem(species: Species, root_m: float, rng: np.random.Generator) -> tuple[Fl
 
 
 def _branches(
-    species: Species, stem: Float, radii: Float, rng: np.random.Generator
-) -> tuple[Float, Float]:
+    species: Species, stem: Floats, radii: Floats, rng: np.random.Generator
+) -> tuple[Floats, Floats]:
     """Points (n, k, 3) of the branches, and radii (n, k)."""
     n = species.branches
     # As many where they are long as fill the crown evenly.
@@ -157,7 +155,7 @@ def _branches(
     return np.stack(points, axis=1), thick[:, None] * np.linspace(1, 0.25, _BRANCH_STEPS + 1)
 
 
-def _twigs(species: Species, branches: Float, rng: np.random.Generator) -> Float:
+def _twigs(species: Species, branches: Floats, rng: np.random.Generator) -> Floats:
     """Return ends of the twigs, (n, 2, 3), which spread from the outer part of each branch."""
     n, m = len(branches), species.twigs
     at = np.sort(rng.uniform(0.2, 1, (n, m)), axis=1)
@@ -173,9 +171,7 @@ def _twigs(species: Species, branches: Float, rng: np.random.Generator) -> Float
     return np.stack([foot, foot + along * length[..., None]], axis=2).reshape(-1, 2, 3)
 
 
-def _leaves(
-    species: Species, twigs: Float, rng: np.random.Generator
-) -> tuple[Float, NDArray[np.int64]]:
+def _leaves(species: Species, twigs: Floats, rng: np.random.Generator) -> tuple[Floats, Ints]:
     """Triangles around the twigs, each by itself."""
     n, m = len(twigs), species.leaves
     long, wide = species.leaf_m
@@ -190,7 +186,7 @@ def _leaves(
     return corners, np.arange(len(corners)).reshape(-1, 3)
 
 
-def _tubes(paths: Float, radii: Float, sides: int) -> tuple[Float, NDArray[np.int64]]:
+def _tubes(paths: Floats, radii: Floats, sides: int) -> tuple[Floats, Ints]:
     """Open tubes along paths (n, k, 3) with radii (n, k)."""
     n, k = radii.shape
     along = _unit(np.gradient(paths, axis=1))
@@ -214,5 +210,5 @@ def _tubes(paths: Float, radii: Float, sides: int) -> tuple[Float, NDArray[np.in
     return points.reshape(-1, 3), np.stack(corners, axis=-1).reshape(-1, 3)
 
 
-def _unit(vectors: Float) -> Float:
+def _unit(vectors: Floats) -> Floats:
     return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)

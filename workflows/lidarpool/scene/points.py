@@ -15,10 +15,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import bytes_of, check_fits, memory
 from ..base.arguments import checked
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, prefixed
 from ..base.open3d_module import load_open3d
 from ..base.words import printable
@@ -35,8 +35,6 @@ _SAMPLE = 20_000  # points whose neighbours tell the spacing
 _NEAREST = 9  # a point itself, and the eight around it on a square grid
 _RECORD = 54  # least bytes of a variable-length record of .las, all before the first point
 _BYTES = 700  # for a point while its surfel is made and written
-
-Float = NDArray[np.float64]
 
 
 @checked
@@ -105,7 +103,7 @@ def scene_of_points(path: str | Path, *, voxel_m: float | None = None, size: flo
     )
 
 
-def _corners(points: Float, covariances: Float, voxel_m: float, size: float) -> Float:
+def _corners(points: Floats, covariances: Floats, voxel_m: float, size: float) -> Floats:
     """Corners (n, 4, 3) of surfels."""
     out = np.empty((len(points), 4, 3))
     for begin in range(0, len(points), 1 << 18):
@@ -119,7 +117,7 @@ def _corners(points: Float, covariances: Float, voxel_m: float, size: float) -> 
     return out
 
 
-def _spacing(o3d: Any, points: Float) -> float:
+def _spacing(o3d: Any, points: Floats) -> float:
     """Median distance of points to the eighth of their neighbours."""
     tree = o3d.core.nns.NearestNeighborSearch(o3d.core.Tensor(points))
     tree.knn_index()
@@ -128,7 +126,7 @@ def _spacing(o3d: Any, points: Float) -> float:
     return float(np.sqrt(np.median(squares.numpy()[:, -1])))
 
 
-def _read(path: Path) -> Float:
+def _read(path: Path) -> Floats:
     """Finite points (n, 3) of a file."""
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
@@ -161,7 +159,7 @@ def _read(path: Path) -> Float:
     return points
 
 
-def _read_pcd(path: Path) -> Float:
+def _read_pcd(path: Path) -> Floats:
     """Read text here, of which Open3D does not see that it is cut; the other kinds by Open3D."""
     head, _, rest = path.read_bytes().partition(b"\nDATA ")
     lines = {words[0]: words[1:] for words in map(str.split, head.decode("latin-1").splitlines())
@@ -181,7 +179,7 @@ def _read_pcd(path: Path) -> Float:
     return points
 
 
-def _read_las(path: Path) -> Float:
+def _read_las(path: Path) -> Floats:
     if find_spec("laspy") is None:
         raise LidarpoolError('it is read by laspy: pip install "lidarpool[las]"')
     import laspy  # an extra
@@ -200,7 +198,7 @@ def _read_las(path: Path) -> Float:
     return np.stack([found.x, found.y, found.z], axis=1)
 
 
-_READERS: dict[str, Callable[[Path], Float]] = {
+_READERS: dict[str, Callable[[Path], Floats]] = {
     ".ply": lambda path: read_ply_points(path.read_bytes()),
     ".pcd": _read_pcd,
     ".xyz": lambda path: np.loadtxt(path, usecols=(0, 1, 2), ndmin=2),

@@ -17,18 +17,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Bytes, Floats, Ints
 from ..base.words import as_text
 from .colours import WHITE, Colours, as_bytes, joined
-from .masks import Colour, MaskNotes
+from .masks import MaskNotes
 from .mesh import Cutout, Mesh
 from .mtl import Materials, ObjTexture
 from .nodes import Content, MeshFileError, Wanted
 from .polygons import check_corners, triangulated
-
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
 
 
 @dataclass
@@ -46,19 +43,19 @@ class _Polygons:
         self.corners.extend(corners)
         self.sizes.append(len(corners))
 
-    def faces(self, vertices: Float) -> Int:
+    def faces(self, vertices: Floats) -> Ints:
         """Triangles (t, 3)."""
         return triangulated(vertices, _ints(self.corners), _ints(self.sizes))
 
 
-def _ints(numbers: array[int]) -> Int:
+def _ints(numbers: array[int]) -> Ints:
     return np.frombuffer(numbers, np.int64)
 
 
 def _mesh(
     name: str,
-    vertices: Float,
-    faces: Int,
+    vertices: Floats,
+    faces: Ints,
     cutouts: tuple[Cutout, ...] = (),
     colours: Colours | None = None,
 ) -> list[Mesh]:
@@ -87,7 +84,7 @@ class _Placed(_Polygons):
         self.places.extend(places)
         self.kinds.extend([kind] * len(corners))
 
-    def triangles(self, vertices: Float) -> tuple[Int, Int, Int]:
+    def triangles(self, vertices: Floats) -> tuple[Ints, Ints, Ints]:
         """Vertices (t, 3), texture coordinates (t, 3) and materials (t,) of triangles."""
         corners = _ints(self.corners)
         check_corners(corners, len(vertices))
@@ -178,12 +175,12 @@ class _Paint:
     """Colours of materials and vertices."""
 
     notes: MaskNotes
-    shades: dict[bytes, ObjTexture | Colour] = field(default_factory=dict)
-    tints: Colour | None = None  # (v, 3), of vertices
+    shades: dict[bytes, ObjTexture | Bytes] = field(default_factory=dict)
+    tints: Bytes | None = None  # (v, 3), of vertices
     names: list[bytes] = field(default_factory=list)  # of materials, by their numbers
-    uv: Float = field(default_factory=lambda: np.empty((0, 2)))
+    uv: Floats = field(default_factory=lambda: np.empty((0, 2)))
 
-    def on(self, faces: Int, places: Int, kinds: Int) -> Colours | None:
+    def on(self, faces: Ints, places: Ints, kinds: Ints) -> Colours | None:
         """Colours of faces (t, 3): the images of their materials, or vertices, or materials."""
         order, parts, sizes = [np.zeros(0, np.int64)], [], []
         for kind in np.unique(kinds):
@@ -289,12 +286,12 @@ def read_off(data: bytes, path: Path, wanted: Wanted) -> Content:
     return Content(_mesh(path.stem, vertices, faces, colours=shown))
 
 
-def _shares(colours: Float) -> Float:
+def _shares(colours: Floats) -> Floats:
     """Shares of colours that are written as 0 to 1 or, if one is above 1.5, as 0 to 255."""
     return colours / (255 if (colours > 1.5).any() else 1)
 
 
-def _tinted(shares: Float, faces: Int) -> Colours:
+def _tinted(shares: Floats, faces: Ints) -> Colours:
     """Colours of vertices, (v, 3), 0 to 1."""
     return replace(Colours.plain(WHITE, len(faces)), corners=as_bytes(shares)[faces])
 
@@ -330,7 +327,7 @@ def read_stl(data: bytes, path: Path, wanted: Wanted) -> Content:
     return Content(meshes)
 
 
-def _stl_mesh(name: str, corners: Float) -> list[Mesh]:
+def _stl_mesh(name: str, corners: Floats) -> list[Mesh]:
     """One mesh of triangles that share no vertices."""
     faces = np.arange(len(corners)).reshape(-1, 3)
     return [Mesh(name, corners, faces)] if len(faces) else []
@@ -396,18 +393,18 @@ def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
     return Content(_mesh(path.stem, vertices, faces, colours=shown))
 
 
-def read_ply_points(data: bytes) -> Float:
+def read_ply_points(data: bytes) -> Floats:
     """Read the vertices of a Stanford polygon file: (n, 3)."""
     return _ply_vertices(_ply_rows(*_ply_header(data)))
 
 
-def read_ply_columns(data: bytes) -> dict[str, NDArray[Any]]:
+def read_ply_columns(data: bytes) -> dict[str, AnyArray]:
     """Read the properties of vertices of a Stanford polygon file, but lists: {name: (n,)}."""
     rows = _ply_rows(*_ply_header(data)).get("vertex", {})
     return {name: values for name, (values, sizes) in rows.items() if (sizes == 1).all()}
 
 
-def _ply_vertices(rows: _Rows) -> Float:
+def _ply_vertices(rows: _Rows) -> Floats:
     if missing := [axis for axis in "xyz" if axis not in rows.get("vertex", {})]:
         raise ValueError(f"its vertices have no {', '.join(missing)}")
     return np.stack([rows["vertex"][axis][0] for axis in "xyz"], axis=1).astype(np.float64)
@@ -441,7 +438,7 @@ def _ply_header(data: bytes) -> tuple[list[_Element], str, bytes]:
 
 
 # {element: {property: its numbers in all rows, how many each row has}}
-_Rows = dict[str, dict[str, tuple[NDArray[Any], Int]]]
+_Rows = dict[str, dict[str, tuple[AnyArray, Ints]]]
 
 
 def _ply_rows(elements: list[_Element], order: str, body: bytes) -> _Rows:
@@ -470,7 +467,7 @@ def _ply_rows(elements: list[_Element], order: str, body: bytes) -> _Rows:
 
 def _element_rows(
     element: _Element, order: str, body: bytes, at: int
-) -> tuple[dict[str, tuple[NDArray[Any], Int]], int]:
+) -> tuple[dict[str, tuple[AnyArray, Ints]], int]:
     """Numbers and lengths of all properties, and the end of the rows."""
     count, names = element.count, list(element.properties)
     kinds = {name: np.dtype(order + kind) for name, (kind, _) in element.properties.items()}

@@ -4,10 +4,8 @@ from __future__ import annotations
 
 import mapbox_earcut
 import numpy as np
-from numpy.typing import NDArray
 
-Float = NDArray[np.float64]
-Int = NDArray[np.int64]
+from ..base.arrays import Bools, Floats, Ints
 
 # For an outline that crosses itself everywhere, the clipper's time grows with their cube: 20 s for
 # so many. Larger outlines are probably broken files.
@@ -17,7 +15,7 @@ _WARPED = 1e-5  # a polygon is plane if its corners lie this near a plane, over 
 _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below minus this
 
 
-def triangulated(vertices: Float, corners: Int, sizes: Int) -> Int:
+def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Cut polygons into triangles with the same corners and orientation.
 
     Convex polygons and quadrangles become fans, all of one size at once; mapbox_earcut clips the
@@ -59,7 +57,7 @@ def triangulated(vertices: Float, corners: Int, sizes: Int) -> Int:
     return out[out[:, 0] >= 0]
 
 
-def _begun_well(vertices: Float, rows: Int) -> Int:
+def _begun_well(vertices: Floats, rows: Ints) -> Ints:
     """Rotate quadrangles (p, 4) to begin at their reflex corner, if any, so that a fan fills them.
 
     The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
@@ -69,7 +67,7 @@ def _begun_well(vertices: Float, rows: Int) -> Int:
     return np.take_along_axis(rows, (begin[:, None] + np.arange(4)) % 4, axis=1)
 
 
-def with_holes(vertices: Float, rings: list[Int]) -> Int:
+def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
     """Clip the ears off one polygon: an outline, and the outlines of holes in it.
 
     The triangles (t, 3) have the orientation of the outline; none if it has no area.
@@ -93,27 +91,27 @@ def with_holes(vertices: Float, rings: list[Int]) -> Int:
     return corners[_clipped(points[:, [across, up]], [len(ring) for ring in rings])]
 
 
-def _clipped(flat: Float, sizes: list[int]) -> Int:
+def _clipped(flat: Floats, sizes: list[int]) -> Ints:
     """Triangles (t, 3) of a plane outline (k, 2) and holes in it, of so many corners each."""
     ends = np.cumsum(sizes).astype(np.uint32)
     found = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends)
     return np.asarray(found, np.int64).reshape(-1, 3)
 
 
-def unrolled(strip: Int) -> Int:
+def unrolled(strip: Ints) -> Ints:
     """Triangles (t, 3) of a strip of corners (t + 2,), all facing the same way."""
     faces = np.stack([strip[:-2], strip[1:-1], strip[2:]], axis=1)
     faces[1::2] = faces[1::2, [1, 0, 2]]
     return faces
 
 
-def fanned(corners: Int) -> Int:
+def fanned(corners: Ints) -> Ints:
     """Triangles (…, t, 3) of fans of corners (…, t + 2)."""
     first = np.broadcast_to(corners[..., :1], corners[..., 2:].shape)
     return np.stack([first, corners[..., 1:-1], corners[..., 2:]], axis=-1)
 
 
-def _lost(points: Float, triangles: Float) -> bool:
+def _lost(points: Floats, triangles: Floats) -> bool:
     """Whether a polygon (k, 3) is warped, and triangles (t, 3, 3) of it do not fill it.
 
     The projection of a warped polygon may cross itself, where the clipper leaves triangles out.
@@ -131,7 +129,7 @@ def _lost(points: Float, triangles: Float) -> bool:
     )
 
 
-def _all_triangles(points: Float) -> Int:
+def _all_triangles(points: Floats) -> Ints:
     """Triangles (k - 2, 3) of a warped polygon (k, 3): clipped as seen along its normal, or a fan.
 
     The fan is the one with the least area, which of a polygon with one reflex corner begins there.
@@ -153,12 +151,12 @@ def _all_triangles(points: Float) -> Int:
     return fanned((best + np.arange(count)) % count)
 
 
-def _newell(points: Float) -> Float:
+def _newell(points: Floats) -> Floats:
     """Twice the area vector of a polygon (k, 3) (Newell)."""
     return np.asarray(np.cross(points, np.roll(points, -1, axis=0)).sum(axis=0))
 
 
-def check_corners(corners: Int, vertices: int) -> None:
+def check_corners(corners: Ints, vertices: int) -> None:
     """Check that corners refer to some of so many vertices; ValueError if not."""
     if len(corners) and not 0 <= corners.min() <= corners.max() < vertices:
         raise ValueError(
@@ -167,7 +165,7 @@ def check_corners(corners: Int, vertices: int) -> None:
         )
 
 
-def _turns(points: Float) -> NDArray[np.bool_]:
+def _turns(points: Floats) -> Bools:
     """Whether corners (p, k, 3) are reflex, against the sense of the polygon: (p, k)."""
     points = points - points[:, :1]
     into = points - np.roll(points, 1, axis=1)

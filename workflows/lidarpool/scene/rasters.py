@@ -19,9 +19,9 @@ from typing import Any
 from uuid import uuid4
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import LEAST, bytes_of, check_fits, memory_share
+from ..base.arrays import AnyArray, Bools, Floats
 from ..base.vocabulary import UNITS_M
 from ..base.words import counted
 from .mesh import Mesh
@@ -249,7 +249,7 @@ def _at(affine: Any, x: Any, y: Any) -> tuple[Any, Any]:
     return a * x + b * y + c, d * x + e * y + f
 
 
-def _corners(file: Any, place: Any) -> NDArray[np.float64]:
+def _corners(file: Any, place: Any) -> Floats:
     """Corners (4, 2) of a file, in its own coordinates."""
     return np.array([_at(place, x, y) for x in (0, file.width) for y in (0, file.height)])
 
@@ -268,7 +268,7 @@ class _Grid:
         """Whether the mesh has the coordinates of the file."""
         return self.own is None or bool(self.own == self.target)
 
-    def at(self, column: NDArray[Any], row: NDArray[Any]) -> tuple[NDArray[Any], NDArray[Any]]:
+    def at(self, column: AnyArray, row: AnyArray) -> tuple[AnyArray, AnyArray]:
         """X and y in the mesh's coordinates."""
         from rasterio.warp import transform
 
@@ -279,7 +279,7 @@ class _Grid:
         return x, y
 
     @cached_property
-    def reach(self) -> NDArray[np.float64]:
+    def reach(self) -> Floats:
         """Lowest and highest x and y in the mesh's coordinates, (2, 2)."""
         from rasterio.warp import transform_bounds
 
@@ -399,8 +399,8 @@ def _mesh(
     grid: _Grid,
     columns: Span,
     rows: Span,
-    heights: NDArray[np.float64],
-    valid: NDArray[np.bool_],
+    heights: Floats,
+    valid: Bools,
 ) -> Mesh:
     """Vertices at the middles of pixels, and two triangles, seen from above, for each full cell."""
     cells = valid[:-1, :-1] & valid[:-1, 1:] & valid[1:, :-1] & valid[1:, 1:]
@@ -474,9 +474,7 @@ def _name(crs: Any) -> str:
     return key if code else f"{_described(crs)['name'][:80]} (no EPSG code)"
 
 
-def _told(
-    source: Any, own: Any, grid: _Grid, step_m: float | None, valid: NDArray[np.bool_]
-) -> str:
+def _told(source: Any, own: Any, grid: _Grid, step_m: float | None, valid: Bools) -> str:
     """Say what was taken."""
     rows, columns = valid.shape
     words = f"{columns:,} x {rows:,} {'means' if step_m else 'pixels'} of {grid.pixel_m:.6g} m"

@@ -10,10 +10,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..base.allowance import check_fits
 from ..base.arguments import as_array, checked
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Pose, Stations, Trajectory
@@ -29,7 +30,6 @@ HELD = ("fixed", "floating", "planar")
 
 _AT_ZERO = Stations((CENTRE,))
 
-Float = NDArray[np.float64]
 Joints = str | Path | Mapping[str, ArrayLike]
 
 _log = logging.getLogger(__name__)
@@ -60,8 +60,8 @@ class Joint:
     name: str
     kind: str
     parent: str
-    origin: Float
-    axis: Float
+    origin: Floats
+    axis: Floats
     limits: tuple[float, float] | None = None
     mimic: tuple[str, float, float] | None = None
 
@@ -198,7 +198,7 @@ class Robot:
         return self._made[without]
 
     def _path(
-        self, link: str, base: Trajectory, times_s: Float, values: Mapping[str, Float]
+        self, link: str, base: Trajectory, times_s: Floats, values: Mapping[str, Floats]
     ) -> Trajectory:
         """Trajectory of a link; joints whose values do not change are taken as rigid."""
         chain: list[Joint] = []
@@ -227,7 +227,7 @@ class Robot:
 
     def _values(
         self, given: Joints | None, tell: Callable[[str], None] = lambda line: None
-    ) -> tuple[Float, dict[str, Float]]:
+    ) -> tuple[Floats, dict[str, Floats]]:
         """Return times (k,), and values (k,) of all joints that move."""
         table: dict[str, Any] = {}
         if isinstance(given, (str, Path)):
@@ -270,7 +270,7 @@ class Robot:
                 )
         return times, table
 
-    def _read_values(self, path: Path, tell: Callable[[str], None]) -> dict[str, Float]:
+    def _read_values(self, path: Path, tell: Callable[[str], None]) -> dict[str, Floats]:
         """Read a table of values; LidarpoolError if it cannot be used."""
         try:
             check_fits(path)
@@ -306,10 +306,10 @@ class Robot:
 class Hinge:
     """A joint whose value changes, in a chain of them."""
 
-    before: Float  # (4, 4): from its axes to those of the link that the one before moves
-    axis: Float  # (3,)
+    before: Floats  # (4, 4): from its axes to those of the link that the one before moves
+    axis: Floats  # (3,)
     slides: bool
-    values: Float  # (k,)
+    values: Floats  # (k,)
 
 
 @dataclass(frozen=True, eq=False)
@@ -322,8 +322,8 @@ class LinkPath:
 
     base: Trajectory
     hinges: tuple[Hinge, ...]
-    last: Float  # (4, 4): from the link's axes to those of the link that the last joint moves
-    times_s: Float  # (k,): of the joints' values
+    last: Floats  # (4, 4): from the link's axes to those of the link that the last joint moves
+    times_s: Floats  # (k,): of the joints' values
     start_s: float  # of the trajectory, by the same clock
 
     @property
@@ -352,7 +352,7 @@ class LinkPath:
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
         return Pose.of(positions[0], rotations[0])
 
-    def poses(self, station: int, times_ns: Float) -> tuple[Float, Float]:
+    def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
         """See `Trajectory.poses`.
 
         All sums are in one order of rounding, however many times there are.
@@ -365,7 +365,7 @@ class LinkPath:
         place, turn, *_ = self._along(station, times_ns, moving=False)
         return place.T, turn.transpose(2, 0, 1)
 
-    def velocities(self, station: int, times_ns: Float) -> tuple[Float, Float]:
+    def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
         """See `lidarpool.sensor.trajectory.velocities`: exact, through all joints.
 
         At a given value of a joint they are those behind it.
@@ -379,8 +379,8 @@ class LinkPath:
         return velocity.T, rate.T
 
     def _along(
-        self, station: int, times_ns: Float, moving: bool
-    ) -> tuple[Float, Float, Float, Float]:
+        self, station: int, times_ns: Floats, moving: bool
+    ) -> tuple[Floats, Floats, Floats, Floats]:
         """Return positions (3, k), rotations (3, 3, k), velocities and rates (3, k).
 
         The last two are zero unless they are asked for.
@@ -427,7 +427,7 @@ class LinkPath:
             velocity = (velocity + _cross(rate, place - start)) * within
         return place, turn, velocity, rate * within
 
-    def _slopes(self, hinge: Hinge, at: Float) -> Float:
+    def _slopes(self, hinge: Hinge, at: Floats) -> Floats:
         """Rates of a joint's value at times (k,), a second."""
         if len(self.times_s) < 2:
             return np.zeros(len(at))
@@ -437,19 +437,19 @@ class LinkPath:
         return np.asarray(slopes[np.clip(segment, 0, len(slopes) - 1)] * inside)
 
 
-def _times(one: Float, other: Float) -> Float:
+def _times(one: Floats, other: Floats) -> Floats:
     """Product of matrices (3, 3, k) and (3, m, k); k may be 1."""
     return np.asarray(
         (one[:, 0, None] * other[0] + one[:, 1, None] * other[1]) + one[:, 2, None] * other[2]
     )
 
 
-def _cross(one: Float, other: Float) -> Float:
+def _cross(one: Floats, other: Floats) -> Floats:
     """Cross products of vectors (3, k)."""
     return np.cross(one, other, axis=0)
 
 
-def _then(place: Float, turn: Float, matrix: Float) -> tuple[Float, Float]:
+def _then(place: Floats, turn: Floats, matrix: Floats) -> tuple[Floats, Floats]:
     """Positions (3, k) and rotations (3, 3, k), followed by the same step (4, 4)."""
     moved = _times(turn, matrix[:3, :, None])
     return place + moved[:, 3], moved[:, :3]

@@ -10,9 +10,9 @@ from functools import cached_property
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.arguments import as_array, checked, checked_fields, shown
+from ..base.arrays import Bools, Floats, Ints32
 from ..base.errors import LidarpoolError
 from ..base.words import counted
 from ..sensor import Pose, Track
@@ -67,11 +67,11 @@ class Scene:
         If there is no triangle, or the arrays do not fit together.
     """
 
-    vertices: NDArray[np.float64]
-    faces: NDArray[np.int32]
-    face_object: NDArray[np.int32]
+    vertices: Floats
+    faces: Ints32
+    face_object: Ints32
     names: tuple[str, ...]
-    origin: NDArray[np.float64]
+    origin: Floats
     actors: tuple[Actor, ...] = ()
     instances: Instances | None = None
     colours: Colours | None = None
@@ -223,7 +223,7 @@ class Scene:
         if not objects:
             raise LidarpoolError("A scene needs at least one object with triangles.")
         plain: list[tuple[int, Mesh]] = []  # (object, mesh without masks and voxels)
-        shared: list[tuple[int, int, NDArray[np.float64]]] = []  # (object, part, matrix)
+        shared: list[tuple[int, int, Floats]] = []  # (object, part, matrix)
         parts: list[Part] = []
         known: dict[Mesh, list[int]] = {}  # {mesh of instances: its parts}
         for number, one in enumerate(objects):
@@ -337,7 +337,7 @@ class Scene:
         return [colours for colours in found if colours is not None]
 
     @property
-    def has_colours(self) -> NDArray[np.bool_]:
+    def has_colours(self) -> Bools:
         """Whether each object, actors after the others, has a colour: (objects,)."""
         found = np.zeros(len(self.all_names), np.bool_)
         if (own := self.colours) is not None:
@@ -350,7 +350,7 @@ class Scene:
         return found
 
     @property
-    def has_voxels(self) -> NDArray[np.bool_]:
+    def has_voxels(self) -> Bools:
         """Whether each object, actors after the others, has voxels: (objects,)."""
         found = np.zeros(len(self.names) + len(self.actors), np.bool_)
         if (shared := self.instances) is not None:
@@ -438,7 +438,7 @@ class Scene:
         return tuple(one for found in out for one in found)
 
     @cached_property
-    def bounds(self) -> NDArray[np.float64]:
+    def bounds(self) -> Floats:
         """Lowest and highest corner of the triangles, local coordinates: (2, 3)."""
         ends = self._own_bounds
         if self.instances:
@@ -446,7 +446,7 @@ class Scene:
         return np.stack([ends.min(axis=0), ends.max(axis=0)])
 
     @cached_property
-    def _own_bounds(self) -> NDArray[np.float64]:
+    def _own_bounds(self) -> Floats:
         """Bounds of `faces` alone: (2, 3), or (0, 3) if there are none."""
         there = np.zeros(len(self.vertices), np.bool_)
         there[self.faces] = True
@@ -454,7 +454,7 @@ class Scene:
         return np.stack([used.min(axis=0), used.max(axis=0)]) if len(used) else used
 
     @cached_property
-    def object_bounds(self) -> NDArray[np.float64]:
+    def object_bounds(self) -> Floats:
         """Lowest and highest corner of each object, local coordinates: (objects, 2, 3).
 
         An object without triangles has (+inf, -inf).
@@ -470,7 +470,7 @@ class Scene:
         return np.stack([low, high], axis=1)
 
     @cached_property
-    def footprints(self) -> NDArray[np.float64]:
+    def footprints(self) -> Floats:
         """Circle around each object seen from above, local: (objects, 3) as x, y, radius.
 
         The circle is centred on the object's bounding rectangle and reaches its farthest
@@ -486,11 +486,11 @@ class Scene:
         return np.column_stack([centres, reach])
 
 
-def _within(numbers: NDArray[np.int32], count: int) -> bool:
+def _within(numbers: Ints32, count: int) -> bool:
     return not numbers.size or bool(numbers.min() >= 0 and numbers.max() < count)
 
 
-def local_origin(vertices: NDArray[np.float64]) -> NDArray[np.float64]:
+def local_origin(vertices: Floats) -> Floats:
     """Choose the origin for world coordinates (v, 3): zero, or whole metres in their middle.
 
     Whole metres are exact in double precision, so that subtracting and adding them again gives the

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
+from ..base.arrays import Floats, Ints
 from ..base.errors import LidarpoolError
 from .mesh import Mesh
 
@@ -103,7 +104,7 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
     return Mesh(name, vertices, _revolved_faces(rings, segments))
 
 
-def _revolved_faces(rings: int, segments: int) -> NDArray[np.int64]:
+def _revolved_faces(rings: int, segments: int) -> Ints:
     """Faces over `rings` circles of `segments` vertices, the poles being the last two vertices."""
     grid = np.arange(rings * segments).reshape(rings, segments)
     following = np.roll(grid, -1, axis=1)
@@ -118,7 +119,7 @@ def _revolved_faces(rings: int, segments: int) -> NDArray[np.int64]:
     return np.concatenate([bottom, *bands, top])
 
 
-def smooth(outline: ArrayLike, rounds: int = 5) -> NDArray[np.float64]:
+def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
     """Round off a polygon (n, 2) by cutting its corners (Chaikin 1974); both ends stay.
 
     The limit is a quadratic B-spline, which never leaves the convex hull of three neighbouring
@@ -133,7 +134,7 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> NDArray[np.float64]:
     return line
 
 
-def resample(line: ArrayLike, count: int) -> NDArray[np.float64]:
+def resample(line: ArrayLike, count: int) -> Floats:
     """Place points (count, d) at equal distances along a polyline (n, d), both ends included."""
     points = np.asarray(line, dtype=np.float64)
     length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])

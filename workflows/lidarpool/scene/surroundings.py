@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from raybeam import RayCaster, available_backends
 
+from ..base.arrays import Bools, Floats
 from .floor import reaching
 from .scene import Scene
-
-Real = NDArray[np.float64]
 
 RAYS = 1000  # from each position, and from outside
 HAND_M = 0.1  # surfaces nearer than this are in the way
@@ -46,14 +45,14 @@ def in_the_way(scene: Scene, positions: ArrayLike) -> bool:
 class Views:
     """What rays in all directions meet from some positions."""
 
-    directions: Real  # (n, 3), unit vectors
-    distance: Real  # (n,), metres; infinite where there is nothing
-    back: NDArray[np.bool_]  # (n,), whether the back of a triangle was hit
-    normals: Real  # (n, 3), unit normals of the triangles hit; 0 where there is nothing
-    heights: Real  # (n,), local z of the hits
+    directions: Floats  # (n, 3), unit vectors
+    distance: Floats  # (n,), metres; infinite where there is nothing
+    back: Bools  # (n,), whether the back of a triangle was hit
+    normals: Floats  # (n, 3), unit normals of the triangles hit; 0 where there is nothing
+    heights: Floats  # (n,), local z of the hits
 
     @property
-    def hit(self) -> NDArray[np.bool_]:
+    def hit(self) -> Bools:
         """Which rays meet a surface that is not within a hand's breadth: (n,)."""
         return np.isfinite(self.distance) & (self.distance > HAND_M)
 
@@ -122,7 +121,7 @@ class Surroundings:
         fits = sides[:2].min() >= _WIDE_M and sides[2] <= _HIGH_M
         return bool(fits and np.mean(_is_level(seen) | upright) >= _UPRIGHT)
 
-    def _cast(self, origins: Real, directions: Real) -> Views:
+    def _cast(self, origins: Floats, directions: Floats) -> Views:
         hits = self._caster.cast(origins, directions)
         a, b, c = self._scene.vertices[self._scene.faces[hits.triangle]].transpose(1, 0, 2)
         normals = np.cross(b - a, c - a)
@@ -133,7 +132,7 @@ class Surroundings:
         return Views(directions, hits.distance, back, normals, heights)
 
 
-def _is_level(seen: Views) -> NDArray[np.bool_]:
+def _is_level(seen: Views) -> Bools:
     return np.asarray(np.abs(seen.normals[:, 2]) > 0.99)
 
 
@@ -164,7 +163,7 @@ def _openness(scene: Scene) -> float:
     return float(np.linalg.norm(total)) / max(area, 1e-300)
 
 
-def directions_around(count: int) -> Real:
+def directions_around(count: int) -> Floats:
     """Make unit vectors (count, 3), evenly spread over a sphere: Fibonacci's spiral."""
     numbers: Any = np.arange(count) + 0.5
     z = 1 - 2 * numbers / count

@@ -5,18 +5,16 @@ from __future__ import annotations
 from typing import Annotated
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from ..base.arguments import checked
+from ..base.arrays import Floats, Ints
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError
 from .instances import Instance
 from .mesh import Mesh
 from .plants import MOST_TREES, SCALES, SPECIES, all_trees, placed
 from .scene import Scene
-
-Float = NDArray[np.float64]
 
 _COARSEST = 4  # cells of the first octave along a side
 _OCTAVES = 11
@@ -82,7 +80,7 @@ def terrain(
     return Scene.from_meshes([ground, *_woods(points[..., 2], side_m, trees, seed)])
 
 
-def _woods(heights: Float, side_m: float, count: int, seed: int) -> list[Instance]:
+def _woods(heights: Floats, side_m: float, count: int, seed: int) -> list[Instance]:
     """Place trees on ground of these heights over a square grid."""
     if not count:
         return []
@@ -116,7 +114,7 @@ def _woods(heights: Float, side_m: float, count: int, seed: int) -> list[Instanc
     return placed(all_trees(seed, _ROOT_M), kind, places[chosen], turn, scale)
 
 
-def _ground_at(heights: Float, side_m: float, share: Float) -> tuple[Float, Float]:
+def _ground_at(heights: Floats, side_m: float, share: Floats) -> tuple[Floats, Floats]:
     """Heights and slopes (rise over run) of the triangles at shares (..., 2) of the sides."""
     size = np.array(heights.shape) - 1
     at = share * size
@@ -130,7 +128,7 @@ def _ground_at(heights: Float, side_m: float, share: Float) -> tuple[Float, Floa
     return low + u * along_u + v * along_v, slope
 
 
-def grid_faces(columns: int, rows: int) -> NDArray[np.int64]:
+def grid_faces(columns: int, rows: int) -> Ints:
     """Two triangles for each cell of a grid of (columns + 1) x (rows + 1) points: (c * r, 2, 3)."""
     corner = (np.arange(columns)[:, None] * (rows + 1) + np.arange(rows)).reshape(-1)
     beside = corner + rows + 1
@@ -139,7 +137,7 @@ def grid_faces(columns: int, rows: int) -> NDArray[np.int64]:
     )
 
 
-def _heights(x: Float, y: Float, rng: np.random.Generator) -> Float:
+def _heights(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
     """Heights from 0 to `_RELIEF` over a grid of coordinates in 0 to 1: (len(x), len(y))."""
     total = np.zeros((len(x), len(y)))
     damping = np.ones_like(total)
@@ -157,7 +155,7 @@ def _heights(x: Float, y: Float, rng: np.random.Generator) -> Float:
     return total * (_RELIEF / highest) if highest else total
 
 
-def _noise(x: Float, y: Float, rng: np.random.Generator) -> Float:
+def _noise(x: Floats, y: Floats, rng: np.random.Generator) -> Floats:
     """Gradient noise over a grid, about -1 to 1; a lattice of unit steps: (len(x), len(y))."""
     shape = (int(x.max()) + 2, int(y.max()) + 2)
     angle = rng.uniform(0, 2 * np.pi, shape)

@@ -21,9 +21,9 @@ from typing import Any
 from xml.parsers import expat
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import Floats
 from ..base.words import counted
 from ..base.xmlfile import refuse_entity
 from .colours import GREY, WHITE, Colours
@@ -78,7 +78,7 @@ class _Object:
 class _Placement:
     key: _Key
     name: str
-    matrix: NDArray[np.float64]
+    matrix: Floats
 
 
 def read_3mf(data: bytes, path: Path, wanted: Wanted) -> Content:

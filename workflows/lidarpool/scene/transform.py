@@ -5,9 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from ..base.arguments import as_array
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..sensor import Pose
 
@@ -20,11 +21,11 @@ UP_AXES = {
 }
 
 
-def rotation_about(axis: ArrayLike, degrees: float) -> NDArray[np.float64]:
+def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
     """Rotation (3, 3) about an axis, which has a length (Rodrigues 1840)."""
     cross = np.cross(np.eye(3), np.array(axis) / np.linalg.norm(axis))
     angle = np.radians(degrees)
-    turn: NDArray[np.float64] = np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    turn: Floats = np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
     return np.eye(3) + turn
 
 
@@ -45,8 +46,8 @@ class Transform:
         If the numbers are not finite or `linear` flattens the mesh.
     """
 
-    linear: NDArray[np.float64]
-    offset: NDArray[np.float64]
+    linear: Floats
+    offset: Floats
 
     def __post_init__(self) -> None:
         linear, offset = as_array("linear", self.linear), as_array("offset", self.offset)

@@ -16,10 +16,10 @@ from urllib.parse import unquote
 from xml.etree.ElementTree import Element, ParseError
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, check_fits
 from ..base.arguments import checked, shown
+from ..base.arrays import Bytes, Floats
 from ..base.errors import LidarpoolError, prefixed
 from ..base.words import printable
 from ..base.xmlfile import xml_root
@@ -39,7 +39,6 @@ _SIDES = 64  # of a cylinder: its faces are 0.12 % of the radius inside it at mo
 _UP = 5  # folders above a robot's file in which its packages are looked for
 _FARTHEST = 1e8  # of any number in a file
 
-Float = NDArray[np.float64]
 
 _log = logging.getLogger(__name__)
 
@@ -140,7 +139,7 @@ def _named(root: Element, kind: str) -> list[Element]:
     return found
 
 
-def _numbers(element: Element | None, name: str, count: int, default: str) -> Float:
+def _numbers(element: Element | None, name: str, count: int, default: str) -> Floats:
     """Read the numbers of an attribute; `default` if it, or the element, is not there."""
     text = default if element is None else element.get(name, default)
     try:
@@ -155,7 +154,7 @@ def _numbers(element: Element | None, name: str, count: int, default: str) -> Fl
     return values
 
 
-def _place(element: Element) -> Float:
+def _place(element: Element) -> Floats:
     """Matrix (4, 4) of an <origin>: rotated about the fixed x, y and z axes, then moved."""
     origin, out = element.find("origin"), np.eye(4)
     out[:3, 3] = _numbers(origin, "xyz", 3, "0 0 0")
@@ -290,7 +289,7 @@ class _Looks:
                 names = ", ".join(dict.fromkeys(links[:3])) + ", …" * (len(links) > 3)
                 self.tell(f"{self.path}: links that {what}: {names}")
 
-    def _colour(self, visual: Element) -> NDArray[np.uint8] | None:
+    def _colour(self, visual: Element) -> Bytes | None:
         """Colour (1, 1, 3) of a visual, by itself or by the name of a material of the robot."""
         material = visual.find("material")
         if not self.colours or material is None:
@@ -301,7 +300,7 @@ class _Looks:
             return None
         return as_bytes(_numbers(colour, "rgba", 4, "1 1 1 1")[:3]).reshape(1, 1, 3)
 
-    def _shape(self, shape: Element) -> tuple[Float, list[Mesh]]:
+    def _shape(self, shape: Element) -> tuple[Floats, list[Mesh]]:
         """Return factors (3,), one of which may be zero, and meshes that are to be scaled."""
         if shape.tag == "mesh":
             scale = _numbers(shape, "scale", 3, "1 1 1")
@@ -325,7 +324,7 @@ class _Looks:
         profile = np.concatenate([round_[: len(_ARC) // 2] - half, round_[len(_ARC) // 2 :] + half])
         return np.ones(3), [revolve(profile, _SIDES)]
 
-    def _sizes(self, sizes: Float) -> Float:
+    def _sizes(self, sizes: Floats) -> Floats:
         if (sizes < 0).any():
             raise LidarpoolError(f"a size is {sizes.min()}; it must not be negative.")
         return sizes

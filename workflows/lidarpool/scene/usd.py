@@ -22,9 +22,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance, bytes_of, memory_share
+from ..base.arrays import AnyArray, Floats
 from ..base.words import counted
 from .actors import box
 from .beside import outside
@@ -54,7 +54,7 @@ _BASE = 512 * 2**20  # bytes that usd-core takes for any file
 _LATEST_S = 9e8
 _SEGMENTS = 64  # around spheres, cylinders, cones and capsules
 
-_Frame = tuple[dict[str, Any], list[NDArray[Any]]]
+_Frame = tuple[dict[str, Any], list[AnyArray]]
 
 
 def read_usd(data: bytes, path: Path, wanted: Wanted) -> Content:
@@ -141,7 +141,7 @@ def _check_files(files: list[str], wanted: Wanted, path: Path) -> None:
 
 
 def _mesh(
-    frame: dict[str, Any], arrays: list[NDArray[Any]], allowance: Allowance, materials: Materials
+    frame: dict[str, Any], arrays: list[AnyArray], allowance: Allowance, materials: Materials
 ) -> list[Mesh]:
     """Mesh of polygons; none without triangles."""
     name = frame["name"]
@@ -167,7 +167,7 @@ def _mesh(
         raise ValueError(f"{name!r}: {error}") from error
 
 
-def _shape(frame: dict[str, Any], arrays: list[NDArray[Any]], materials: Materials) -> list[Mesh]:
+def _shape(frame: dict[str, Any], arrays: list[AnyArray], materials: Materials) -> list[Mesh]:
     """Mesh of a cube, sphere, cylinder, cone, capsule or plane; none if it has no size."""
     made = _outline(frame)
     if made is None or "materials" not in frame:
@@ -199,7 +199,7 @@ def _outline(frame: dict[str, Any]) -> Mesh | None:
     return Mesh(name, np.roll(made.vertices, axis + 1, axis=1), made.faces)
 
 
-def _profile(kind: str, size: dict[str, Any]) -> NDArray[np.float64]:
+def _profile(kind: str, size: dict[str, Any]) -> Floats:
     """Radii and heights (n, 2) of a round shape."""
     half, radius = size.get("height", 0) / 2, size["radius"]
     if kind == "Cylinder":
@@ -218,7 +218,7 @@ def _profile(kind: str, size: dict[str, Any]) -> NDArray[np.float64]:
 
 def _content(
     frame: dict[str, Any],
-    arrays: list[NDArray[Any]],
+    arrays: list[AnyArray],
     meshes: dict[int, list[Mesh]],
     stem: str,
     allowance: Allowance,

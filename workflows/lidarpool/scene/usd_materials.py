@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import AnyArray, Bools, Floats, Ints
 from .colours import LINEAR, WHITE, Colours, as_srgb
 from .masks import (
     FACE_BYTES,
@@ -27,7 +27,6 @@ from .polygons import check_corners, triangulated
 _CUT = 0.5  # least opacity that stops light, unless a material states another
 _BYTES = np.arange(256) / 255
 
-Int = NDArray[np.int64]
 # Where a material has a colour or an opacity from: a `value`, an `image`, or `values` of the mesh;
 # see `Looks` in usd_child.py.
 Source = dict[str, Any]
@@ -50,7 +49,7 @@ class _Use(NamedTuple):
         raw, wraps = source.get("raw", False), tuple(source["wraps"])
         return cls(source["image"], source["channels"], scale, bias, raw, wraps)
 
-    def light(self, channel: str) -> NDArray[np.float64]:
+    def light(self, channel: str) -> Floats:
         """Light (256,) of the bytes of a channel."""
         k = "rgba".index(channel)
         return (_BYTES if self.raw or k == 3 else LINEAR) * self.scale[k] + self.bias[k]
@@ -68,19 +67,19 @@ class Look:
     """
 
     def __init__(
-        self, frame: dict[str, Any], arrays: list[NDArray[Any]], places: dict[str, Int]
+        self, frame: dict[str, Any], arrays: list[AnyArray], places: dict[str, Ints]
     ) -> None:
         self._arrays, self._places = arrays, places
         self._values: dict[str, tuple[str, int]] = frame.get("values", {})
 
-    def coordinates(self, source: Source, rows: Int) -> tuple[NDArray[np.float64], Int]:
+    def coordinates(self, source: Source, rows: Ints) -> tuple[Floats, Ints]:
         """Texture coordinates (c, 2) as in glTF, and which of them triangles have, (k, 3)."""
         values, corners = self._at(source["values"], rows, 2)
         matrix = np.array(source.get("matrix", np.eye(3, 2)))
         u, v = (values @ matrix[:2] + matrix[2]).T
         return np.stack([u, 1 - v], axis=1), corners
 
-    def painted(self, name: str, rows: Int) -> Colours | None:
+    def painted(self, name: str, rows: Ints) -> Colours | None:
         """Colours of triangles by values, linear light; None if there are none."""
         if name not in self._values:
             return None
@@ -91,7 +90,7 @@ class Look:
         white = Colours.plain(WHITE, len(rows))
         return Colours(white.images, white.image, corners=colours[corners])
 
-    def _at(self, name: str, rows: Int, width: int) -> tuple[NDArray[np.float64], Int]:
+    def _at(self, name: str, rows: Ints, width: int) -> tuple[Floats, Ints]:
         if not name:  # a texture that is not told where to look has its value at zero everywhere
             return np.zeros((1, width)), np.zeros((len(rows), 3), np.int64)
         if name not in self._values:
@@ -115,7 +114,7 @@ class Materials:
         self._shades, self._mask = remembered(self._read_shades), remembered(self._read_mask)
         self.notes = MaskNotes()
 
-    def add(self, frame: dict[str, Any], arrays: list[NDArray[Any]]) -> None:
+    def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
         """Keep a frame of an image or a material."""
         if frame["what"] == "material":
             self._materials[frame["number"]] = frame
@@ -123,7 +122,7 @@ class Materials:
         why = frame["unread"] and f"its image {frame['name']!r} {frame['unread']}"
         self._images[frame["number"]] = why, arrays[0].tobytes()
 
-    def colours(self, number: int | None, look: Look, rows: Int) -> Colours | None:
+    def colours(self, number: int | None, look: Look, rows: Ints) -> Colours | None:
         """Colours that a material gives triangles; None if they have none."""
         if not self._colours:
             return None
@@ -144,7 +143,7 @@ class Materials:
                 return look.painted(one["values"], rows)
         return None
 
-    def cutout(self, number: int | None, look: Look, rows: Int) -> Cutout | None:
+    def cutout(self, number: int | None, look: Look, rows: Ints) -> Cutout | None:
         """Mask that a material gives triangles; None if they are solid."""
         material = self._materials[number]
         source = material.get("opacity", {"value": 1.0})
@@ -196,9 +195,9 @@ class Materials:
 
 def dressed(
     frame: dict[str, Any],
-    arrays: list[NDArray[Any]],
-    vertices: NDArray[np.float64],
-    polygons: tuple[Int, Int, NDArray[np.bool_]],
+    arrays: list[AnyArray],
+    vertices: Floats,
+    polygons: tuple[Ints, Ints, Bools],
     materials: Materials,
 ) -> Iterator[Piece]:
     """Cut polygons into triangles, divided by their materials.

@@ -7,9 +7,9 @@ import re
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.allowance import Allowance
+from ..base.arrays import Floats
 from ..base.words import counted
 from .actors import box
 from .mesh import DENSEST, VOXELS_MOST, Mesh, Voxels
@@ -20,8 +20,6 @@ _OFF = 2  # voxels by which the corners may contradict the counts; HELIOS++'s ow
 # The box is so much larger on all sides, as a share of a voxel's edge: its sides are not those of
 # the ground or of a neighbouring grid, which light would miss.
 _MARGIN = 0.02
-
-Real = NDArray[np.float64]
 
 
 def read_vox(data: bytes, path: Path, wanted: Wanted) -> Content:
@@ -71,10 +69,10 @@ def read_vox(data: bytes, path: Path, wanted: Wanted) -> Content:
     return Content([mesh], unit_m=1.0, up_axis="z", notes=notes)
 
 
-def _grid(head: dict[str, str]) -> tuple[Real, Real, Real]:
+def _grid(head: dict[str, str]) -> tuple[Floats, Floats, Floats]:
     """Return the counts of voxels, where the first begins, and their edges: (3,) each."""
 
-    def three(name: str, times: int = 1) -> Real:
+    def three(name: str, times: int = 1) -> Floats:
         try:
             values = np.array([float(word) for word in head[name].split()] * times)[:3]
         except (KeyError, ValueError):
@@ -112,7 +110,7 @@ def _column(columns: list[str]) -> int:
     return named[0]
 
 
-def _check(where: Real, density: Real, shape: Real) -> None:
+def _check(where: Floats, density: Floats, shape: Floats) -> None:
     """Refuse rows that are of no voxel or of the same, and densities that cannot be."""
     bad = ~((where == np.floor(where)) & (where >= 0) & (where < shape)).all(axis=1)
     if bad.any():
@@ -129,5 +127,5 @@ def _check(where: Real, density: Real, shape: Real) -> None:
         )
 
 
-def _told(numbers: Real) -> str:
+def _told(numbers: Floats) -> str:
     return " ".join(f"{number:g}" for number in numbers)

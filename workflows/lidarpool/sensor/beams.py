@@ -8,10 +8,11 @@ from functools import cached_property
 from typing import Annotated, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arguments import as_array, checked, checked_fields
+from ..base.arrays import Floats, Ints
 from ..base.declared import told
 from ..base.errors import LidarpoolError
 
@@ -42,10 +43,10 @@ class Beams:
         If the lengths differ, a value is not finite, or there are no beams or too many.
     """
 
-    elevation: NDArray[np.float64]
-    azimuth: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    time_ns: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
-    origin: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 3)))
+    elevation: Floats
+    azimuth: Floats = field(default_factory=lambda: np.zeros(0))
+    time_ns: Floats = field(default_factory=lambda: np.zeros(0))
+    origin: Floats = field(default_factory=lambda: np.zeros((0, 3)))
 
     def __post_init__(self) -> None:
         count = as_array("Beams.elevation", self.elevation).size
@@ -100,10 +101,10 @@ class Head(Protocol):
     def firings(self, step: int) -> tuple[int, int]:
         """First firing of a time step, and one past the last; steps have no gaps."""
 
-    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def times_ns(self, firings: Ints) -> Floats:
         """When firings begin, nanoseconds since the head started: (k,)."""
 
-    def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def azimuths(self, firings: Ints) -> Floats:
         """Azimuth of the head at firings, radians: (k,)."""
 
 
@@ -182,16 +183,16 @@ class Spin:
         count, steps = self._firings_per_step.as_integer_ratio()
         return -(-step * count // steps), -(-(step + 1) * count // steps)
 
-    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def times_ns(self, firings: Ints) -> Floats:
         """See `Head.times_ns`."""
         return np.asarray(firings, np.float64) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
-    def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def azimuths(self, firings: Ints) -> Floats:
         """See `Head.azimuths`."""
         turned = 2 * np.pi * self._within(firings) / self.firings_per_turn
         return np.radians(self.zero_deg) + (-turned if self.clockwise else turned)
 
-    def _within(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def _within(self, firings: Ints) -> Floats:
         """Count firings since the turn began; fractional if a turn begins between two."""
         return np.asarray(firings % self.firings_per_turn, np.float64)
 
@@ -215,12 +216,12 @@ class Mirror(Spin):
     # Share of each cycle in which it fires: a polygon's facets cover more than is used.
     duty: Duty = 1.0
 
-    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def times_ns(self, firings: Ints) -> Floats:
         """See `Head.times_ns`."""
         pause = self._within(firings) * (1 - self.duty)
         return (firings - pause) * (1e9 / (self.rate_hz * self.firings_per_turn))
 
-    def azimuths(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def azimuths(self, firings: Ints) -> Floats:
         """See `Head.azimuths`."""
         phase = self._within(firings) / self.firings_per_turn
         if self.motion == "sine":
@@ -232,7 +233,7 @@ class Mirror(Spin):
         return np.radians(self.zero_deg) + np.radians(self.width_deg) * place
 
 
-def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _table(name: str, values: ArrayLike, shape: tuple[int, ...]) -> Floats:
     """Read-only float64 array of a shape; zeros where none were given."""
     array = as_array(f"Beams.{name}", values).copy()
     if not array.size:

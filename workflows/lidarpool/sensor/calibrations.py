@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 import yaml
-from numpy.typing import NDArray
 
 from ..base.allowance import check_fits
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.yamlfile import load_yaml
 from .beams import Beams
@@ -32,8 +32,8 @@ class Calibration:
     file: str  # its name
     maker: str | None  # of the format; None for a plain table of beams
     beams: Beams | None = None  # in the maker's order, with the file's times, if any
-    rays: NDArray[np.float64] | None = None  # instead, unit directions (n, 3) as they are fired
-    shot_ns: NDArray[np.float64] | None = None  # their times (n,), if the file has them
+    rays: Floats | None = None  # instead, unit directions (n, 3) as they are fired
+    shot_ns: Floats | None = None  # their times (n,), if the file has them
     head: dict[str, Any] = field(default_factory=dict)  # fields of `SensorModel`
 
 
@@ -200,7 +200,7 @@ def _table(name: str, text: str) -> Calibration:
     return Calibration(name, "robosense", Beams(elevation, -azimuth))
 
 
-def _livox(name: str, rows: NDArray[np.float64]) -> Calibration:
+def _livox(name: str, rows: Floats) -> Calibration:
     """Rays of Livox's list. Zenith is counted from the z axis; Time may only number the rows."""
     times, azimuth, zenith = rows[:, 0], *np.radians(rows[:, 1:]).T
     back = np.flatnonzero(np.diff(times) < 0)
@@ -216,7 +216,7 @@ def _livox(name: str, rows: NDArray[np.float64]) -> Calibration:
     return Calibration(name, "livox", rays=rays, shot_ns=shot_ns, head=head)
 
 
-def _rows(text: str, skip: int, columns: int) -> NDArray[np.float64]:
+def _rows(text: str, skip: int, columns: int) -> Floats:
     """Numbers of the lines after the header, (n, columns); ValueError naming a bad line."""
     rows = np.loadtxt(io.StringIO(text), delimiter=",", skiprows=skip, ndmin=2)
     if not len(rows) or rows.shape[1] != columns:

@@ -7,8 +7,8 @@ from dataclasses import fields
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray
 from .beams import Beams, Mirror, Spin
 from .rays import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
@@ -25,7 +25,7 @@ class _OwnKindError(Exception):
     """A class of a user's own, which no file describes."""
 
 
-def described(thing: Any, arrays: MutableMapping[str, NDArray[Any]]) -> Any:
+def described(thing: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
     """Return sensors as data for JSON, their arrays in `arrays`; None with classes of a user."""
     try:
         return _described(thing, arrays)
@@ -33,7 +33,7 @@ def described(thing: Any, arrays: MutableMapping[str, NDArray[Any]]) -> Any:
         return None
 
 
-def _described(thing: Any, arrays: MutableMapping[str, NDArray[Any]]) -> Any:
+def _described(thing: Any, arrays: MutableMapping[str, AnyArray]) -> Any:
     if isinstance(thing, np.ndarray):
         name = f"rays{len(arrays)}"
         arrays[name] = thing
@@ -51,7 +51,7 @@ def _described(thing: Any, arrays: MutableMapping[str, NDArray[Any]]) -> Any:
     return thing
 
 
-def remade(told: Any, arrays: Mapping[str, NDArray[Any]]) -> Any:
+def remade(told: Any, arrays: Mapping[str, AnyArray]) -> Any:
     """Return what `described` was given; any exception if the data are not such."""
     if isinstance(told, list):
         return tuple(remade(one, arrays) for one in told)

@@ -7,7 +7,8 @@ from functools import cache
 from typing import Literal
 
 import numpy as np
-from numpy.typing import NDArray
+
+from ..base.arrays import Floats, Indices
 
 # {sub-rays: distance from the middle, as a share of the radius, and angle in degrees, of a sixth of
 # them}; the others are turned by multiples of 60 degrees, and one is in the middle. They were found
@@ -55,7 +56,7 @@ Profile = Literal["even", "gaussian"]
 
 
 @cache
-def _places(count: int) -> NDArray[np.float64]:
+def _places(count: int) -> Floats:
     """Places in the unit disc: (count, 2), the middle first."""
     if count == 1:
         return np.zeros((1, 2))
@@ -69,7 +70,7 @@ def _places(count: int) -> NDArray[np.float64]:
 
 
 @cache
-def _gaussian_places(count: int) -> NDArray[np.float64]:
+def _gaussian_places(count: int) -> Floats:
     """Places with equal shares of a Gaussian beam's light, in units of its radius at 1/e².
 
     Those of the disc, moved outwards: where the disc within a place has a share q of the area, the
@@ -100,8 +101,8 @@ class Beam:
         Whether the two directions differ, so that across and up have to be those of the sensor.
     """
 
-    angles: NDArray[np.float64]
-    starts: NDArray[np.float64] | None = None
+    angles: Floats
+    starts: Floats | None = None
     oval: bool = False
 
     def __len__(self) -> int:
@@ -135,7 +136,7 @@ class Beam:
 
 
 @cache
-def neighbours(count: int) -> NDArray[np.intp]:
+def neighbours(count: int) -> Indices:
     """Pairs of sub-rays with no other one between them: (m, 2).
 
     The circle whose diameter connects them is empty (Gabriel and Sokal 1969).

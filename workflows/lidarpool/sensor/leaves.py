@@ -10,10 +10,10 @@ from functools import cache
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from ..base.arguments import shown
+from ..base.arrays import Floats
 
 LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
@@ -21,8 +21,6 @@ LeafAngles = Literal[
 NAMES: tuple[str, ...] = LeafAngles.__args__  # type: ignore[attr-defined]
 _NODES = 361  # angles of light for which integrals are tabulated, from 0 to 90 degrees
 _ANGLES = 500  # of leaves, in the integrals
-
-Real = NDArray[np.float64]
 
 
 def _named_or_ratio(value: Any) -> Any:
@@ -40,7 +38,7 @@ LeafAngle = Annotated[
 ]
 
 
-def density(leaf_angle: str | float, angle: Real) -> Real:
+def density(leaf_angle: str | float, angle: Floats) -> Floats:
     """Share of the leaf area for each radian of its angle (n,), from 0 to π/2; its integral is 1.
 
     Names are the distributions of de Wit (1965), as trigonometric functions after Bunnik (1978).
@@ -72,7 +70,7 @@ def density(leaf_angle: str | float, angle: Real) -> Real:
 
 
 @cache
-def _tables(leaf_angle: str | float) -> tuple[Real, Real, Real]:
+def _tables(leaf_angle: str | float) -> tuple[Floats, Floats, Floats]:
     """Cosines of light from the vertical, and for them what `projection` and `brightness` are."""
     cosine = np.sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
@@ -91,7 +89,7 @@ def _tables(leaf_angle: str | float) -> tuple[Real, Real, Real]:
     return cosine[:, 0], crossing, bright / crossing
 
 
-def projection(leaf_angle: str | float, cosine: Real) -> Real:
+def projection(leaf_angle: str | float, cosine: Floats) -> Floats:
     """Mean projection of leaves, as a share of their area: the G function of Ross (1981), (n,).
 
     `cosine` (n,) is that of the light's angle from the vertical, 0 to 1.
@@ -105,7 +103,7 @@ def projection(leaf_angle: str | float, cosine: Real) -> Real:
     return np.interp(cosine, nodes, found)
 
 
-def brightness(leaf_angle: str | float, cosine: Real) -> Real:
+def brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
     """Mean cosine between light and the normals of the leaves that it meets: (n,).
 
     A leaf is met in proportion to its projection, so those that face the light count more: two

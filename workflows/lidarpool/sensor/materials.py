@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from ..base.arguments import checked_fields, shown
+from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import Share, TextOrTexts, told, written_as
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
@@ -232,7 +233,7 @@ def _materials_like(name: str, known: Sequence[str]) -> str:
     return did_you_mean(name, some or known) or f" There are: {'; '.join(some or known)}."
 
 
-def rows_named(pattern: str, names: Sequence[str]) -> NDArray[np.intp]:
+def rows_named(pattern: str, names: Sequence[str]) -> Indices:
     """Rows of names that are a name, or fit it as a pattern with * and ?."""
     if not any(sign in pattern for sign in "*?["):
         return np.array([row for row, name in enumerate(names) if name == pattern], np.intp)
@@ -240,7 +241,7 @@ def rows_named(pattern: str, names: Sequence[str]) -> NDArray[np.intp]:
     return np.array([r for r, name in enumerate(names) if name == pattern or fits(name)], np.intp)
 
 
-def _last_for(materials: Sequence[Material], names: Sequence[str]) -> NDArray[np.intp]:
+def _last_for(materials: Sequence[Material], names: Sequence[str]) -> Indices:
     """Last material that names each object, -1 for none: (objects,)."""
     last = np.full(len(names), -1)
     known = {name: row for row, name in enumerate(names)}
@@ -278,7 +279,7 @@ def with_classes(
 
 
 def with_class(
-    materials: Sequence[Material], semantic_class: int, rows: NDArray[np.intp], names: Sequence[str]
+    materials: Sequence[Material], semantic_class: int, rows: Indices, names: Sequence[str]
 ) -> list[Material]:
     """Give some objects a class, and leave the rest of their materials.
 
@@ -296,18 +297,18 @@ def with_class(
 class MaterialTable:
     """Materials of objects: each array has one value for each."""
 
-    reflectance: NDArray[np.float64]
-    scale: NDArray[np.float64]  # of the luminance of colours; 0 where the reflectance is a number
-    roughness: NDArray[np.float64]  # 0 for no gloss
-    metalness: NDArray[np.float64]
-    retro: NDArray[np.bool_]
-    passes: NDArray[np.bool_]
-    mirrors: NDArray[np.bool_]
+    reflectance: Floats
+    scale: Floats  # of the luminance of colours; 0 where the reflectance is a number
+    roughness: Floats  # 0 for no gloss
+    metalness: Floats
+    retro: Bools
+    passes: Bools
+    mirrors: Bools
     semantic_class: NDArray[np.uint16]
-    refractive_index: NDArray[np.float64]  # within; 0 where light goes straight on
-    attenuation: NDArray[np.float64]  # within, 1/m
-    leaf_area: NDArray[np.float64]  # density within, m²/m³; 0 for no leaves, 1 for voxels
-    leaf_angle: NDArray[np.intp]  # rows of `leaf_angles`
+    refractive_index: Floats  # within; 0 where light goes straight on
+    attenuation: Floats  # within, 1/m
+    leaf_area: Floats  # density within, m²/m³; 0 for no leaves, 1 for voxels
+    leaf_angle: Indices  # rows of `leaf_angles`
     leaf_angles: tuple[str | float, ...]
 
     @classmethod
@@ -316,7 +317,7 @@ class MaterialTable:
         materials: Sequence[Material],
         names: Sequence[str],
         wavelength_nm: float = NEAR_NM,
-        voxels: NDArray[np.bool_] | None = None,
+        voxels: Bools | None = None,
     ) -> MaterialTable:
         """Find the materials of objects by name: the last that names an object counts.
 
@@ -368,12 +369,12 @@ class MaterialTable:
         return bool((self.reflectance > 0).all() and not through.any())
 
     @property
-    def leafy(self) -> NDArray[np.bool_]:
+    def leafy(self) -> Bools:
         """Whether objects are full of leaves."""
         return self.leaf_area > 0
 
     @property
-    def refracts(self) -> NDArray[np.bool_]:
+    def refracts(self) -> Bools:
         """Whether light is refracted at the surfaces of objects."""
         return self.refractive_index > 0
 
@@ -384,10 +385,10 @@ class MaterialTable:
 
     def scattered(
         self,
-        rows: NDArray[np.integer[Any]],
-        cosine: NDArray[np.float64],
-        luminance: NDArray[np.float64] | None = None,
-    ) -> NDArray[np.float64]:
+        rows: Integers,
+        cosine: Floats,
+        luminance: Floats | None = None,
+    ) -> Floats:
         """Share of the light returned by objects (n,): 1 for white at right angles.
 
         `luminance` (n,) is that of the colours that were hit, if the table is `textured`.
@@ -406,9 +407,7 @@ class MaterialTable:
             back[on] += front * gloss(cosine[on], self.roughness[rows[on]])
         return back
 
-    def goes_on(
-        self, rows: NDArray[np.integer[Any]], cosine: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def goes_on(self, rows: Integers, cosine: Floats) -> Floats:
         """Share of the light that continues at glass or mirrors (n,).
 
         Where it is refracted, what the surface reflects is not taken off.
@@ -418,7 +417,7 @@ class MaterialTable:
         return np.asarray(np.where(self.leafy[rows], 1, 1 - self.reflectance[rows]) * through)
 
 
-def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArray[np.float64]:
+def gloss(cosine: Floats, roughness: Floats) -> Floats:
     """Light that facets of a rough surface mirror back to where it came from, of a white diffuser.
 
     Facets are distributed after Walter et al. 2007 (GGX), with shadowing after Smith, and the width
@@ -430,9 +429,7 @@ def gloss(cosine: NDArray[np.float64], roughness: NDArray[np.float64]) -> NDArra
     return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 
 
-def fresnel(
-    cosine: NDArray[np.float64], index: float | NDArray[np.float64] = GLASS_INDEX
-) -> NDArray[np.float64]:
+def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
     """Share of unpolarised light that a surface reflects (Fresnel's equations).
 
     `index` is the refractive index behind the surface over that before it; all light is reflected

@@ -12,11 +12,11 @@ from statistics import NormalDist
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ..base.allowance import check_fits
 from ..base.arguments import checked
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
@@ -77,7 +77,7 @@ class BeamTable(_Part):
             self.origins(count),
         )
 
-    def origins(self, count: int) -> NDArray[np.float64]:
+    def origins(self, count: int) -> Floats:
         """Origins of so many beams: (count, 3), or (0, 3) if there are none."""
         origin = np.array(self.origin_m, np.float64).reshape(-1, 3)
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin

@@ -20,10 +20,10 @@ from itertools import accumulate
 from typing import Annotated, NamedTuple, Protocol
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field, Strict
 
 from ..base.arguments import checked_fields
+from ..base.arrays import Floats, Ints
 from ..base.declared import Seed, written_as
 from ..base.errors import LidarpoolError
 from .noise import Purpose, named_seed, normal
@@ -31,7 +31,6 @@ from .trajectory import CENTRE, Pose, Trajectory, velocities
 
 BLOCK = 1 << 14  # samples that are made at a time
 
-Real = NDArray[np.float64]
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
 Place = Annotated[
@@ -195,16 +194,16 @@ class Moving(Protocol):
 class ImuSamples(NamedTuple):
     """Some consecutive samples of an IMU, in its own axes."""
 
-    times_ns: NDArray[np.int64]  # (k,): end of the interval, since the survey's start
-    rates: Real  # (k, 3): mean angular velocities over the interval before, rad/s
-    forces: Real  # (k, 3): mean specific forces, m/s^2: at rest, upwards, gravity
+    times_ns: Ints  # (k,): end of the interval, since the survey's start
+    rates: Floats  # (k, 3): mean angular velocities over the interval before, rad/s
+    forces: Floats  # (k, 3): mean specific forces, m/s^2: at rest, upwards, gravity
 
 
 class Fixes(NamedTuple):
     """Some consecutive positions of a GNSS receiver's antenna."""
 
-    times_ns: NDArray[np.int64]  # (k,): since the survey's start
-    positions: Real  # (k, 3): metres, the scene's local coordinates
+    times_ns: Ints  # (k,): since the survey's start
+    positions: Floats  # (k, 3): metres, the scene's local coordinates
 
 
 def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None) -> None:
@@ -252,7 +251,7 @@ def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
     count = math.floor(survey.duration_ns * imu.rate_hz / 1e9 + 1e-6)
     for first in range(0, count, block):
         samples = np.arange(first, min(first + block, count))
-        ends: Real = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
+        ends: Floats = np.append(samples, samples[-1] + 1) * 1e9 / imu.rate_hz
         _, turns, speeds = _moved(path, imu.mount, ends)
         middles = (ends[1:] + ends[:-1]) / 2
         _, halfway, _ = _moved(path, imu.mount, middles)
@@ -287,7 +286,7 @@ def fixes(survey: Moving, block: int = BLOCK) -> Iterator[Fixes]:
         yield Fixes(np.rint(times).astype(np.int64), places + errors.of(samples))
 
 
-def _moved(path: Trajectory, mount: Pose, times_ns: Real) -> tuple[Real, Real, Real]:
+def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Floats, Floats]:
     """Positions (k, 3), rotations (k, 3, 3) and velocities (k, 3) of something on a carrier."""
     times_ns = np.minimum(times_ns, path.duration_ns)
     places, turns = path.poses(0, times_ns)
@@ -299,7 +298,7 @@ def _moved(path: Trajectory, mount: Pose, times_ns: Real) -> tuple[Real, Real, R
     return places + levers, turns @ own, speeds + np.cross(rates, levers)
 
 
-def _rotation_vectors(before: Real, after: Real) -> Real:
+def _rotation_vectors(before: Floats, after: Floats) -> Floats:
     """Rotation vectors (k, 3), radians, from rotations (k, 3, 3) to others, in their axes."""
     turn = np.einsum("nji,njk->nik", before, after)
     sines = np.stack([turn[:, k, j] - turn[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
@@ -321,20 +320,20 @@ class _Errors:
         self,
         seed: int,
         step_s: float,
-        white: Real,  # (3,): standard deviation of a sample
-        bias: Real,  # (3,): standard deviation of the Gauss-Markov process
+        white: Floats,  # (3,): standard deviation of a sample
+        bias: Floats,  # (3,): standard deviation of the Gauss-Markov process
         bias_time_s: float,
-        walk: Real,  # (3,): of the random walk in a second
+        walk: Floats,  # (3,): of the random walk in a second
     ) -> None:
         self._seed = seed
         self._white, self._bias, self._walk = white, bias, walk * math.sqrt(step_s)
         # To single precision, in which an exponential is the same on every machine.
         self._kept = float(np.float32(math.exp(-step_s / bias_time_s)))
         self._driven = bias * math.sqrt(1 - self._kept**2)
-        self._biases: Real = np.zeros(3)  # of the last sample
-        self._walked: Real = np.zeros(3)
+        self._biases: Floats = np.zeros(3)  # of the last sample
+        self._walked: Floats = np.zeros(3)
 
-    def of(self, samples: NDArray[np.int64]) -> Real:
+    def of(self, samples: Ints) -> Floats:
         """Return the errors of the next samples (k,): (k, 3)."""
         out = np.zeros((len(samples), 3))
         if self._white.any():
@@ -360,13 +359,13 @@ class _Errors:
             out += walked
         return out
 
-    def _normal(self, purpose: Purpose, samples: NDArray[np.int64]) -> Real:
+    def _normal(self, purpose: Purpose, samples: Ints) -> Floats:
         """Make normal deviates for samples (k,) along each axis: (k, 3)."""
         high, low = np.divmod(samples, 1 << 32)
         return np.stack([normal(self._seed, purpose, high, low, axis) for axis in range(3)], axis=1)
 
 
-def geodetic(positions: Real, origin: tuple[float, float, float]) -> Real:
+def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
     """Latitudes, longitudes (degrees) and ellipsoidal heights of points east, north and up of one.
 
     Through Cartesian coordinates of WGS 84; Bowring's (1985) latitude is exact to 1e-9 degrees

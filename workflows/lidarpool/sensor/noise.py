@@ -11,12 +11,13 @@ from enum import Enum, unique
 from functools import cache
 from hashlib import sha256
 from statistics import NormalDist
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base.arguments import checked_fields
+from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import Seed, Share, told
 from ..base.errors import LidarpoolError
 from .materials import at_right_angles
@@ -28,9 +29,6 @@ ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 25
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
-
-Whole = NDArray[np.integer[Any]]
-Real = NDArray[np.float64]
 
 
 @unique
@@ -198,8 +196,13 @@ class Noise:
         return replace(self, seed=named_seed(self.seed, name))
 
     def ranges(
-        self, distance: Real, energy: Real | None, scan: Whole, ray: Whole, number: Whole
-    ) -> Real:
+        self,
+        distance: Floats,
+        energy: Floats | None,
+        scan: Integers,
+        ray: Integers,
+        number: Integers,
+    ) -> Floats:
         """Return the reported ranges of returns (n,), metres, at least 0.
 
         The energies are needed where noise or walk depend on them.
@@ -212,11 +215,13 @@ class Noise:
             distance = distance - self.walk(energy)
         return np.maximum(distance + sigma * normal(self.seed, Purpose.RANGE, scan, ray, number), 0)
 
-    def velocities(self, velocity: Real, scan: Whole, ray: Whole, number: Whole) -> Real:
+    def velocities(
+        self, velocity: Floats, scan: Integers, ray: Integers, number: Integers
+    ) -> Floats:
         """Return the reported radial velocities of returns (n,), m/s."""
         return velocity + self.velocity_m_s * normal(self.seed, Purpose.VELOCITY, scan, ray, number)
 
-    def walk(self, energy: Real) -> Real:
+    def walk(self, energy: Floats) -> Floats:
         """By how much returns (n,) appear nearer than one at the threshold, metres.
 
         A pulse with the shape of a Gaussian, so high over a fixed threshold, crosses it so many
@@ -226,8 +231,8 @@ class Noise:
         return np.asarray(self.walk_m * np.sqrt(2 * np.log(over)))
 
     def false_alarms(
-        self, gate_s: float, scan: Whole, ray: Whole
-    ) -> tuple[NDArray[np.intp], Real, Real]:
+        self, gate_s: float, scan: Integers, ray: Integers
+    ) -> tuple[Indices, Floats, Floats]:
         """Find false alarms of rays (n,), whose receivers are open for so many seconds.
 
         They come at the same rate at all times. Each is a maximum of the receiver's noise above the
@@ -239,7 +244,7 @@ class Noise:
         Rows of the rays, the time since the receiver opened, in seconds, and energies: (k,) each.
         """
         rows, since = np.arange(len(ray)), np.zeros(len(ray))
-        found: list[tuple[NDArray[np.intp], Real, Real]] = []
+        found: list[tuple[Indices, Floats, Floats]] = []
         number = 0
         while len(rows) or not found:
             # The time until the next one is exponentially distributed.
@@ -254,7 +259,7 @@ class Noise:
         row, time, energy = map(np.concatenate, zip(*found, strict=True))
         return row, time, energy
 
-    def angles(self, scan: Whole, ray: Whole) -> tuple[Real, Real]:
+    def angles(self, scan: Integers, ray: Integers) -> tuple[Floats, Floats]:
         """Deviations of beams, across and up: (n,) and (n,), radians."""
         sigma = np.radians(self.angle_deg)
         return (
@@ -262,7 +267,7 @@ class Noise:
             sigma * normal(self.seed, Purpose.UP, scan, ray),
         )
 
-    def detected(self, energy: Real, scan: Whole, ray: Whole, number: Whole) -> NDArray[np.bool_]:
+    def detected(self, energy: Floats, scan: Integers, ray: Integers, number: Integers) -> Bools:
         """Whether returns (n,) are detected.
 
         The signal with its normally distributed noise has to pass a threshold: at an energy equal
@@ -275,8 +280,8 @@ class Noise:
         return seen
 
     def passes(
-        self, purpose: Purpose, energy: Real, scan: Whole, ray: Whole, number: ArrayLike = 0
-    ) -> NDArray[np.bool_]:
+        self, purpose: Purpose, energy: Floats, scan: Integers, ray: Integers, number: ArrayLike = 0
+    ) -> Bools:
         """Whether signals (n,) with their noise pass the threshold, see `detected`."""
         above = THRESHOLD_SIGMAS * (energy / self.threshold - 1)
         return np.asarray(above + normal(self.seed, purpose, scan, ray, number) > 0)
@@ -317,7 +322,7 @@ def raw(
 
 def uniform(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
-) -> NDArray[np.float64]:
+) -> Floats:
     """Numbers uniform in [0, 1), multiples of 2**-53: (n,); arguments as of `raw`."""
     bits = raw(seed, purpose, scan, ray, number) >> np.uint64(11)
     return bits.astype(np.float64) * 2.0**-53
@@ -325,7 +330,7 @@ def uniform(
 
 def normal(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
-) -> NDArray[np.float64]:
+) -> Floats:
     """Numbers of mean 0 and variance 1, normally distributed: (n,); arguments as of `raw`.
 
     They are quantiles of 65,536 equal shares of the distribution, so none is beyond 4.3.
@@ -335,7 +340,7 @@ def normal(
 
 
 @cache
-def _quantiles() -> NDArray[np.float64]:
+def _quantiles() -> Floats:
     shares = (np.arange(2**15) + 0.5) / 2**16
     low = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([low, -low[::-1]])

@@ -8,10 +8,10 @@ from math import log, pi, sqrt
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import BeforeValidator, Field
 
 from ..base.arguments import checked_fields, shown
+from ..base.arrays import Floats
 from ..base.declared import told
 from ..base.errors import LidarpoolError
 from .disc import SUBRAYS, Beam, Profile
@@ -204,11 +204,11 @@ def _pair(divergence: Sequence[float]) -> tuple[float, float]:
 
 
 def spread(
-    directions: NDArray[np.float64],
-    across: NDArray[np.float64],
-    up: NDArray[np.float64],
-    axes: tuple[NDArray[np.float64], NDArray[np.float64]] | None = None,
-) -> NDArray[np.float64]:
+    directions: Floats,
+    across: Floats,
+    up: Floats,
+    axes: tuple[Floats, Floats] | None = None,
+) -> Floats:
     """Turn unit directions (n, 3) by small angles (n, k) or (1, k), radians: (n, k, 3), unit.
 
     By default, the two axes across a ray are those of `any_axes`.
@@ -223,7 +223,7 @@ def spread(
     return out.transpose(1, 2, 0)
 
 
-def any_axes(directions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def any_axes(directions: Floats) -> tuple[Floats, Floats]:
     """Two axes across unit directions (n, 3): those of Duff et al. 2017, which always exist."""
     x, y, z = directions.T
     sign = np.where(z < 0, -1.0, 1.0)
@@ -234,9 +234,7 @@ def any_axes(directions: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDAr
     return one, other
 
 
-def axes_about(
-    directions: NDArray[np.float64], axis: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
     """Axes across unit directions (n, 3): counter-clockwise about an axis (3,), and towards it.
 
     Straight along the axis, they are those of `any_axes`.

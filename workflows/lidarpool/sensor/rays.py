@@ -6,9 +6,9 @@ from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
+from ..base.arrays import Floats, Ints
 from ..base.errors import LidarpoolError
 from .beams import Beams
 from .sensor import Sensor
@@ -48,7 +48,7 @@ class PrismSensor(Sensor):
         """See `Sensor.period`."""
         return None
 
-    def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def directions(self, firings: Ints) -> Floats:
         """See `Sensor.directions`."""
         minutes = self.head.times_ns(firings) / 60e9
         flat = np.array([1.0, 0, 0])[:, None, None]
@@ -69,9 +69,7 @@ class PrismSensor(Sensor):
         return np.ascontiguousarray(ray.transpose(1, 2, 0))
 
 
-def _refracted(
-    rays: NDArray[np.float64], normals: NDArray[np.float64], ratio: float
-) -> NDArray[np.float64]:
+def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
     """Rays (3, k, c) behind a face, by Snell's law; `ratio` is the index before over that behind.
 
     The normals (3, k, 1), or (3, 1, 1), point along the light's direction.
@@ -97,8 +95,8 @@ class ListedSensor(Sensor):
 
     beams: Beams = field(default_factory=lambda: Beams(np.zeros(1)))
     # (n, 3): unit directions in the order of firing, and (n,): firing times from 0 on.
-    rays: NDArray[np.float64] = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
-    shot_ns: NDArray[np.float64] = field(default_factory=lambda: np.zeros(1))
+    rays: Floats = field(default_factory=lambda: np.array([[1.0, 0, 0]]))
+    shot_ns: Floats = field(default_factory=lambda: np.zeros(1))
     cycle_ns: float = 1e8  # duration of the list
     cycle: ClassVar[str] = "frame"
 
@@ -107,12 +105,12 @@ class ListedSensor(Sensor):
         """See `Sensor.period`."""
         return len(self.rays)
 
-    def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def directions(self, firings: Ints) -> Floats:
         """See `Sensor.directions`."""
         return self.rays[firings % len(self.rays)][:, None, :]
 
-    def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def begins_ns(self, firings: Ints) -> Floats:
         """See `Sensor.begins_ns`."""
         cycles, shots = np.divmod(firings, len(self.rays))
-        times: NDArray[np.float64] = self.start_ns + cycles * self.cycle_ns + self.shot_ns[shots]
+        times: Floats = self.start_ns + cycles * self.cycle_ns + self.shot_ns[shots]
         return times

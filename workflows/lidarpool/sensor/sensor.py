@@ -8,10 +8,11 @@ from functools import cached_property
 from typing import Annotated, ClassVar
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arguments import checked, checked_fields
+from ..base.arrays import Floats, Ints
 from ..base.declared import told
 from ..base.errors import LidarpoolError
 from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
@@ -146,7 +147,7 @@ class Sensor:
         """
         return self.head.firings(step)
 
-    def turns(self, steps: ArrayLike) -> NDArray[np.int64]:
+    def turns(self, steps: ArrayLike) -> Ints:
         """Return the number of the turn, or frame, in which each time step (k,) begins: (k,).
 
         A head without `rate_hz`, which may be a user's, has a turn in each step.
@@ -195,11 +196,11 @@ class Sensor:
             high, ahead = high + ahead, 2 * ahead
         return bisect_left(range(high + 1), number, lo=low, key=turn)
 
-    def directions(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def directions(self, firings: Ints) -> Floats:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""
         return self._turned(firings, self.ahead)
 
-    def origins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    def origins(self, firings: Ints) -> Floats | None:
         """Return starts of the rays of firings (k,), sensor axes: (k, channels, 3), metres.
 
         None if all start at the sensor's centre.
@@ -209,7 +210,7 @@ class Sensor:
         return self._turned(firings, self.beams.origin)
 
     @cached_property
-    def ahead(self) -> NDArray[np.float64]:
+    def ahead(self) -> Floats:
         """Unit directions of the beams in the head's axes, at azimuth 0: (channels, 3)."""
         beams = self.beams
         level = np.cos(beams.elevation)
@@ -217,12 +218,12 @@ class Sensor:
         return np.column_stack([x, y, np.sin(beams.elevation)])
 
     @cached_property
-    def centre(self) -> NDArray[np.float64] | None:
+    def centre(self) -> Floats | None:
         """Common start of all beams, (3,) in the head's axes; None if they differ."""
         origin = self.beams.origin
         return origin[0] if (origin == origin[0]).all() else None
 
-    def spins(self, firings: NDArray[np.int64]) -> NDArray[np.float64] | None:
+    def spins(self, firings: Ints) -> Floats | None:
         """Return cosines and sines of the head's angles at firings: (2, k).
 
         About the head's z axis; `axes` relates it to the sensor's axes. None if the rays are not
@@ -235,13 +236,11 @@ class Sensor:
         return np.stack([np.cos(azimuth), np.sin(azimuth)])
 
     @property
-    def axes(self) -> NDArray[np.float64] | None:
+    def axes(self) -> Floats | None:
         """Rotation from the head's axes to the sensor's; None if they are the same."""
         return None
 
-    def _turned(
-        self, firings: NDArray[np.int64], vectors: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
+    def _turned(self, firings: Ints, vectors: Floats) -> Floats:
         """Rotate vectors (c, 3), such as one for each beam, with the head: (k, c, 3).
 
         Uses products of firing and beam terms, without trigonometry for each ray.
@@ -255,11 +254,11 @@ class Sensor:
         out[..., 2] = z
         return out if self.axes is None else out @ self.axes.T
 
-    def begins_ns(self, firings: NDArray[np.int64]) -> NDArray[np.float64]:
+    def begins_ns(self, firings: Ints) -> Floats:
         """Return the starts of firings (k,), since the start of the station: (k,)."""
         return self.start_ns + self.head.times_ns(firings)
 
-    def times_ns(self, firings: NDArray[np.int64]) -> NDArray[np.int64]:
+    def times_ns(self, firings: Ints) -> Ints:
         """Return the times of the rays of firings (k,), from the station's start: (k, channels)."""
         times = self.begins_ns(firings)[:, None] + self.beams.time_ns
         return np.rint(times).astype(np.int64)
@@ -280,6 +279,6 @@ class LineSensor(Sensor):
     cycle: ClassVar[str] = "cycle"
 
     @property
-    def axes(self) -> NDArray[np.float64]:
+    def axes(self) -> Floats:
         """See `Sensor.axes`."""
         return np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])

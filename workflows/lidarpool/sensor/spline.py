@@ -8,12 +8,11 @@ products, quotients and roots have one order, so that every processor has the sa
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Real = NDArray[np.float64]
+from ..base.arrays import Floats, Indices
 
 
-def knots_of(times: Real, values: Real) -> Real:
+def knots_of(times: Floats, values: Floats) -> Floats:
     """Values (d, n) at times (n,), which stop together, and two derivatives there: (3, d, n)."""
     steps = np.diff(times)
     slopes = np.diff(values) / steps
@@ -55,8 +54,8 @@ def knots_of(times: Real, values: Real) -> Real:
 
 
 def on_curve(
-    knots: Real, steps: Real, segment: NDArray[np.intp], since: Real, slopes: bool
-) -> tuple[Real, Real]:
+    knots: Floats, steps: Floats, segment: Indices, since: Floats, slopes: bool
+) -> tuple[Floats, Floats]:
     """Values and, if asked for, slopes (d, k), `since` (k,) after the knots `segment` (k,)."""
     # Times mostly come in order: coefficients are computed once for all in one segment.
     begins = np.flatnonzero(np.diff(segment, prepend=-1))

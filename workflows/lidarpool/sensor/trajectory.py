@@ -7,10 +7,11 @@ from functools import cached_property
 from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arguments import as_array, checked_fields, shown
+from ..base.arrays import Bools, Floats, Indices
 from ..base.declared import Angle, Triple, written_as
 from ..base.errors import LidarpoolError
 from .spline import knots_of, on_curve
@@ -49,7 +50,7 @@ class Pose:
             raise LidarpoolError(f"A pose needs three finite coordinates and angles, not {self}.")
 
     @property
-    def rotation(self) -> NDArray[np.float64] | None:
+    def rotation(self) -> Floats | None:
         """Rotation from sensor to scene axes, (3, 3); None without rotation."""
         if not (self.yaw_deg or self.pitch_deg or self.roll_deg):
             return None
@@ -64,7 +65,7 @@ class Pose:
         return Pose.of(self.position + one @ mount.position, one @ other)
 
     @classmethod
-    def of(cls, position: ArrayLike, rotation: NDArray[np.float64] | None) -> Pose:
+    def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
         """Make a pose of a position and a rotation matrix (3, 3), or None."""
         place = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
@@ -79,7 +80,7 @@ class Pose:
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
-def rotations_of(angles_deg: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotations_of(angles_deg: Floats) -> Floats:
     """Rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), as of `Pose`; or of one."""
     angles = np.radians(angles_deg.T)
     (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
@@ -130,9 +131,7 @@ class Trajectory(Protocol):
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """Pose at a time since the start of a station."""
 
-    def poses(
-        self, station: int, times_ns: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
         """Positions (k, 3) and rotations (k, 3, 3) at times (k,) of a station that moves.
 
         They are fastest if each of their numbers is contiguous over the poses.
@@ -148,9 +147,7 @@ def presence_ns(path: Trajectory) -> tuple[float, float]:
     return float(first), float(last)
 
 
-def velocities(
-    path: Trajectory, station: int, times_ns: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
     """Return velocities and angular velocities on a trajectory, derivatives of its poses.
 
     Those of its own method `velocities` with the same arguments and values, which the classes of
@@ -196,9 +193,7 @@ class Stations:
         """See `Trajectory.pose`."""
         return self.at[station]
 
-    def poses(
-        self, station: int, times_ns: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+    def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats | None]:
         """See `Trajectory.poses`."""
         pose, count = self.at[station], len(times_ns)
         rotation = pose.rotation
@@ -245,9 +240,9 @@ class Track:
     ((5.0, 0.0, 1.0), 2000000000.0)
     """
 
-    times_s: NDArray[np.float64]
-    positions: NDArray[np.float64]
-    quaternions: NDArray[np.float64] | None = None
+    times_s: Floats
+    positions: Floats
+    quaternions: Floats | None = None
     smooth: bool = False
     start_s: float | None = None
     duration_s: float | None = None
@@ -321,9 +316,7 @@ class Track:
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
         return Pose.of(positions[0], rotations[0])
 
-    def poses(
-        self, station: int, times_ns: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def poses(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
         """See `Trajectory.poses`.
 
         Raises
@@ -346,9 +339,7 @@ class Track:
             rotations = rotations + factor * table.take(segment, axis=1)
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
-    def velocities(
-        self, station: int, times_ns: NDArray[np.float64]
-    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def velocities(self, station: int, times_ns: Floats) -> tuple[Floats, Floats]:
         """See `velocities`: exact derivatives of its curves, at a given pose those behind it.
 
         Raises
@@ -366,9 +357,7 @@ class Track:
             speeds, rates = (self._segments[k].take(segment, axis=1) for k in (1, 4))
         return (speeds * within).T, (rates * within).T
 
-    def _at(
-        self, times_ns: NDArray[np.float64]
-    ) -> tuple[NDArray[np.intp], NDArray[np.float64], NDArray[np.bool_]]:
+    def _at(self, times_ns: Floats) -> tuple[Indices, Floats, Bools]:
         """Return segments of times (k,), seconds since these began, and whether it moves then."""
         assert self.start_s is not None  # set above
         times, at = self.times_s, times_ns / 1e9 + self.start_s
@@ -387,7 +376,7 @@ class Track:
         return segment, at - times.take(segment), within
 
     @cached_property
-    def _spline(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _spline(self) -> tuple[Floats, Floats]:
         """Knots of positions and quaternions, of which each is the nearer to the last; steps."""
         turns = self.quaternions
         assert turns is not None  # set above
@@ -397,7 +386,7 @@ class Track:
         return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
-    def _segments(self) -> tuple[NDArray[np.float64], ...]:
+    def _segments(self) -> tuple[Floats, ...]:
         """Coefficients of poses on straight ways, one column for each of s segments.
 
         Positions at their starts and velocities (3, s); of the rotation (3, 9, s), which is
@@ -420,9 +409,7 @@ class Track:
         return begin, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0], spin
 
 
-def _between(
-    quaternions: NDArray[np.float64], times_s: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _between(quaternions: Floats, times_s: Floats) -> tuple[Floats, Floats]:
     """Axes (s, 3) and rates (s, 1), rad/s, of turns from each pose to the next, in its axes."""
     # conjugate(p) q
     (p, pw), (q, qw) = ((t[:, :3], t[:, 3:]) for t in (quaternions[:-1], quaternions[1:]))
@@ -434,7 +421,7 @@ def _between(
     return axis / np.where(sine > 0, sine, 1), rates
 
 
-def matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
+def matrices(quaternions: Floats) -> Floats:
     """Rotation matrices (k, 3, 3) of unit quaternions x, y, z, w (k, 4)."""
     x, y, z, w = quaternions.T
     rows = [
@@ -445,7 +432,7 @@ def matrices(quaternions: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.moveaxis(np.array(rows), -1, 0)
 
 
-def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternions_of(rotations: Floats) -> Floats:
     """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), which may be rounded.
 
     The eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000).
@@ -457,11 +444,11 @@ def quaternions_of(rotations: NDArray[np.float64]) -> NDArray[np.float64]:
         table[:, i, j] = table[:, j, i] = m[i, j] + m[j, i]
         table[:, k, 3] = table[:, 3, k] = m[j, i] - m[i, j]
     table[:, 3, 3] = m[0, 0] + m[1, 1] + m[2, 2]
-    found: NDArray[np.float64] = np.linalg.eigh(table)[1][..., -1]
+    found: Floats = np.linalg.eigh(table)[1][..., -1]
     return found
 
 
-def _along(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
+def _along(slopes: Floats) -> Floats:
     """Quaternions (k, 4) of a level carrier that faces its direction of travel.
 
     While it stands it keeps its direction; before it first moves it faces its first direction.
@@ -475,7 +462,7 @@ def _along(slopes: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
 
 
-def _refuse(bad: NDArray[np.bool_], words: str) -> None:
+def _refuse(bad: Bools, words: str) -> None:
     """Raise LidarpoolError if any is bad, with the number of the first."""
     if bad.any():
         raise LidarpoolError(f"{words.format(int(bad.argmax()))} (poses are counted from 0).")

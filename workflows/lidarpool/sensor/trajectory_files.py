@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from numpy.typing import NDArray
 from pydantic import Field
 
 from ..base.allowance import check_fits
 from ..base.arguments import checked
+from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from .calibrations import said
 from .trajectory import Beyond, Track, quaternions_of, rotations_of
@@ -99,7 +99,7 @@ def load_trajectory(
         raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}") from error
 
 
-def _numbers(text: str, columns: int | None = None, **options: Any) -> NDArray[np.float64]:
+def _numbers(text: str, columns: int | None = None, **options: Any) -> Floats:
     """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
@@ -110,7 +110,7 @@ def _numbers(text: str, columns: int | None = None, **options: Any) -> NDArray[n
     return rows
 
 
-def _rotations(given: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotations(given: Floats) -> Floats:
     off = np.abs(given @ given.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
     if not (off <= 2e-3).all() or (np.linalg.det(given) < 0).any():
         raise ValueError("it holds matrices that are no rotations")
@@ -141,7 +141,7 @@ def columns_of_table(
     names: Mapping[str, str],
     known: Sequence[str],
     needed: Callable[[Container[str]], Sequence[str]],
-) -> dict[str, NDArray[np.float64]]:
+) -> dict[str, Floats]:
     """Columns (k,) of a table with a header, by their names here; others are left out.
 
     Capital letters count only in `names`.
@@ -212,7 +212,7 @@ def _is_finite(cell: str) -> bool:
         return False
 
 
-def quaternions_from_degrees(angles: NDArray[np.float64]) -> NDArray[np.float64]:
+def quaternions_from_degrees(angles: Floats) -> Floats:
     """Quaternions (k, 4) of yaw, pitch and roll in degrees (k, 3), as of `Pose`."""
     return quaternions_of(rotations_of(angles))
 

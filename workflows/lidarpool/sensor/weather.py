@@ -12,8 +12,8 @@ from dataclasses import dataclass
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats
 from ..base.declared import told
 from .materials import REFERENCE_M, extinction
 
@@ -33,8 +33,6 @@ FAINTEST = 0.5
 NEAREST_M, FARTHEST_M = 0.1, 1e4  # where particles are looked for
 LEAST_LEFT = 1e-200  # of the light, so that one can divide by it
 LARGE = 2.0  # light that a large particle takes, in its cross-sections: half of it by diffraction
-
-Real = NDArray[np.float64]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -120,7 +118,7 @@ class Particles(NamedTuple):
         squares = 2 / self.slope**3 * (1 - math.exp(-x) * (1 + x + x * x / 2))
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
-    def above(self, diameter_mm: Real) -> Real:
+    def above(self, diameter_mm: Floats) -> Floats:
         """Particles above diameters (n,), 1/m³: (n,)."""
         some = np.exp(-self.slope * np.minimum(diameter_mm, self.largest))
         return np.asarray(self.number / self.slope * (some - math.exp(-self.slope * self.largest)))
@@ -191,7 +189,7 @@ class Air(NamedTuple):
     divergence: float  # full angle, radians
     overlap_m: float
 
-    def width(self, distance: Real) -> Real:
+    def width(self, distance: Floats) -> Floats:
         """Diameter of the beam, metres."""
         return np.asarray(np.sqrt(self.exit_m**2 + (self.divergence * distance) ** 2))
 
@@ -201,13 +199,13 @@ class Air(NamedTuple):
         left = np.exp(-2 * self.extinction * distance)
         return (REFERENCE_M / seen) ** 2 * np.maximum(left, LEAST_LEFT)
 
-    def smallest(self, particles: Particles, energy: float, distance: Real) -> Real:
+    def smallest(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Diameters of particles that return an energy, millimetres; inf if none returns it."""
         share = energy / (particles.reflectance * self.white(distance))
         wide = 1000 * self.width(distance) * np.sqrt(share)
         return np.where(share <= 1, wide, np.inf)
 
-    def rate(self, particles: Particles, energy: float, distance: Real) -> Real:
+    def rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Particles in the beam that return at least an energy, in each metre: 1/m."""
         area = math.pi / 4 * self.width(distance) ** 2
         return area * particles.above(self.smallest(particles, energy, distance))
@@ -217,7 +215,7 @@ class Air(NamedTuple):
         distance = np.geomspace(begins, max(ends, begins * 1.001), NODES)
         return float(np.trapezoid(self.rate(particles, energy, distance), distance))
 
-    def cloud(self, backscatter: float, begins: Real, ends: Real) -> Real:
+    def cloud(self, backscatter: float, begins: Floats, ends: Floats) -> Floats:
         """Energies that fog or dust returns from slabs that fill the beam, by Simpson's rule."""
         middle, slab = (begins + ends) / 2, ends - begins
         mean = (self.white(begins) + 4 * self.white(middle) + self.white(ends)) / 6

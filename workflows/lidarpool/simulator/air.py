@@ -12,14 +12,14 @@ from statistics import NormalDist
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Indices, Ints
 from ..scene.colours import GREY, packed
 from ..sensor import Survey
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, raw, uniform
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
-from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, Real, Whole, joined, numbers
+from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, joined, numbers
 from .surfaces import Surfaces
 
 QUANTILES = 1 << 16
@@ -31,13 +31,13 @@ TAIL_SIGMAS = 6.0
 class _Seen(NamedTuple):
     """Particles of one kind that may be detected; the arrays (QUANTILES,) are by range."""
 
-    counts: Real  # (k,): cumulative probabilities of 0, 1, … in a beam
-    distance: Real  # before which an equal share of them is
-    smallest: Real  # diameter that may be detected, mm
-    larger: Real  # 1 - exp(-slope * (largest - smallest))
+    counts: Floats  # (k,): cumulative probabilities of 0, 1, … in a beam
+    distance: Floats  # before which an equal share of them is
+    smallest: Floats  # diameter that may be detected, mm
+    larger: Floats  # 1 - exp(-slope * (largest - smallest))
     step: float  # 1 / slope, mm
-    energy: Real  # of a particle of 1 mm
-    most: Real  # of one that fills the beam
+    energy: Floats  # of a particle of 1 mm
+    most: Floats  # of one that fills the beam
 
 
 class _Fog(NamedTuple):
@@ -45,10 +45,10 @@ class _Fog(NamedTuple):
 
     begins: float  # metres
     cell: float
-    energy: Real  # (cells,)
+    energy: Floats  # (cells,)
     # Cumulative probabilities that a cell has the highest peak of some first cells: the row of n
     # cells is n plus them.
-    peaks: Real
+    peaks: Floats
 
 
 class AirCaster:
@@ -100,7 +100,7 @@ class AirCaster:
             sub, distance, energy = sub[order], distance[order], energy[order]
         return _inserted(hits, planes, sub, distance, energy)
 
-    def _reach(self, hits: Hits, count: int) -> Real:
+    def _reach(self, hits: Hits, count: int) -> Floats:
         """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
         materials = self._surfaces.at(self._wavelength_nm)
         ends = hits.distance
@@ -111,14 +111,14 @@ class AirCaster:
         reach[hits.ray] = ends  # of several, the last
         return reach
 
-    def _bent(self, hits: Hits) -> NDArray[np.intp]:
+    def _bent(self, hits: Hits) -> Indices:
         """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
         refracts = self._surfaces.at(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
         return np.flatnonzero(refracts[self._surfaces.objects(hits.triangle)])
 
-    def _within(self, hits: Hits, ray: Whole, distance: Real) -> NDArray[np.bool_]:
+    def _within(self, hits: Hits, ray: Ints, distance: Floats) -> Bools:
         """Whether places on rays are within water or glass, where nothing falls: (n,)."""
         rows = self._bent(hits)
         bent, where = hits.ray[rows], hits.distance[rows]
@@ -129,7 +129,7 @@ class AirCaster:
             count[some] += where[first[some] + number] < distance[some]
         return np.asarray(count % 2 == 1)
 
-    def _clouded(self, hits: Hits, reach: Real) -> Real:
+    def _clouded(self, hits: Hits, reach: Floats) -> Floats:
         """How far fog goes: to surfaces, and to what light is refracted into, but for panes."""
         rows = self._bent(hits)
         if not len(rows):
@@ -144,8 +144,8 @@ class AirCaster:
         return reach
 
     def _met(
-        self, seen: _Seen, seed: int, scan: Whole, ray: Whole, reach: Real, each: int
-    ) -> tuple[Whole, Real, Real]:
+        self, seen: _Seen, seed: int, scan: Ints, ray: Ints, reach: Floats, each: int
+    ) -> tuple[Ints, Floats, Floats]:
         """Sub-rays, distances and energies of particles of a kind."""
         chance = uniform(seed, Purpose.PARTICLES, scan, ray)
         some = np.flatnonzero(chance >= seen.counts[0])
@@ -165,8 +165,8 @@ class AirCaster:
         return sub[before], distance[before], each * energy
 
     def _in_fog(
-        self, fog: _Fog, scan: Whole, ray: Whole, reach: Real, each: int
-    ) -> tuple[Whole, Real, Real]:
+        self, fog: _Fog, scan: Ints, ray: Ints, reach: Floats, each: int
+    ) -> tuple[Ints, Floats, Floats]:
         """Sub-rays, distances and energies of the peaks of fog."""
         cells = len(fog.energy)
         free = (np.minimum(reach[::each], FARTHEST_M) - fog.begins) / fog.cell
@@ -180,7 +180,7 @@ class AirCaster:
 
 
 def _inserted(
-    hits: Hits, planes: Planes, ray: Whole, distance: Real, energy: Real
+    hits: Hits, planes: Planes, ray: Ints, distance: Floats, energy: Floats
 ) -> tuple[Hits, Planes]:
     """Insert hits in the air before the others of their rays."""
     count = len(ray)
@@ -191,7 +191,7 @@ def _inserted(
     order = np.argsort(np.concatenate([ray, hits.ray]), kind="stable")
     row = order - count  # of the others
 
-    def seen(rows: NDArray[np.intp]) -> tuple[Real, Real]:
+    def seen(rows: Indices) -> tuple[Floats, Floats]:
         normals, directions = np.zeros((2, len(rows), 3))
         solid = row[rows] >= 0
         if solid.any():
@@ -230,7 +230,7 @@ def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) 
     )
 
 
-def _poisson(mean: float) -> Real:
+def _poisson(mean: float) -> Floats:
     """Cumulative probabilities of 0, 1, … events; the last is 1."""
     sums, term, count = [], math.exp(-mean), 0
     total = term
@@ -258,7 +258,7 @@ def _fog(
     return _Fog(begins, cell, single(energy), rows.reshape(-1))
 
 
-def highest(signals: Real) -> Real:
+def highest(signals: Floats) -> Floats:
     """Cumulative probabilities of which of the first n signals is the highest: (k + 1, k).
 
     The signals (k,) fall, and have noise of standard deviation 1. The row of none is 1.
@@ -279,13 +279,13 @@ def highest(signals: Real) -> Real:
     return out
 
 
-def single(table: Real) -> Real:
+def single(table: Floats) -> Floats:
     """Round to single precision, in which exponentials are the same on every machine."""
     return table.astype(np.float32).astype(np.float64)
 
 
 @cache
-def _exponential() -> Real:
+def _exponential() -> Floats:
     """Quantiles of the exponential distribution, of equal shares."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
     return single(-np.log1p(-shares))

@@ -6,14 +6,13 @@ from bisect import bisect_left
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ..base.arrays import Floats, Indices, Ints, Ints32
 from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
-from .hits import Real, Whole
 from .motion import Clock, Poses, into_axes, products, turned
 from .surfaces import Surfaces
 from .world import World
@@ -26,11 +25,11 @@ SLACK_NS = 10.0  # by which the time of a pulse at the receiver may be off befor
 class _Spots(NamedTuple):
     """Where pulses of a sensor hit something: arrays (n,)."""
 
-    time: Real  # when, nanoseconds since the station began
-    place: Real  # (n, 3)
-    normal: Real  # (n, 3)
-    triangle: NDArray[np.int32]
-    distance: Real  # from that sensor
+    time: Floats  # when, nanoseconds since the station began
+    place: Floats  # (n, 3)
+    normal: Floats  # (n, 3)
+    triangle: Ints32
+    distance: Floats  # from that sensor
 
 
 class Crosstalk:
@@ -54,8 +53,8 @@ class Crosstalk:
         ]
 
     def received(
-        self, scan: int, rays: Whole, origins: Real, directions: Real, poses: Poses
-    ) -> tuple[NDArray[np.intp], Real, Real]:
+        self, scan: int, rays: Ints, origins: Floats, directions: Floats, poses: Poses
+    ) -> tuple[Indices, Floats, Floats]:
         """Find pulses of other sensors that consecutive rays (n,) receive.
 
         `rays` count from the begin of a scan. Origins and directions are (n, 3).
@@ -70,7 +69,7 @@ class Crosstalk:
         fired = sensor.begins_ns(firing) + sensor.beams.time_ns[channel]
         gate = 2 / LIGHT_M_NS * np.array([sensor.min_range_m, sensor.max_range_m])
         order = np.argsort(fired, kind="stable")
-        found: list[tuple[NDArray[np.intp], Real, Real]] = []
+        found: list[tuple[Indices, Floats, Floats]] = []
         for other in self._others:
             lidar = self._survey.carried[other].sensor
             reach = (lidar.max_range_m + sensor.max_range_m) / LIGHT_M_NS
@@ -96,13 +95,13 @@ class Crosstalk:
 
     def _open(
         self,
-        fired: Real,
-        order: NDArray[np.intp],
-        origins: Real,
-        directions: Real,
+        fired: Floats,
+        order: Indices,
+        origins: Floats,
+        directions: Floats,
         spots: _Spots,
-        gate: Real,
-    ) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+        gate: Floats,
+    ) -> tuple[Indices, Indices]:
         """Pairs of a ray and a spot that it may see, whose light arrives while it waits."""
         times = fired[order]
         about = np.minimum(np.searchsorted(times, spots.time), len(times) - 1)
@@ -163,7 +162,7 @@ class Crosstalk:
             distance,
         )
 
-    def _energy(self, spots: _Spots, spot: NDArray[np.intp], towards: Real, far: Real) -> Real:
+    def _energy(self, spots: _Spots, spot: Indices, towards: Floats, far: Floats) -> Floats:
         """Energies that are received of spots: (n,), as of a sensor's own pulses."""
         surfaces, nm = self._surfaces, self._sensor.optics.wavelength_nm
         triangle = spots.triangle[spot]
@@ -176,9 +175,7 @@ class Crosstalk:
         return np.asarray(share * cosine * at_right_angles(far) * np.exp(-both))
 
 
-def _expanded(
-    first: NDArray[np.intp], stop: NDArray[np.intp]
-) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
     """Row and number of each whole number of ranges (n,): (k,) each."""
     each = np.maximum(stop - first, 0)
     row = np.repeat(np.arange(len(each)), each)

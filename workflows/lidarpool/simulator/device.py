@@ -15,11 +15,11 @@ from functools import lru_cache
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import DeviceHits, Outbox, Pattern, check_scan
 from raybeam.device import to_device
 
+from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
@@ -69,16 +69,16 @@ class DeviceReturns:
     scene: Scene
     survey: Survey
     specs: list[ScanSpec]
-    counts: NDArray[np.int64]  # of each scan
-    hits: NDArray[np.int64]  # of each scan, kept or not
-    tally: tuple[NDArray[np.intp], NDArray[np.int64]]
-    columns: dict[str, NDArray[Any]]  # by name
+    counts: Ints  # of each scan
+    hits: Ints  # of each scan, kept or not
+    tally: tuple[Indices, Ints]
+    columns: dict[str, AnyArray]  # by name
     returns: BatchReturns | None  # on the host, if there are columns that NumPy makes
 
     def __len__(self) -> int:
         return int(self.counts.sum())
 
-    def column(self, column: Column) -> NDArray[Any]:
+    def column(self, column: Column) -> AnyArray:
         """Values of a column."""
         if column.name in self.columns:
             return self.columns[column.name]
@@ -87,7 +87,7 @@ class DeviceReturns:
         value = {"sensor": self.specs[0].sensor, "cause": SURFACE}.get(column.name, 1)
         return np.full(len(self), value, column.dtype)
 
-    def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    def ends(self, rows: Ints) -> Floats:
         """Positions of some points (k,), at least to the survey's precision: (k, 3)."""
         if self.returns is not None:
             return self.returns.ends(rows)
@@ -126,7 +126,7 @@ class DeviceColumns:
         pattern: Pattern,
         poses: Poses,
         window: tuple[int, int],
-        groups: NDArray[np.int64],
+        groups: Ints,
     ) -> DeviceReturns:
         """Cast scans, see `Rig.returns`."""
         survey, sensor = self.survey, self.survey.carried[specs[0].sensor].sensor
@@ -177,12 +177,12 @@ class _Making:
     """Columns of a batch on their way from the device to the host."""
 
     def __init__(
-        self, maker: DeviceColumns, specs: list[ScanSpec], groups: NDArray[np.int64], most: int
+        self, maker: DeviceColumns, specs: list[ScanSpec], groups: Ints, most: int
     ) -> None:
         self._maker, self._specs, self._groups, self._most = maker, specs, groups, most
         self._begun: _Begun | None = None
         self._count = 0
-        self._on_actors: list[tuple[NDArray[Any], ...]] = [_NO_HITS]  # rows, and as `_HITS`
+        self._on_actors: list[tuple[AnyArray, ...]] = [_NO_HITS]  # rows, and as `_HITS`
 
     def make(self, hits: DeviceHits) -> None:
         """Make the columns of some hits, and send them to the host."""
@@ -210,11 +210,11 @@ class _Making:
         self._count += len(hits)
 
     @property
-    def rows(self) -> NDArray[np.int64]:
+    def rows(self) -> Ints:
         """Rows of the hits on actors."""
         return np.concatenate([rows for rows, *_ in self._on_actors])
 
-    def done(self) -> tuple[dict[str, NDArray[Any]], tuple[NDArray[Any], ...]]:
+    def done(self) -> tuple[dict[str, AnyArray], tuple[AnyArray, ...]]:
         """Wait for all columns; returns them by name, and what NumPy needs of hits, as `_HITS`."""
         if self._begun is None:
             return {c.name: np.zeros(0, c.dtype) for c in self._maker.made}, _NO_HITS[1:]
@@ -222,7 +222,7 @@ class _Making:
         # Page-locked memory has room for hits of all rays: where few hit, it is given back.
         few = 2 * self._count < self._most
 
-        def kept(out: NDArray[Any]) -> NDArray[Any]:
+        def kept(out: AnyArray) -> AnyArray:
             return out[: self._count].copy() if few else out[: self._count]
 
         columns = {column.name: kept(out) for column, out in self._begun.out.items()}
@@ -259,8 +259,8 @@ class _Begun:
     kernel: Any
     given: tuple[Any, ...]  # arguments between hits and columns
     outbox: Outbox
-    out: dict[Column, NDArray[Any]]  # page-locked, as all of these
-    hits: list[NDArray[Any]]  # as `_HITS`, if NumPy needs all of them
+    out: dict[Column, AnyArray]  # page-locked, as all of these
+    hits: list[AnyArray]  # as `_HITS`, if NumPy needs all of them
 
 
 @lru_cache(maxsize=16)

@@ -7,20 +7,16 @@ derivatives of the trajectories' own curves (`lidarpool.sensor.trajectory.veloci
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Floats, Integers, Ints, Ints32
 from .motion import Poses, products
 from .surfaces import Surfaces
 
 BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache
 
-Real = NDArray[np.float64]
 
-
-def approach(poses: Poses, ray: NDArray[np.integer[Any]], origins: Real, directions: Real) -> Real:
+def approach(poses: Poses, ray: Integers, origins: Floats, directions: Floats) -> Floats:
     """How fast rays (n,) grow because their origins move, m/s: (n,); what stands still has that.
 
     Origins and unit directions are (n, 3), in the scene's axes.
@@ -39,12 +35,12 @@ def approach(poses: Poses, ray: NDArray[np.integer[Any]], origins: Real, directi
 def radial_velocities(
     surfaces: Surfaces,
     poses: Poses,
-    ray: NDArray[np.integer[Any]],
-    rays: tuple[Real, Real],
-    distance: Real,
-    triangle: NDArray[np.int32],
-    times: Real | NDArray[np.int64],
-) -> Real:
+    ray: Integers,
+    rays: tuple[Floats, Floats],
+    distance: Floats,
+    triangle: Ints32,
+    times: Floats | Ints,
+) -> Floats:
     """Return the radial velocities of straight rays (n,) that end on triangles, m/s: (n,).
 
     Parameters

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern, ScanReturns
 
+from ..base.arrays import Bools, Bytes, Floats, Ints, Ints32, UInts32
 from ..scene.scene import Scene
 from ..sensor import Returns, Sensor, Survey
 from ..sensor.disc import Beam
@@ -19,7 +20,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import Mode, any_axes, axes_about, spread
 from .air import AirCaster
 from .doppler import radial_velocities
-from .hits import NO_SURFACE, Hits, Keys, Real, Whole, joined, numbers, runs
+from .hits import NO_SURFACE, Hits, Keys, joined, numbers, runs
 from .motion import Poses, products, turned
 from .paths import Paths
 from .receiver import Receiver
@@ -38,18 +39,18 @@ class Echoes(ScanReturns):
     """Returns in the order of rays and distances, possibly several for a ray."""
 
     # (k,): received, see `Surfaces.energy`; None if it is that of the rays as reported.
-    energy: Real | None
-    number: NDArray[np.uint8]  # (k,): among the reported returns of its pulse, from 1
-    returns: NDArray[np.uint8]  # (k,): how many these are
-    reported: Real  # (k,): distance with noise; `distance` has none
+    energy: Floats | None
+    number: Bytes  # (k,): among the reported returns of its pulse, from 1
+    returns: Bytes  # (k,): how many these are
+    reported: Floats  # (k,): distance with noise; `distance` has none
     # (k,): packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
-    colour: NDArray[np.uint32] | None = None
-    cause: NDArray[np.uint8] | None = None  # (k,): why they are there; None if all are surfaces
+    colour: UInts32 | None = None
+    cause: Bytes | None = None  # (k,): why they are there; None if all are surfaces
     # (k,): radial velocities, m/s; None if they are those of the rays' ends, or not needed.
-    velocity: Real | None = None
+    velocity: Floats | None = None
     # (k,): full width at half maximum in the waveform, ns, and height; None without waveforms.
-    width: Real | None = None
-    amplitude: Real | None = None
+    width: Floats | None = None
+    amplitude: Floats | None = None
     waveform: NDArray[np.void] | None = None  # (k,): recorded, but for the location
 
 
@@ -102,7 +103,7 @@ class EchoCaster:
         divided: Pattern | None,
         poses: Poses,
         window: tuple[int, int],
-        groups: Whole,
+        groups: Ints,
         *,
         tally: bool = True,
     ) -> Echoes:
@@ -200,7 +201,7 @@ class EchoCaster:
         pattern: Pattern,
         poses: Poses,
         window: tuple[int, int],
-        groups: Whole,
+        groups: Ints,
         tally: bool,
     ) -> Echoes:
         """Cast rays with one return each; compute energies only for kept ones, and if needed."""
@@ -241,7 +242,7 @@ class EchoCaster:
             velocity=velocity,
         )
 
-    def _tally(self, triangle: NDArray[np.int32]) -> Whole:
+    def _tally(self, triangle: Ints32) -> Ints:
         surfaces = self._surfaces
         some = triangle[triangle != NO_SURFACE]
         return np.bincount(surfaces.counter(some), minlength=surfaces.counters)
@@ -273,7 +274,7 @@ class EchoCaster:
         waveform = recorded(hits, given, self._digitizer, each, self._records, noise)
         return returns._replace(waveform=waveform)
 
-    def _kept(self, returns: Hits, groups: Whole, tally: bool) -> Echoes:
+    def _kept(self, returns: Hits, groups: Ints, tally: bool) -> Echoes:
         """Count the returns of each scan and thin them out."""
         ray = returns.ray
         cuts = np.searchsorted(ray, np.append(groups, np.iinfo(np.int64).max))
@@ -309,7 +310,7 @@ def digitizer_of(returns: Returns, sensor: Sensor) -> Digitizer:
     return Digitizer(system_ns, returns.sample_ns, returns.waveform == "gaussian")
 
 
-def chosen(returns: Hits, mode: Mode) -> NDArray[np.bool_]:
+def chosen(returns: Hits, mode: Mode) -> Bools:
     """Whether a mode reports each return: (n,)."""
     ray = returns.ray
     begins, counts = runs(ray)

@@ -9,14 +9,11 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import AnyArray, Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32
 from ..columns.table import CAUSES
 
 NO_SURFACE = -1  # triangle and object of what is no surface
 SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING = range(len(CAUSES))
-
-Whole = NDArray[np.int64]
-Rays = NDArray[np.integer[Any]]
-Real = NDArray[np.float64]
 
 
 def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
@@ -30,25 +27,25 @@ class Hits(NamedTuple):
     What is no surface has the triangle `NO_SURFACE`.
     """
 
-    ray: Whole
-    distance: Real
-    triangle: NDArray[np.int32]
-    energy: Real
-    colour: NDArray[np.uint32] | None = None  # packed, see `Surfaces.colours`
-    cause: NDArray[np.uint8] | None = None  # None if all are surfaces
-    velocity: Real | None = None  # radial, m/s, if a column has it; NaN if unknown
+    ray: Ints
+    distance: Floats
+    triangle: Ints32
+    energy: Floats
+    colour: UInts32 | None = None  # packed, see `Surfaces.colours`
+    cause: Bytes | None = None  # None if all are surfaces
+    velocity: Floats | None = None  # radial, m/s, if a column has it; NaN if unknown
     # Full width at half maximum in the waveform, ns; None if returns are made without.
-    width: Real | None = None
+    width: Floats | None = None
     waveform: NDArray[np.void] | None = None  # of returns: recorded, see `recorded`
 
-    def take(self, rows: NDArray[np.bool_] | NDArray[np.intp]) -> Hits:
+    def take(self, rows: Bools | Indices) -> Hits:
         """Select some of them."""
         return Hits(*selected(self, rows))
 
 
 # Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
 # rays: (n, 3) each.
-Planes = Callable[[NDArray[np.intp]], tuple[Real, Real]]
+Planes = Callable[[Indices], tuple[Floats, Floats]]
 
 
 def joined(parts: list[Hits]) -> Hits:
@@ -67,7 +64,7 @@ def joined(parts: list[Hits]) -> Hits:
     )
 
 
-def _filled(parts: list[Hits], columns: tuple[Any, ...], value: np.generic) -> NDArray[Any] | None:
+def _filled(parts: list[Hits], columns: tuple[Any, ...], value: np.generic) -> AnyArray | None:
     """Concatenate a column that some parts lack, with a value for those; None if all lack it."""
     if all(column is None for column in columns):
         return None
@@ -82,20 +79,20 @@ class Keys:
     """Keys of the random numbers of rays."""
 
     scan: int  # number of the first scan
-    begins: Whole  # rays at which scans begin
+    begins: Ints  # rays at which scans begin
 
-    def of(self, ray: Rays) -> tuple[Whole, Whole]:
+    def of(self, ray: Integers) -> tuple[Ints, Ints]:
         """Return the scans of rays, and their numbers within them."""
         number = np.searchsorted(self.begins, ray, side="right") - 1
         return self.scan + number, ray - self.begins[number]
 
 
-def numbers(ray: Whole) -> Whole:
+def numbers(ray: Ints) -> Ints:
     """Count the entries of each ray, which are consecutive, from 0: (n,)."""
     return np.arange(len(ray)) - np.repeat(*runs(ray))
 
 
-def runs(ray: Whole) -> tuple[Whole, Whole]:
+def runs(ray: Ints) -> tuple[Ints, Ints]:
     """Find starts and lengths of runs of equal numbers."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     return begins, np.diff(begins, append=len(ray))

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..scene.scene import Scene
 from ..sensor import Trajectory
@@ -23,7 +24,7 @@ from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.noise import Purpose
 from ..sensor.optics import any_axes
-from .hits import Real, Whole, selected
+from .hits import selected
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces
 from .world import World
@@ -32,18 +33,16 @@ DEPTH = 8  # media around a place that are known at most
 PROBES_MOST = 256  # surfaces that a search for media around a place passes
 UPWARDS = np.array([0.0123, 0.0345, 0.9993])  # of that search; along no edge of what people model
 
-Bools = NDArray[np.bool_]
-Numbers = NDArray[np.int32]
 # Random bits of rays for a purpose: (n,).
-Draw = Callable[[Purpose, Whole], NDArray[np.uint64]]
+Draw = Callable[[Purpose, Ints], NDArray[np.uint64]]
 
 
 class Rays(NamedTuple):
     """Light of sub-rays that begins, and the trajectories of actors."""
 
-    origins: Real  # (n, 3)
-    directions: Real  # (n, 3)
-    times: Real  # (n,)
+    origins: Floats  # (n, 3)
+    directions: Floats  # (n, 3)
+    times: Floats  # (n,)
     ways: tuple[Trajectory, ...]
 
 
@@ -51,32 +50,32 @@ class Rays(NamedTuple):
 class Around:
     """Media around the light of sub-rays, the innermost first: (n, DEPTH) each; -1 for none."""
 
-    objects: Numbers
-    triangles: Numbers  # where light came in
+    objects: Ints32
+    triangles: Ints32  # where light came in
 
     @classmethod
     def none(cls, count: int) -> Around:
         """Make them for light in the air."""
         return cls(*(np.full((count, DEPTH), -1, np.int32) for _ in range(2)))
 
-    def __getitem__(self, rows: NDArray[np.integer[Any]]) -> Around:
+    def __getitem__(self, rows: Integers) -> Around:
         """Select those of some sub-rays."""
         return Around(self.objects[rows], self.triangles[rows])
 
-    def enter(self, rows: NDArray[np.intp], objects: Numbers, triangles: Numbers) -> None:
+    def enter(self, rows: Indices, objects: Ints32, triangles: Ints32) -> None:
         """Enter a medium each."""
         for table, new in ((self.objects, objects), (self.triangles, triangles)):
             table[rows, 1:] = table[rows, :-1]
             table[rows, 0] = new
 
-    def surround(self, rows: NDArray[np.intp], objects: Numbers, triangles: Numbers) -> None:
+    def surround(self, rows: Indices, objects: Ints32, triangles: Ints32) -> None:
         """Add a medium each around those that are known; nothing where there are too many."""
         place = (self.objects[rows] >= 0).sum(axis=1)
         free = place < DEPTH
         self.objects[rows[free], place[free]] = objects[free]
         self.triangles[rows[free], place[free]] = triangles[free]
 
-    def leave(self, rows: NDArray[np.intp], objects: Numbers) -> Bools:
+    def leave(self, rows: Indices, objects: Ints32) -> Bools:
         """Leave a medium each; returns which were known."""
         same = self.objects[rows] == objects[:, None]
         known = same.any(axis=1)
@@ -93,29 +92,29 @@ class Around:
 class Bundle:
     """How the light of sub-rays has been bent and weakened: arrays (n, …)."""
 
-    index: Real  # (n,): refractive index where it is
-    first: Real  # (n,): and where it began
-    lost: Real  # (n,): optical depth by attenuation, one way
-    places: Real  # (n, 2, 3): derivatives of where it is, by its first direction
-    ways: Real  # (n, 2, 3): and of where it goes
+    index: Floats  # (n,): refractive index where it is
+    first: Floats  # (n,): and where it began
+    lost: Floats  # (n,): optical depth by attenuation, one way
+    places: Floats  # (n, 2, 3): derivatives of where it is, by its first direction
+    ways: Floats  # (n, 2, 3): and of where it goes
 
     @classmethod
-    def of(cls, directions: Real, index: Real) -> Bundle:
+    def of(cls, directions: Floats, index: Floats) -> Bundle:
         """Make those of light that begins."""
         ways = np.stack(any_axes(directions), axis=1)
         none = np.zeros(len(ways))
         return cls(index.copy(), index, none, np.zeros_like(ways), ways)
 
-    def __getitem__(self, rows: NDArray[np.integer[Any]]) -> Bundle:
+    def __getitem__(self, rows: Integers) -> Bundle:
         """Select those of some sub-rays."""
         return Bundle(*selected(vars(self).values(), rows))
 
-    def go(self, step: Real, attenuation: Real) -> None:
+    def go(self, step: Floats, attenuation: Floats) -> None:
         """Go straight on so many metres (n,), where so much is lost, 1/m (n,)."""
         self.places = self.places + step[:, None, None] * self.ways
         self.lost = self.lost + attenuation * step
 
-    def factor(self, directions: Real, distance: Real, extinction: float) -> Real:
+    def factor(self, directions: Floats, distance: Floats, extinction: float) -> Floats:
         """Energy relative to that of light that went as far, straight through the air: (n,).
 
         Of light that is scattered at the end of a path, the receiver gets the share that its area
@@ -132,7 +131,9 @@ class Bundle:
         more = np.minimum(2 * (extinction * distance - self.lost), 700.0)
         return np.asarray(nearer * np.exp(more))
 
-    def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools, index: Real) -> None:
+    def turn(
+        self, before: Floats, after: Floats, normals: Floats, mirrored: Bools, index: Floats
+    ) -> None:
         """Turn it at flat surfaces, from directions (n, 3) to others, into another index (n,)."""
         along, behind = (_aside(_dots(way, normals)) for way in (before, after))
         # Each ray of a bundle arrives where it meets the plane.
@@ -181,7 +182,7 @@ class Media:
         for angle in self._angles if self.leafy else ():
             projection(angle, np.ones(1))  # makes its table
 
-    def sides(self, objects: Numbers, along: Real) -> Bools:
+    def sides(self, objects: Ints32, along: Floats) -> Bools:
         """Whether light enters objects, whose normals have the cosines `along` with it: (n,)."""
         return np.asarray((along < 0) != self._inwards[objects])
 
@@ -210,8 +211,8 @@ class Media:
     def _search(
         self,
         world: World,
-        origins: Real,
-        times: Real,
+        origins: Floats,
+        times: Floats,
         ways: tuple[Trajectory, ...],
     ) -> Around:
         """Look upwards: a medium that light leaves without having entered it is around it."""
@@ -238,23 +239,23 @@ class Media:
             around.surround(rows[goes], objects[goes], hits.triangle[goes])
         return around
 
-    def within(self, world: World, light: Rays, depths: Real | None) -> Within:
+    def within(self, world: World, light: Rays, depths: Floats | None) -> Within:
         """Return the state of light that begins; `depths` (n,) are those until a leaf."""
         around = self.around(world, light)
         bundle = Bundle.of(light.directions, self.index(around)) if self.bends else None
         return Within(self, around, bundle, depths)
 
-    def index(self, around: Around) -> Real:
+    def index(self, around: Around) -> Floats:
         """Refractive indices of the innermost media that have one: (n,)."""
         indices = self._index[around.objects]
         return _first(indices, indices > 0, 1.0)
 
-    def attenuation(self, around: Around) -> Real:
+    def attenuation(self, around: Around) -> Floats:
         """Extinction there, 1/m: (n,); outside of what refracts that of the air."""
         refracts = self._index[around.objects] > 0
         return _first(self._attenuation[around.objects], refracts, self.air)
 
-    def behind(self, around: Around, objects: Numbers, triangles: Numbers, along: Real) -> Around:
+    def behind(self, around: Around, objects: Ints32, triangles: Ints32, along: Floats) -> Around:
         """Media behind surfaces (n,), which light meets at the cosines `along`."""
         behind = around[np.arange(len(objects))]
         enters, filled = self.sides(objects, along), self.filled[objects]
@@ -263,7 +264,7 @@ class Media:
         behind.leave(goes, objects[goes])
         return behind
 
-    def density(self, around: Around, upright: Real) -> Real:
+    def density(self, around: Around, upright: Floats) -> Floats:
         """Optical depth of leaves for each metre, in each medium around light: (n, DEPTH)."""
         density = self._area[around.objects]
         if density.any():
@@ -272,7 +273,7 @@ class Media:
                 density *= np.where(self._angle[around.objects] == number, crossing, 1)
         return density
 
-    def bright(self, objects: Numbers, upright: Real) -> Real:
+    def bright(self, objects: Ints32, upright: Floats) -> Floats:
         """Mean cosine between light and the leaves of objects (n,) that it meets: (n,)."""
         out = np.ones(len(objects))
         for number, angle in enumerate(self._angles):
@@ -283,10 +284,10 @@ class Media:
 class Leaves(NamedTuple):
     """Leaves that light meets: arrays (k,)."""
 
-    rows: NDArray[np.intp]  # of the light
-    metres: Real  # how far it gets
-    triangles: Numbers  # where it came into the crown
-    cosines: Real  # mean ones between light and leaves
+    rows: Indices  # of the light
+    metres: Floats  # how far it gets
+    triangles: Ints32  # where it came into the crown
+    cosines: Floats  # mean ones between light and leaves
 
 
 @dataclass
@@ -296,23 +297,28 @@ class Within:
     media: Media
     around: Around
     bundle: Bundle | None  # None if nothing refracts
-    left: Real | None  # (n,): optical depth until a leaf; None if there are none
+    left: Floats | None  # (n,): optical depth until a leaf; None if there are none
 
-    def __getitem__(self, rows: NDArray[np.integer[Any]]) -> Within:
+    def __getitem__(self, rows: Integers) -> Within:
         """Select that of some sub-rays."""
         return Within(self.media, *selected((self.around, self.bundle, self.left), rows))
 
     @property
-    def index(self) -> Real | float:
+    def index(self) -> Floats | float:
         """Refractive index where it is."""
         return 1.0 if self.bundle is None else self.bundle.index
 
-    def optical(self, step: Real) -> Real:
+    def optical(self, step: Floats) -> Floats:
         """Optical paths of so many metres (n,)."""
         return step if self.bundle is None else step * self.bundle.index
 
     def meet(
-        self, origins: Real, directions: Real, span: tuple[Real, Real], ray: Whole, draw: Draw
+        self,
+        origins: Floats,
+        directions: Floats,
+        span: tuple[Floats, Floats],
+        ray: Ints,
+        draw: Draw,
     ) -> Leaves:
         """Find which light meets a leaf within a span of its way, metres from its origin (n,)."""
         if self.left is None:
@@ -345,8 +351,8 @@ class Within:
         return Leaves(rows, metres, self.around.triangles[rows, place], cosines)
 
     def _among_voxels(
-        self, starts: Real, directions: Real, length: Real, density: Real
-    ) -> tuple[NDArray[np.intp], Real, Real]:
+        self, starts: Floats, directions: Floats, length: Floats, density: Floats
+    ) -> tuple[Indices, Floats, Floats]:
         """Take light through grids, and put their optical depths for a metre into `density`.
 
         Those that it has are for a density of 1. Returns the rows of light in grids, how far it
@@ -371,20 +377,20 @@ class Within:
         density[rows] = own
         return rows, metres, rest
 
-    def go(self, step: Real) -> None:
+    def go(self, step: Floats) -> None:
         """Go straight on so many metres (n,)."""
         if self.bundle is not None:
             self.bundle.go(step, self.media.attenuation(self.around))
 
-    def factor(self, directions: Real, distance: Real) -> Real | float:
+    def factor(self, directions: Floats, distance: Floats) -> Floats | float:
         """Energy relative to that of light that went as far, straight through the air: (n,)."""
         if self.bundle is None:
             return 1.0
         return self.bundle.factor(directions, distance, self.media.air)
 
     def cross(
-        self, objects: Numbers, triangles: Numbers, directions: Real, normals: Real, along: Real
-    ) -> tuple[Real, Real | float, Bools]:
+        self, objects: Ints32, triangles: Ints32, directions: Floats, normals: Floats, along: Floats
+    ) -> tuple[Floats, Floats | float, Bools]:
         """Take light through surfaces (n,), which it meets at the cosines `along`.
 
         Returns
@@ -401,15 +407,15 @@ class Within:
         self.around.triangles[whole] = before.triangles[whole]
         return ahead, passes, whole
 
-    def turn(self, before: Real, after: Real, normals: Real, mirrored: Bools) -> None:
+    def turn(self, before: Floats, after: Floats, normals: Floats, mirrored: Bools) -> None:
         """Turn the bundles at flat surfaces, from directions (n, 3) to others."""
         if self.bundle is not None:
             self.bundle.turn(before, after, normals, mirrored, self.media.index(self.around))
 
 
 def refracted(
-    directions: Real, normals: Real, along: Real, ratio: Real
-) -> tuple[Real, Real, Bools]:
+    directions: Floats, normals: Floats, along: Floats, ratio: Floats
+) -> tuple[Floats, Floats, Bools]:
     """Take light through surfaces by Snell's law; `ratio` (n,) is the index behind over before.
 
     Returns
@@ -429,7 +435,7 @@ def refracted(
     return np.where(bends[:, None], bent, directions), passes, whole
 
 
-def depths(bits: NDArray[np.uint64]) -> Real:
+def depths(bits: NDArray[np.uint64]) -> Floats:
     """Exponentially distributed numbers of mean 1, from random bits: (n,).
 
     The number of halvings and a table of 32,768 logarithms give the same on every machine.
@@ -443,19 +449,19 @@ def depths(bits: NDArray[np.uint64]) -> Real:
 _LOGS = -np.log((np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5).astype(np.float32).astype(np.float64)
 
 
-def _dots(one: Real, other: Real) -> Real:
+def _dots(one: Floats, other: Floats) -> Floats:
     """Scalar products along the last axis, in one order of rounding."""
     return np.asarray(
         (one[..., 0] * other[..., 0] + one[..., 1] * other[..., 1]) + one[..., 2] * other[..., 2]
     )
 
 
-def _aside(cosine: Real) -> Real:
+def _aside(cosine: Floats) -> Floats:
     """Keep cosines away from 0."""
     return np.where(np.abs(cosine) > 1e-9, cosine, 1e-9)
 
 
-def _first(values: Real, wanted: NDArray[Any], default: float) -> Real:
+def _first(values: Floats, wanted: AnyArray, default: float) -> Floats:
     """Return the first wanted value of each row, or a default: (n,)."""
     place = wanted.argmax(axis=1)
     rows = np.arange(len(values))

@@ -7,15 +7,13 @@ from functools import cached_property
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 import raybeam.poses
 from raybeam import Motion, Pattern
 
+from ..base.arrays import Floats, Integers
 from ..sensor import Mounted, Trajectory
 from ..sensor.trajectory import velocities
-
-Float = NDArray[np.float64]
 
 
 @dataclass(frozen=True)
@@ -25,16 +23,16 @@ class Clock:
     Actors move by times since the survey's start, a carrier by those since its station's.
     """
 
-    begins: Float  # (f,): of each firing
-    delays: Float  # (m,): of each ray of a firing
+    begins: Floats  # (f,): of each firing
+    delays: Floats  # (m,): of each ray of a firing
     ways: tuple[Trajectory, ...]  # of the actors, or that of the carrier
     start: int = 0  # first ray
     subrays: int = 1  # of each ray
 
-    def of(self, ray: NDArray[np.integer[Any]]) -> Float:
+    def of(self, ray: Integers) -> Floats:
         """Return the firing times of rays (n,): (n,)."""
         firing, beam = np.divmod(self.start + ray // self.subrays, len(self.delays))
-        times: Float = self.begins[firing] + self.delays[beam]
+        times: Floats = self.begins[firing] + self.delays[beam]
         return times
 
 
@@ -42,8 +40,8 @@ class Clock:
 class Poses:
     """Poses of rays for `RayCaster.scan`: of the sensor's head, or else of its carrier."""
 
-    positions: Float
-    rotations: Float | None = None
+    positions: Floats
+    rotations: Floats | None = None
     rays_per_pose: int | None = None
     motion: Motion | None = None
     clock: Clock | None = None
@@ -68,7 +66,7 @@ class Poses:
         """Trajectories of the actors."""
         return () if self.clock is None else self.clock.ways
 
-    def times(self, ray: NDArray[np.integer[Any]]) -> Float:
+    def times(self, ray: Integers) -> Floats:
         """Return firing times of rays, nanoseconds since the survey's start; for actors."""
         return np.zeros(len(ray)) if self.clock is None else self.clock.of(ray)
 
@@ -96,7 +94,7 @@ class Poses:
             carrier=carrier,
         )
 
-    def drift(self, ray: NDArray[np.integer[Any]], origins: Float) -> Float:
+    def drift(self, ray: Integers, origins: Floats) -> Floats:
         """Velocities of the carrier at starts of rays (n, 3), m/s: (n, 3).
 
         A beam starts from a fixed point of the carrier: what a head that turns adds is left out,
@@ -109,9 +107,7 @@ class Poses:
         places, _ = path.poses(self.station, times)
         return carried_at(velocity, rate, origins - places)
 
-    def rays(
-        self, pattern: Pattern, ray: NDArray[np.integer[Any]], start: int = 0
-    ) -> tuple[Float, Float]:
+    def rays(self, pattern: Pattern, ray: Integers, start: int = 0) -> tuple[Floats, Floats]:
         """Origins and directions of rays of a pattern, see `Pattern.rays`."""
         return pattern.rays(ray, start=start, **self.given)
 
@@ -175,12 +171,12 @@ def poses_of_firings(
     return Poses(places, rotations, sensor.channels, motion, by_head=spins is not None)
 
 
-def carried_at(velocity: Float, rate: Float, lever: Float) -> Float:
+def carried_at(velocity: Floats, rate: Floats, lever: Floats) -> Floats:
     """Velocities of points of bodies: of their origins, their rates, and levers, (n, 3) each."""
     return velocity + np.cross(rate, lever)
 
 
-def turned(vectors: Float, rotation: Float | None) -> Float:
+def turned(vectors: Floats, rotation: Floats | None) -> Floats:
     """Rotate vectors (n, 3) by a matrix, with a fixed order of rounding, unlike BLAS."""
     if rotation is None:
         return vectors
@@ -188,7 +184,7 @@ def turned(vectors: Float, rotation: Float | None) -> Float:
     return np.stack([(x * a + y * b) + z * c for a, b, c in rotation], axis=1)
 
 
-def into_axes(vectors: Float, rotations: Float | None) -> Float:
+def into_axes(vectors: Floats, rotations: Floats | None) -> Floats:
     """Rotate vectors (m, 3) from the scene's axes to those of rotations (m, 3, 3), one each."""
     if rotations is None:
         return vectors
@@ -200,7 +196,7 @@ def into_axes(vectors: Float, rotations: Float | None) -> Float:
     return out
 
 
-def spun(rotations: Float, spins: Float) -> Float:
+def spun(rotations: Floats, spins: Floats) -> Floats:
     """Products of matrices (k, 3, 3) and turns about z, their cosines and sines (2, k)."""
     (cos, sin), out = spins, np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
     for row in range(3):
@@ -211,7 +207,7 @@ def spun(rotations: Float, spins: Float) -> Float:
     return out
 
 
-def products(one: Float, other: Float) -> Float:
+def products(one: Floats, other: Floats) -> Floats:
     """Scalar products of vectors (3, ...): (...), in one order of rounding."""
     (x, y, z), (a, b, c) = one, other
     product = x * a
@@ -220,7 +216,7 @@ def products(one: Float, other: Float) -> Float:
     return np.asarray(product)
 
 
-def _product(matrices: Float, matrix: Float) -> Float:
+def _product(matrices: Floats, matrix: Floats) -> Floats:
     """Products of matrices (k, 3, 3) and one (3, 3), in one order of rounding, however many."""
     out = np.empty((3, 3, len(matrices))).transpose(2, 0, 1)
     for row in range(3):
@@ -228,7 +224,7 @@ def _product(matrices: Float, matrix: Float) -> Float:
     return out
 
 
-def _turned_by(before: Float, after: Float) -> Float:
+def _turned_by(before: Floats, after: Floats) -> Floats:
     """Rotation vectors (k, 3), radians, between matrices (k, 3, 3) that differ by little.
 
     Half the sum of the cross products of the axes before and after: the sine of the angle.

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ..base.arrays import Floats, Indices, Integers, Ints, Ints32, UInts32
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.noise import Purpose, raw
 from .doppler import BLOCK_HITS, approach
-from .hits import AIR, Hits, Keys, Planes, Real, Whole, joined, selected
+from .hits import AIR, Hits, Keys, Planes, joined, selected
 from .media import Media, Rays, Within, depths
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
@@ -29,19 +29,19 @@ LEAFY_PASSES_MOST = 64  # where there are crowns, whose surfaces it passes twice
 class _Light:
     """The light of sub-rays on its way: arrays (n,), vectors (n, 3)."""
 
-    ray: Whole  # number of the sub-ray
-    times: Real
-    origins: Real
-    directions: Real
-    share: Real  # that comes back, but for what the last surface scatters
-    before: Real  # optical path up to the origin
+    ray: Ints  # number of the sub-ray
+    times: Floats
+    origins: Floats
+    directions: Floats
+    share: Floats  # that comes back, but for what the last surface scatters
+    before: Floats  # optical path up to the origin
     # What mirrors did to the directions so far, (n, 3, 3), if there are any.
-    turns: Real | None = None
+    turns: Floats | None = None
     within: Within | None = None  # if there are media
     # How fast its optical path grows, m/s, but for the motion of its end, if that is asked for.
-    growth: Real | None = None
+    growth: Floats | None = None
 
-    def on(self, rows: NDArray[np.integer[Any]]) -> _Light:
+    def on(self, rows: Integers) -> _Light:
         """Select that of some sub-rays."""
         return _Light(*selected(vars(self).values(), rows))
 
@@ -72,11 +72,11 @@ class Paths:
 
     def energy(
         self,
-        triangle: NDArray[np.int32],
-        cosine: Real,
-        distance: Real,
-        colour: NDArray[np.uint32] | None,
-    ) -> Real:
+        triangle: Ints32,
+        cosine: Floats,
+        distance: Floats,
+        colour: UInts32 | None,
+    ) -> Floats:
         """Return the received energy of hits (n,), see `Surfaces.energy`."""
         return self._surfaces.energy(triangle, cosine, distance, self._light, colour)
 
@@ -107,7 +107,7 @@ class Paths:
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
         )
 
-        def draw(purpose: Purpose, ray: Whole) -> NDArray[np.uint64]:
+        def draw(purpose: Purpose, ray: Ints) -> NDArray[np.uint64]:
             scan, number = keys.of(first + ray // each)
             return raw(self._seed, purpose, scan, number, ray % each)
 
@@ -121,7 +121,7 @@ class Paths:
             light.within = media.within(self._world, rays, left)
         step, triangle = found.distance, found.triangle
         parts: list[Hits] = []
-        seen: list[Real] = []  # normals as the sensor sees them
+        seen: list[Floats] = []  # normals as the sensor sees them
         clear = np.full(len(ray), nearest)  # where light is first, metres from the origin
         for _ in range(LEAFY_PASSES_MOST if leafy else PASSES_MOST):
             normals = surfaces.normals(triangle, light.times, poses.ways)
@@ -185,7 +185,7 @@ class Paths:
             order = np.argsort(hits.ray, kind="stable")
             hits, normals = hits.take(order), np.concatenate(seen)[order]
 
-        def planes(rows: NDArray[np.intp]) -> tuple[Real, Real]:
+        def planes(rows: Indices) -> tuple[Floats, Floats]:
             return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
 
         return hits, planes
@@ -193,13 +193,13 @@ class Paths:
     def _behind(
         self,
         light: _Light,
-        step: Real,
-        distance: Real,
-        triangle: NDArray[np.int32],
-        normals: Real,
-        along: Real,
-        moved: Real | None,
-    ) -> tuple[_Light, Real]:
+        step: Floats,
+        distance: Floats,
+        triangle: Ints32,
+        normals: Floats,
+        along: Floats,
+        moved: Floats | None,
+    ) -> tuple[_Light, Floats]:
         """Take light (n,) through the surfaces at its end, or off them.
 
         Returns it behind them, and where the surfaces are from there, metres, at or below 0.
@@ -250,9 +250,7 @@ class Paths:
         velocity[rows] = approach(poses, ray, *poses.rays(beams, ray, window[0]))
         return hits._replace(velocity=velocity)
 
-    def _velocities(
-        self, light: _Light, step: Real, triangle: NDArray[np.int32], poses: Poses
-    ) -> Real:
+    def _velocities(self, light: _Light, step: Floats, triangle: Ints32, poses: Poses) -> Floats:
         """Velocities of where light ends after so many metres, m/s: (n, 3)."""
         out = np.empty_like(light.directions)
         for begin in range(0, len(triangle), BLOCK_HITS):

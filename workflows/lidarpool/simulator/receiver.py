@@ -5,31 +5,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ..base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS, any_axes
 from .crosstalk import Crosstalk
-from .hits import (
-    BLOOMING,
-    CROSSTALK,
-    FALSE_ALARM,
-    NO_SURFACE,
-    Hits,
-    Keys,
-    Real,
-    Whole,
-    joined,
-    numbers,
-)
+from .hits import BLOOMING, CROSSTALK, FALSE_ALARM, NO_SURFACE, Hits, Keys, joined, numbers
 from .motion import Poses, into_axes, products
 from .paths import Paths
 from .surfaces import Surfaces
@@ -43,7 +31,9 @@ FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
 INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
 
 
-def unreal(ray: Whole, distance: Real, energy: Real, cause: int, *, coloured: bool = False) -> Hits:
+def unreal(
+    ray: Ints, distance: Floats, energy: Floats, cause: int, *, coloured: bool = False
+) -> Hits:
     """Make returns that are from no surface, in the order of rays and distances."""
     order = np.lexsort((distance, ray))
     count = len(ray)
@@ -94,10 +84,10 @@ class Receiver:
         self,
         returns: Hits,
         keys: Keys,
-        rays: Whole,
+        rays: Ints,
         beams: Pattern,
         poses: Poses,
-        rows: Whole,
+        rows: Ints,
         start: int,
     ) -> Hits:
         """Return the detected returns of consecutive rays (n,), and what else is detected.
@@ -108,7 +98,7 @@ class Receiver:
         parts = [returns]
         coloured = returns.colour is not None
 
-        def add(ray: Whole, distance: Real, energy: Real, cause: int) -> None:
+        def add(ray: Ints, distance: Floats, energy: Floats, cause: int) -> None:
             parts.append(unreal(ray, distance, energy, cause, coloured=coloured))
 
         if self._alarms:
@@ -138,13 +128,13 @@ class Receiver:
     def _stray(
         self,
         returns: Hits,
-        rays: Whole,
-        origins: Real,
-        directions: Real,
-        times: Real,
+        rays: Ints,
+        origins: Floats,
+        directions: Floats,
+        times: Floats,
         poses: Poses,
         keys: Keys,
-    ) -> tuple[NDArray[np.intp], Real, Real]:
+    ) -> tuple[Indices, Floats, Floats]:
         """Stray light of retro-reflectors that is detected: rows of rays, distances, energies."""
         best = np.zeros(len(rays))
         ends = np.zeros((len(rays), 3))  # seen from the origins
@@ -175,7 +165,7 @@ class Receiver:
         row = row[seen]
         return row, distance[seen], best[row]
 
-    def _near(self, retro: _Retro, cells: _Cells) -> NDArray[np.intp]:
+    def _near(self, retro: _Retro, cells: _Cells) -> Indices:
         """Rays that may receive enough of the light of a retro-reflector, and perhaps others."""
         centre = retro.middle - cells.begins
         far = np.sqrt(products(centre.T, centre.T))
@@ -193,18 +183,18 @@ class Receiver:
         inside = ~(off < np.cos(np.minimum(reach[which], np.pi)))
         return near[inside]
 
-    def _reach(self, retro: _Retro, distance: Real) -> Real:
+    def _reach(self, retro: _Retro, distance: Floats) -> Floats:
         """Angles at which the light of a retro-reflector becomes too faint, radians: (n,)."""
         whole = self._whole(np.repeat(retro.triangles[:1], len(distance)), distance)
         share = FAINTEST * self._noise.threshold / np.maximum(whole, 1e-300)
         return np.radians(np.sqrt(self._noise.stray_light / share))
 
-    def _whole(self, triangle: NDArray[np.int32], distance: Real) -> Real:
+    def _whole(self, triangle: Ints32, distance: Floats) -> Floats:
         """Energies of beams that hit a retro-reflector: (n,)."""
         white = np.full(len(distance), 0xFFFFFFFF, np.uint32)
         return self._paths.energy(triangle, np.ones(len(distance)), distance, white)
 
-    def _leaks(self, retro: _Retro, starts: Real, ahead: Real) -> tuple[Real, Real]:
+    def _leaks(self, retro: _Retro, starts: Floats, ahead: Floats) -> tuple[Floats, Floats]:
         """Energies of stray light in rays (n,), and where it is from, seen from there: (n, 3).
 
         The light comes from the point of the triangles that is nearest to the ray by angle.
@@ -232,7 +222,7 @@ class Receiver:
             best[some[more]], ends[some[more]] = energy[more], point[some[more]]
         return best, ends
 
-    def _beside(self, returns: Hits, ray: Whole, distance: Real) -> NDArray[np.bool_]:
+    def _beside(self, returns: Hits, ray: Ints, distance: Floats) -> Bools:
         """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""
         first = np.searchsorted(returns.ray, ray, side="left")
         last = np.searchsorted(returns.ray, ray, side="right")
@@ -247,7 +237,7 @@ class Receiver:
 class _Cells:
     """Rays that are fired one after the other, with a cone around those of each cell."""
 
-    def __init__(self, starts: Real, ahead: Real) -> None:
+    def __init__(self, starts: Floats, ahead: Floats) -> None:
         self.starts, self.ahead = starts, ahead
         first = np.arange(0, len(starts), CELL_RAYS)
         self.number = np.arange(len(starts)) // CELL_RAYS  # cells of the rays
@@ -264,12 +254,12 @@ class _Cells:
 class _Retro:
     """Triangles of retro-reflectors that are near to each other."""
 
-    triangles: NDArray[np.int32]  # (k,): their numbers
-    corners: Real  # (k, 3, 3): in the scene's axes, or those of an actor
+    triangles: Ints32  # (k,): their numbers
+    corners: Floats  # (k, 3, 3): in the scene's axes, or those of an actor
     actor: int | None = None
 
     @cached_property
-    def middle(self) -> Real:
+    def middle(self) -> Floats:
         return np.asarray(self.corners.reshape(-1, 3).mean(axis=0))
 
     @cached_property
@@ -299,9 +289,7 @@ def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
         begin += len(faces)
 
 
-def _clusters(
-    triangles: NDArray[np.integer[Any]], corners: Real, actor: int | None = None
-) -> Iterator[_Retro]:
+def _clusters(triangles: Integers, corners: Floats, actor: int | None = None) -> Iterator[_Retro]:
     """Divide triangles into some that are near to each other."""
     if not len(triangles):
         return
@@ -312,7 +300,7 @@ def _clusters(
         yield _Retro(triangles[some].astype(np.int32), corners[some], actor)
 
 
-def _first_few(retro: _Retro, starts: Real, ahead: Real) -> NDArray[np.intp]:
+def _first_few(retro: _Retro, starts: Floats, ahead: Floats) -> Indices:
     """Find some triangles whose middles are nearest to rays (n,) by angle: (n, k)."""
     count = len(retro.triangles)
     if count <= TRIANGLES_NEAR:
@@ -324,7 +312,7 @@ def _first_few(retro: _Retro, starts: Real, ahead: Real) -> NDArray[np.intp]:
     return np.argsort(-cosine, axis=0, kind="stable")[:TRIANGLES_NEAR].T
 
 
-def _nearest(x: Real, y: Real, corners: Real, depth: Real) -> tuple[Real, Real]:
+def _nearest(x: Floats, y: Floats, corners: Floats, depth: Floats) -> tuple[Floats, Floats]:
     """Distances from 0 of triangles with corners x, y (n, 3) in a plane, and the points there.
 
     The points are between the `corners` (n, 3, 3), which are seen at x and y, at depths (n, 3). A

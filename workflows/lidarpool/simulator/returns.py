@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, UInts32
 from ..columns.table import Column
 from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
@@ -63,106 +63,106 @@ class BatchReturns:
         return len(self.found.ray)
 
     @property
-    def hits(self) -> NDArray[np.int64]:
+    def hits(self) -> Ints:
         """Returns of each scan, kept or not: (scans,)."""
         return self.found.hits
 
-    def column(self, column: Column) -> NDArray[Any]:
+    def column(self, column: Column) -> AnyArray:
         """Values of a column."""
         return column.make(self)
 
-    def ends(self, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    def ends(self, rows: Ints) -> Floats:
         """Positions of some returns (k,): (k, 3)."""
         return self.positions[rows]
 
     # -- the ray -----------------------------------------------------------------------------
 
     @cached_property
-    def _first_rays(self) -> NDArray[np.int64]:
+    def _first_rays(self) -> Ints:
         """Number of the first ray of each scan."""
         begin = self.specs[0].firings[0]
         firsts = [spec.firings[0] - begin for spec in self.specs]
         return np.array(firsts, np.int64) * self.sensor.channels
 
     @cached_property
-    def counts(self) -> NDArray[np.int64]:
+    def counts(self) -> Ints:
         """Returns of each scan: (scans,)."""
         cuts = np.searchsorted(self.found.ray, self._first_rays)
         return np.diff(np.append(cuts, len(self))).astype(np.int64)
 
     @cached_property
-    def scan(self) -> NDArray[np.int32]:
+    def scan(self) -> Ints32:
         """Number of the scan."""
         first = self.specs[0].scan
         return np.repeat(np.arange(first, first + len(self.specs), dtype=np.int32), self.counts)
 
     @cached_property
-    def ray(self) -> NDArray[np.int64]:
+    def ray(self) -> Ints:
         """Number of the ray within its scan."""
         return self.found.ray.astype(np.int64) - np.repeat(self._first_rays, self.counts)
 
     @cached_property
-    def channel(self) -> NDArray[np.uint32]:
+    def channel(self) -> UInts32:
         """Beam of the sensor."""
         return np.asarray(self.found.ray % np.uint32(self.sensor.channels), np.uint32)
 
     @cached_property
-    def firing(self) -> NDArray[np.int64]:
+    def firing(self) -> Ints:
         """Number of the firing, from the beginning of the station."""
         return self.specs[0].firings[0] + self._number
 
     @property
-    def sensor_number(self) -> NDArray[np.uint8]:
+    def sensor_number(self) -> Bytes:
         """Number of the sensor."""
         return np.full(len(self), self.specs[0].sensor, np.uint8)
 
     @cached_property
-    def time(self) -> NDArray[np.int64]:
+    def time(self) -> Ints:
         """Firing time of the ray, nanoseconds since the survey's start."""
         times = self.sensor.begins_ns(self._firings).take(self._number)
         times += self.sensor.beams.time_ns.take(self.channel)
         return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
 
     @property
-    def _firings(self) -> NDArray[np.int64]:
+    def _firings(self) -> Ints:
         """All rays of the scans, with and without returns."""
         return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
 
     @cached_property
-    def _number(self) -> NDArray[np.int64]:
+    def _number(self) -> Ints:
         """Number of the firing, from that of the first scan."""
         return self.found.ray // np.int64(self.sensor.channels)
 
     # -- positions ---------------------------------------------------------------------------
 
     @cached_property
-    def _rays(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    def _rays(self) -> tuple[Floats, Floats]:
         return self._poses.rays(self._pattern, self.found.ray, self._start)
 
     @property
-    def origins(self) -> NDArray[np.float64]:
+    def origins(self) -> Floats:
         """Starts of the rays, metres, the scene's local coordinates: (n, 3)."""
         return np.broadcast_to(self._rays[0], (len(self), 3))
 
     @property
-    def directions(self) -> NDArray[np.float64]:
+    def directions(self) -> Floats:
         """Unit directions in the scene's axes: (n, 3)."""
         return self._rays[1]
 
     @property
-    def range(self) -> NDArray[np.float64]:
+    def range(self) -> Floats:
         """Distance from the start of the ray, metres, with noise."""
         return self.found.reported
 
     @cached_property
-    def positions(self) -> NDArray[np.float64]:
+    def positions(self) -> Floats:
         """Ends of the rays, metres, the scene's local coordinates: (n, 3)."""
         origins, directions = self._rays
         out = directions * self.range[:, None]
         return np.add(out, origins, out=out)
 
     @cached_property
-    def cells(self) -> NDArray[np.int32]:
+    def cells(self) -> Ints32:
         """Positions as whole multiples of the survey's precision: (3, n)."""
         world = self.survey.coordinates == "world"
         scaled = (self.positions if world else self.sensor_positions) / self.survey.precision_m
@@ -171,31 +171,31 @@ class BatchReturns:
         return cells
 
     @property
-    def cell_x(self) -> NDArray[np.int32]:
+    def cell_x(self) -> Ints32:
         """Quantised x of each return, multiples of the precision from the local origin."""
         return self.cells[0]
 
     @property
-    def cell_y(self) -> NDArray[np.int32]:
+    def cell_y(self) -> Ints32:
         """Quantised y of each return, multiples of the precision from the local origin."""
         return self.cells[1]
 
     @property
-    def cell_z(self) -> NDArray[np.int32]:
+    def cell_z(self) -> Ints32:
         """Quantised z of each return, multiples of the precision from the local origin."""
         return self.cells[2]
 
     @cached_property
-    def _rows(self) -> NDArray[np.int64]:
+    def _rows(self) -> Ints:
         """Of the pattern."""
         return (self._start + self.found.ray.astype(np.int64)) % len(self._pattern)
 
     @cached_property
-    def _sensor_directions(self) -> NDArray[np.float64]:
+    def _sensor_directions(self) -> Floats:
         return self._to_sensor(self._pattern.directions[self._rows])
 
     @cached_property
-    def sensor_positions(self) -> NDArray[np.float64]:
+    def sensor_positions(self) -> Floats:
         """Ends of the rays in the axes of the sensor at their firing, metres: (n, 3)."""
         origins = self._pattern.origins
         ends = self._pattern.directions[self._rows] * self.range[:, None]
@@ -207,7 +207,7 @@ class BatchReturns:
             ends += self.sensor.centre
         return self._to_sensor(ends)
 
-    def _to_sensor(self, vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    def _to_sensor(self, vectors: Floats) -> Floats:
         """Turn vectors (n, 3) in the axes of the carrier, or the head, to those of the sensor."""
         if self._poses.by_head:
             spins = self.sensor.spins(self._firings)
@@ -219,30 +219,30 @@ class BatchReturns:
         return turned(vectors, None if mount is None else mount.T)
 
     @cached_property
-    def azimuth(self) -> NDArray[np.float64]:
+    def azimuth(self) -> Floats:
         """Angle of the ray about the sensor's z axis, degrees, from 0 to 360."""
         x, y, _ = self._sensor_directions.T
         return np.degrees(np.arctan2(y, x)) % 360
 
     @cached_property
-    def elevation(self) -> NDArray[np.float64]:
+    def elevation(self) -> Floats:
         """Angle of the ray above the sensor's xy plane, degrees."""
         return np.degrees(np.arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
 
     # -- the surface -------------------------------------------------------------------------
 
     @property
-    def triangle(self) -> NDArray[np.int32]:
+    def triangle(self) -> Ints32:
         """Triangle of the scene."""
         return self.found.triangle
 
     @cached_property
-    def object(self) -> NDArray[np.int32]:
+    def object(self) -> Ints32:
         """Object of the scene."""
         return self._surfaces.objects(self.found.triangle)
 
     @cached_property
-    def cosine(self) -> NDArray[np.float64]:
+    def cosine(self) -> Floats:
         """Cosine of the angle between the ray and the normal of its triangle, 0 to 1.
 
         It means nothing where there is no surface.
@@ -253,7 +253,7 @@ class BatchReturns:
         return np.abs(products(normals.T, self.directions.T))
 
     @cached_property
-    def intensity(self) -> NDArray[np.float64]:
+    def intensity(self) -> Floats:
         """Received energy, see `Surfaces.energy`."""
         if self.found.energy is not None:
             return self.found.energy
@@ -264,7 +264,7 @@ class BatchReturns:
         )
 
     @cached_property
-    def _colours(self) -> NDArray[np.uint32]:
+    def _colours(self) -> UInts32:
         """Packed colours."""
         if self.found.colour is not None:
             return self.found.colour
@@ -276,29 +276,29 @@ class BatchReturns:
         return self._surfaces.colours(self.found.triangle, points, times, ways)
 
     @property
-    def red(self) -> NDArray[np.uint8]:
+    def red(self) -> Bytes:
         """Red of the surface, sRGB."""
         return unpacked(self._colours)[:, 0]
 
     @property
-    def green(self) -> NDArray[np.uint8]:
+    def green(self) -> Bytes:
         """Green of the surface, sRGB."""
         return unpacked(self._colours)[:, 1]
 
     @property
-    def blue(self) -> NDArray[np.uint8]:
+    def blue(self) -> Bytes:
         """Blue of the surface, sRGB."""
         return unpacked(self._colours)[:, 2]
 
     @property
-    def reflectivity(self) -> NDArray[np.float64]:
+    def reflectivity(self) -> Floats:
         """Intensity without the loss by distance and air."""
         lost = at_right_angles(self.found.distance, self.survey.extinction(self.sensor))
         # In thick fog or dust nothing is left of the light from where a false alarm seems to be.
         return np.asarray(self.intensity / np.maximum(lost, LEAST_LEFT))
 
     @cached_property
-    def radial_velocity(self) -> NDArray[np.float64]:
+    def radial_velocity(self) -> Floats:
         """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
         found, velocity = self.found, self.found.velocity
         if velocity is None:
@@ -322,12 +322,12 @@ class BatchReturns:
         return velocity
 
     @property
-    def amplitude(self) -> NDArray[np.float64]:
+    def amplitude(self) -> Floats:
         """Height of the echo in the waveform; without waveforms its energy."""
         return self.intensity if self.found.amplitude is None else self.found.amplitude
 
     @property
-    def pulse_width(self) -> NDArray[np.float64]:
+    def pulse_width(self) -> Floats:
         """Full width at half maximum of the echo in the waveform, nanoseconds."""
         if self.found.width is None:
             returns = self.survey.returns_each[self.specs[0].sensor]
@@ -348,17 +348,17 @@ class BatchReturns:
         return made.view(column_type(made.dtype["samples"].shape[0]))
 
     @property
-    def return_number(self) -> NDArray[np.uint8]:
+    def return_number(self) -> Bytes:
         """Number among the reported returns of its pulse."""
         return self.found.number
 
     @property
-    def returns(self) -> NDArray[np.uint8]:
+    def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
         return self.found.returns
 
     @property
-    def cause(self) -> NDArray[np.uint8]:
+    def cause(self) -> Bytes:
         """Why the return is there, see `CAUSES` of the table of columns."""
         if self.found.cause is None:
             return np.zeros(len(self), np.uint8)

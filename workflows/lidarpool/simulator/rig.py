@@ -8,10 +8,10 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import Pattern
 
+from ..base.arrays import Floats, Floats32
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
@@ -210,9 +210,9 @@ class Rig:
     def ranges(
         self,
         specs: list[ScanSpec],
-        positions: NDArray[np.float64],
-        rotations: NDArray[np.float64] | None,
-    ) -> NDArray[np.float32]:
+        positions: Floats,
+        rotations: Floats | None,
+    ) -> Floats32:
         """Cast the same firings from many poses of a carrier that stands.
 
         `specs` are scans of one station; the next pose has the numbers that follow theirs. The

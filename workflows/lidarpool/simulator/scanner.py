@@ -10,12 +10,13 @@ from itertools import compress
 from typing import Annotated, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 from pydantic import Field
 
 from raybeam.poses import check_poses
 
 from ..base.arguments import checked, shown
+from ..base.arrays import Floats, Floats32
 from ..base.errors import LidarpoolError
 from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
@@ -214,7 +215,7 @@ class Scanner:
     @checked
     def ranges(
         self, poses: Pose | ArrayLike, *, number: Number | None = None, start_s: Start = None
-    ) -> NDArray[np.float32]:
+    ) -> Floats32:
         """Ranges that the sensor measures from many poses at one time, as images.
 
         This is the fastest way to scan: no points are made.
@@ -362,7 +363,7 @@ def _path(given: Any) -> Trajectory:
     return path
 
 
-def _placed(poses: Any) -> tuple[NDArray[np.float64], NDArray[np.float64] | None]:
+def _placed(poses: Any) -> tuple[Floats, Floats | None]:
     """Positions (k, 3) and rotations (k, 3, 3), or None."""
     if isinstance(poses, Pose):
         poses = [poses]

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Ints
 from ..sensor.disc import neighbours
-from .hits import NO_SURFACE, Hits, Planes, Real, Whole, numbers, runs
+from .hits import NO_SURFACE, Hits, Planes, numbers, runs
 from .motion import products
 
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
@@ -64,8 +64,8 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
 
 
 def continued(
-    hits: Hits, new: NDArray[np.bool_], gap_m: float, each: int, normal: Real, direction: Real
-) -> NDArray[np.bool_]:
+    hits: Hits, new: Bools, gap_m: float, each: int, normal: Floats, direction: Floats
+) -> Bools:
     """Whether a surface continues from before each hit to behind it: no return begins, (n,).
 
     Two neighbouring sub-rays hit one surface if the planes through the two hits meet half-way
@@ -93,7 +93,7 @@ def continued(
     one, other = one[pair], other[pair]
     near = 1 / hits.distance
 
-    def half_way(this: Whole, that: Whole) -> Real:
+    def half_way(this: Ints, that: Ints) -> Floats:
         """Ranges half-way to another hit, on the plane of the first."""
         plane, looks = normal[this].T, direction.T
         slope = products(plane, looks[:, that]) / products(plane, looks[:, this])

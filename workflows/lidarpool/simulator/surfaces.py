@@ -9,8 +9,8 @@ from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32
 from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
@@ -24,9 +24,6 @@ _log = logging.getLogger(__name__)
 
 BLOCK_FACES = 1 << 18  # triangles whose normals are made at a time
 BLOCK_HITS = 1 << 14  # hits whose colours are looked up at a time, to fit a cache
-
-Triangles = NDArray[np.integer[Any]]
-Real = NDArray[np.float64]
 
 
 _NONE = np.zeros(0, np.intp)
@@ -106,7 +103,7 @@ class Surfaces:
         """Materials of objects at the wavelength of a sensor."""
         return self._tables[wavelength_nm]
 
-    def moved(self, scene: Scene, rows: NDArray[np.intp]) -> Surfaces:
+    def moved(self, scene: Scene, rows: Indices) -> Surfaces:
         """Return the same with some of the scene's instances in other places."""
         assert scene.instances is not None
         made = copy(self)
@@ -115,7 +112,7 @@ class Surfaces:
         made.grids = self.grids and self.grids.moved(scene.instances)
         return made
 
-    def _found(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
+    def _found(self, triangle: Integers) -> tuple[Integers, Indices, Indices]:
         """Rows without instances, which of them are in one, and in which: (n,), (k,), (k,)."""
         plain, actors = self._begins[[0, -1]]
         rows = np.where(triangle >= actors, triangle - (actors - plain), triangle)
@@ -124,8 +121,8 @@ class Surfaces:
         return rows, on, which
 
     def normals(
-        self, triangle: Triangles, times: Real | NDArray[np.int64], ways: tuple[Trajectory, ...]
-    ) -> Real:
+        self, triangle: Integers, times: Floats | Ints, ways: tuple[Trajectory, ...]
+    ) -> Floats:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
@@ -148,7 +145,7 @@ class Surfaces:
                 normals[:, rows] = turned.T
         return normals.T
 
-    def _rows(self, triangle: Triangles) -> tuple[Triangles, NDArray[np.intp], NDArray[np.intp]]:
+    def _rows(self, triangle: Integers) -> tuple[Integers, Indices, Indices]:
         """Rows among the triangles that are kept once, and the others as `_found`."""
         rows, on, which = triangle, _NONE, _NONE
         if self._scene.instances is not None:
@@ -164,11 +161,11 @@ class Surfaces:
 
     def colours(
         self,
-        triangle: Triangles,
-        points: Real,
-        times: Real | NDArray[np.int64],
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
         ways: tuple[Trajectory, ...],
-    ) -> NDArray[np.uint32]:
+    ) -> UInts32:
         """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
         if self._lookup is None:
             return np.full(len(triangle), packed(GREY[0])[0])
@@ -179,8 +176,8 @@ class Surfaces:
         return out
 
     def _colours(
-        self, triangle: Triangles, points: Real, times: Any, ways: tuple[Trajectory, ...]
-    ) -> NDArray[np.uint32]:
+        self, triangle: Integers, points: Floats, times: Any, ways: tuple[Trajectory, ...]
+    ) -> UInts32:
         assert self._lookup is not None
         rows, on, which = self._rows(triangle)
         if len(on) or ways:
@@ -199,11 +196,11 @@ class Surfaces:
 
     def velocities(
         self,
-        triangle: Triangles,
-        points: Real,
-        times: Real | NDArray[np.int64],
+        triangle: Integers,
+        points: Floats,
+        times: Floats | Ints,
         ways: tuple[Trajectory, ...],
-    ) -> Real:
+    ) -> Floats:
         """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
         out = np.zeros((len(triangle), 3))
         objects = self.objects(triangle) if ways else None
@@ -229,7 +226,7 @@ class Surfaces:
         )
         return Lookup(colours, corners)
 
-    def bodies(self) -> tuple[NDArray[np.int64], Real]:
+    def bodies(self) -> tuple[Ints, Floats]:
         """Return what bodies the triangles belong to, in the order of a world's ray caster.
 
         Returns
@@ -255,7 +252,7 @@ class Surfaces:
             turns.insert(0, one)
         return np.concatenate(bodies).astype(np.int64), np.concatenate(turns)
 
-    def objects(self, triangle: Triangles) -> NDArray[np.int32]:
+    def objects(self, triangle: Integers) -> Ints32:
         """Objects of triangles (n,); -1 of no surface."""
         shared = self._scene.instances
         if shared is None:
@@ -266,11 +263,11 @@ class Surfaces:
         objects[on] = shared.owner[which]
         return objects
 
-    def instances(self, triangle: Triangles) -> NDArray[np.intp]:
+    def instances(self, triangle: Integers) -> Indices:
         """Instances that triangles (n,) belong to; each belongs to one."""
         return np.searchsorted(self._begins, triangle, side="right") - 1
 
-    def counter(self, triangle: Triangles) -> Triangles:
+    def counter(self, triangle: Integers) -> Integers:
         """Counters of hits of triangles (n,), see `Scene.counters`."""
         if self._scene.instances is None:
             return triangle
@@ -282,12 +279,12 @@ class Surfaces:
 
     def energy(
         self,
-        triangle: Triangles,
-        cosine: Real,
-        distance: Real,
+        triangle: Integers,
+        cosine: Floats,
+        distance: Floats,
         light: Light,
-        colours: NDArray[np.uint32] | None = None,
-    ) -> Real:
+        colours: UInts32 | None = None,
+    ) -> Floats:
         """Received energy of rays that end on triangles (n,), at distances in metres.
 
         ``reflectance * cosine * (10 m / distance)**2 * exp(-2 * extinction * distance)``; for a
@@ -300,7 +297,7 @@ class Surfaces:
         return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
     @cached_property
-    def solids(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def solids(self) -> tuple[Bools, Bools]:
         """Whether the surfaces of objects that hold a medium are closed, and point inwards: (n,).
 
         They point inwards if they are closed and have a negative volume.
@@ -309,7 +306,7 @@ class Surfaces:
         closed = np.ones(len(table.reflectance), np.bool_)
         volume = np.zeros(len(closed))
         for number in np.flatnonzero(table.leafy | table.refracts).tolist():
-            bodies: list[tuple[Real, Triangles]] = []
+            bodies: list[tuple[Floats, Integers]] = []
             if number >= self._standing:
                 mesh = scene.actors[number - self._standing].mesh
                 bodies.append((mesh.vertices, mesh.faces))
@@ -324,13 +321,13 @@ class Surfaces:
         return closed, closed & (volume < 0)
 
     @cached_property
-    def _by_object(self) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    def _by_object(self) -> tuple[Indices, Indices]:
         """Rows of the scene's faces in the order of objects, and where those of each begin."""
         owners = self._scene.face_object
         order = np.argsort(owners, kind="stable")
         return order, np.searchsorted(owners[order], np.arange(self._standing + 1))
 
-    def _faces_of(self, number: int) -> Triangles:
+    def _faces_of(self, number: int) -> Integers:
         order, begins = self._by_object
         return self._scene.faces[order[begins[number] : begins[number + 1]]]
 
@@ -341,7 +338,7 @@ class Surfaces:
         held = (table.leafy | table.refracts) & closed
         return tuple(np.flatnonzero(held[: self._standing]).tolist())
 
-    def spread_out(self, by_m: float) -> Real:
+    def spread_out(self, by_m: float) -> Floats:
         """Vertices of the scene's faces, where surfaces of media are so many metres further out.
 
         Water that touches its basin, or leaves that touch others, would share a surface with them,
@@ -372,14 +369,14 @@ class Surfaces:
         return vertices
 
     @property
-    def _kept(self) -> list[tuple[Real, Triangles, Colours | None]]:
+    def _kept(self) -> list[tuple[Floats, Integers, Colours | None]]:
         """Vertices, faces and colours of the triangles that are kept once.
 
         Those of the meshes of actors follow the scene's, and those of the parts of instances follow
         them.
         """
         scene = self._scene
-        bodies: list[tuple[Real, Triangles, Colours | None]] = [
+        bodies: list[tuple[Floats, Integers, Colours | None]] = [
             (scene.vertices, scene.faces, scene.colours)
         ]
         bodies += [(mesh.vertices, mesh.faces, mesh.colours) for mesh in self._meshes]
@@ -389,7 +386,7 @@ class Surfaces:
         return bodies
 
     @cached_property
-    def unit_normals(self) -> NDArray[np.float32]:
+    def unit_normals(self) -> Floats32:
         """Unit normals of `_kept`, one row for each axis, the fastest layout: (3, f)."""
         bodies = self._kept
         out = np.empty((3, sum(len(faces) for _, faces, _ in bodies)), np.float32)
@@ -405,19 +402,19 @@ class Surfaces:
         return out
 
     @cached_property
-    def _first_of_part(self) -> NDArray[np.intp]:
+    def _first_of_part(self) -> Indices:
         """Rows at which the parts of instances begin."""
         assert self._scene.instances is not None
         sizes = [len(part.faces) for part in self._scene.instances.parts]
         return self._parts_begin + np.cumsum([0, *sizes[:-1]])
 
 
-def _turns(transforms: Real) -> Real:
+def _turns(transforms: Floats) -> Floats:
     """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
     return np.asarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)
 
 
-def _closed(vertices: Real, faces: Triangles) -> bool:
+def _closed(vertices: Floats, faces: Integers) -> bool:
     """Whether a surface has no gaps: each edge is one of two triangles that wind alike."""
     used, corners = np.unique(faces, return_inverse=True)
     # Vertices of flat shading are one for each triangle.
@@ -432,7 +429,7 @@ def _closed(vertices: Real, faces: Triangles) -> bool:
     return bool(np.array_equal(there, back))
 
 
-def _volume(vertices: Real, faces: Triangles) -> float:
+def _volume(vertices: Floats, faces: Integers) -> float:
     """Volume within a closed surface, m³; negative if its triangles wind the other way."""
     a, b, c = (vertices[faces] - vertices[faces[0, 0]]).transpose(1, 0, 2)
     return float((np.cross(a, b) * c).sum() / 6)

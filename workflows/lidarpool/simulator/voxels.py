@@ -6,10 +6,9 @@ from copy import copy
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import Bools, Floats, Indices
 from ..scene.instances import Instances
-from .hits import Real
 
 BLOCK_RAYS = 1 << 13  # that go through grids at a time, to fit a cache
 _LEVEL = 1e-30  # along an axis, light this slow meets no other voxel
@@ -52,14 +51,14 @@ class Grids:
 
     def through(
         self,
-        which: NDArray[np.intp],
-        starts: Real,
-        ways: Real,
-        crossing: Real,
-        even: Real,
-        length: Real,
-        left: Real,
-    ) -> tuple[Real, Real, Real]:
+        which: Indices,
+        starts: Floats,
+        ways: Floats,
+        crossing: Floats,
+        even: Floats,
+        length: Floats,
+        left: Floats,
+    ) -> tuple[Floats, Floats, Floats]:
         """Follow light (n,) through the grids around it, by voxels (Amanatides and Woo 1987).
 
         Parameters
@@ -92,16 +91,16 @@ class Grids:
 
     def _through(
         self,
-        which: NDArray[np.intp],
-        starts: Real,
-        ways: Real,
-        crossing: Real,
-        even: Real,
-        length: Real,
-        left: Real,
-        metres: Real,
-        rest: Real,
-        there: Real,
+        which: Indices,
+        starts: Floats,
+        ways: Floats,
+        crossing: Floats,
+        even: Floats,
+        length: Floats,
+        left: Floats,
+        metres: Floats,
+        rest: Floats,
+        there: Floats,
     ) -> None:
         """Do it for a block, and write what was found into the last three."""
         back = self._back[which].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
@@ -152,7 +151,7 @@ class Grids:
             cell = np.where(border <= ahead, cell + step, cell)
             at = np.maximum(ahead, 0)  # the first may be before the start, by rounding
 
-    def _density(self, cell: Real, size: Real, first: Any) -> tuple[Real, NDArray[np.bool_]]:
+    def _density(self, cell: Floats, size: Floats, first: Any) -> tuple[Floats, Bools]:
         """Densities of voxels (3, k, n), and whether they are in their grids: (k, n)."""
         i, j, k = cell
         inside = np.asarray(((cell >= 0) & (cell < size)).all(axis=0))

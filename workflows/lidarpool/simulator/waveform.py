@@ -15,10 +15,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from ..base.arrays import Floats, Ints
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import Purpose, normal, raw
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
-from .hits import Hits, Keys, Planes, Real, Whole, numbers, runs
+from .hits import Hits, Keys, Planes, numbers, runs
 from .separation import continued
 
 # All in standard deviations of the system waveform.
@@ -63,11 +64,11 @@ class Digitizer:
         """Samples before and behind an echo that it reaches."""
         return int(np.ceil(CUT * self.sigma))
 
-    def samples(self, distance: Real) -> Real:
+    def samples(self, distance: Floats) -> Floats:
         """Return when light comes back, samples after the pulse."""
         return distance * (2 / LIGHT_M_NS / self.sample_ns)
 
-    def amplitude(self, energy: Real, width: Real) -> Real:
+    def amplitude(self, energy: Floats, width: Floats) -> Floats:
         """Heights of echoes (n,) by energy and full width at half maximum, ns; 0 is unknown."""
         system_ns = FWHM * self.sigma_ns
         return np.asarray(energy * (system_ns / np.where(width > 0, width, system_ns)))
@@ -77,9 +78,9 @@ class Digitizer:
 class _Found:
     """Echoes in waveforms, in order: arrays (m,)."""
 
-    position: Real  # samples after the pulse
-    energy: Real
-    width: Real  # of the system waveform's
+    position: Floats  # samples after the pulse
+    energy: Floats
+    width: Floats  # of the system waveform's
 
 
 def returns_in(
@@ -159,8 +160,8 @@ def returns_in(
 
 
 def _searched(
-    distance: Real, energy: Real, counts: Whole, digitizer: Digitizer
-) -> tuple[Whole, _Found]:
+    distance: Floats, energy: Floats, counts: Ints, digitizer: Digitizer
+) -> tuple[Ints, _Found]:
     """Find the echoes of pulses, and which of them each hit belongs to, or -1.
 
     Hits are in the order of pulses, so many of each, and distances.
@@ -187,28 +188,28 @@ class _Waves:
     they have the same bits wherever their waveform stands.
     """
 
-    samples: Real
-    begins: Whole  # (c,): place of the first sample of each
-    lows: Whole  # (c,): its time
-    tops: Real  # (c,): highest samples
+    samples: Floats
+    begins: Ints  # (c,): place of the first sample of each
+    lows: Ints  # (c,): its time
+    tops: Floats  # (c,): highest samples
 
-    def owner(self, place: Whole) -> Whole:
+    def owner(self, place: Ints) -> Ints:
         """Waveforms of places."""
         return np.searchsorted(self.begins, place, side="right") - 1
 
-    def shift(self, owner: Whole) -> Whole:
+    def shift(self, owner: Ints) -> Ints:
         """Places at time 0, as if waveforms began there."""
         return self.begins[owner] - self.lows[owner]
 
 
-def _key(time: Real, shift: Whole) -> Whole:
+def _key(time: Floats, shift: Ints) -> Ints:
     """Order times of waveforms, to a thousandth of a sample."""
     return np.rint(time * 1024).astype(np.int64) + 1024 * shift
 
 
 def _of_block(
-    distance: Real, energy: Real, counts: Whole, digitizer: Digitizer
-) -> tuple[Whole, _Found]:
+    distance: Floats, energy: Floats, counts: Ints, digitizer: Digitizer
+) -> tuple[Ints, _Found]:
     sigma = digitizer.sigma
     when = digitizer.samples(distance)
     ends = np.cumsum(counts)
@@ -230,12 +231,12 @@ def _of_block(
     return np.where(owner[echo] == mine, echo, -1), found
 
 
-def first_samples(when: Real, sigma: float) -> tuple[Whole, int]:
+def first_samples(when: Floats, sigma: float) -> tuple[Ints, int]:
     """First sample of each echo that is not 0, and how many there are, from the times (n,)."""
     return np.ceil(when - CUT * sigma).astype(np.int64), int(2 * CUT * sigma) + 1
 
 
-def add_echoes(samples: Real, shift: Whole, when: Real, energy: Real, sigma: float) -> None:
+def add_echoes(samples: Floats, shift: Ints, when: Floats, energy: Floats, sigma: float) -> None:
     """Add echoes at times `when` (n,) to samples; `shift` (n,) are the places of time 0."""
     first, many = first_samples(when, sigma)
     time = first[:, None] + np.arange(many)
@@ -247,7 +248,7 @@ def add_echoes(samples: Real, shift: Whole, when: Real, energy: Real, sigma: flo
 _NONE = np.zeros(0, np.int64), np.zeros(0, np.int64), _Found(*np.zeros((3, 0)))
 
 
-def _peaks(waves: _Waves, sigma: float) -> tuple[Whole, Whole, _Found]:
+def _peaks(waves: _Waves, sigma: float) -> tuple[Ints, Ints, _Found]:
     """Find local maxima: keys of the last times that belong to each, their waveforms, the echoes.
 
     Their times and heights are those of the Gaussian through three samples, their energies the
@@ -274,7 +275,7 @@ def _peaks(waves: _Waves, sigma: float) -> tuple[Whole, Whole, _Found]:
     return 1024 * until, owner, _Found(position, energy, energy / height)
 
 
-def _gaussians(waves: _Waves, sigma: float) -> tuple[Whole, Whole, _Found]:
+def _gaussians(waves: _Waves, sigma: float) -> tuple[Ints, Ints, _Found]:
     """Decompose waveforms into Gaussians; returns as of `_peaks`.
 
     There is one for each minimum of the second derivative (after Hofton et al. 2000, who take the
@@ -338,7 +339,7 @@ def _gaussians(waves: _Waves, sigma: float) -> tuple[Whole, Whole, _Found]:
     return until, owner, _Found(position, energy, width)
 
 
-def fitted(x: Real, y: Real, owner: Whole, guess: Real) -> Real:
+def fitted(x: Floats, y: Floats, owner: Ints, guess: Floats) -> Floats:
     """Fit sums of Gaussians by least squares: heights, places and widths, (3, k, fits).
 
     The method is that of Levenberg and Marquardt; a fit ends when a step gains nothing, or after
@@ -361,7 +362,7 @@ def fitted(x: Real, y: Real, owner: Whole, guess: Real) -> Real:
     widest = np.maximum((x[begins + lengths - 1] - x[begins]) / (4 * count), 1.5)
     damping = np.full(fits, 1e-3)
 
-    def misses(now: Real) -> tuple[Real, Real, Real]:
+    def misses(now: Floats) -> tuple[Floats, Floats, Floats]:
         height, place, width = now[:, :, owner]
         z = (x - place) / width
         bell = np.exp(-0.5 * z * z)
@@ -406,7 +407,7 @@ def fitted(x: Real, y: Real, owner: Whole, guess: Real) -> Real:
     return out
 
 
-def _solved(normal: Real, right: Real) -> Real:
+def _solved(normal: Floats, right: Floats) -> Floats:
     """Solve symmetric equations, of which the lower half is read: (n, n, fits) and (n, fits)."""
     size = len(right)
     lower = np.zeros_like(normal)
@@ -489,8 +490,8 @@ def recorded(
 
 
 def _window(
-    hits: Hits, digitizer: Digitizer, each: int, begins: Whole, low: Whole, high: Whole, count: int
-) -> Real:
+    hits: Hits, digitizer: Digitizer, each: int, begins: Ints, low: Ints, high: Ints, count: int
+) -> Floats:
     """Sample the waveforms of some windows, of the hits from `low` to `high`: (windows, count)."""
     sizes = high - low
     mine = np.repeat(np.arange(len(begins)), sizes)
@@ -507,7 +508,7 @@ def _window(
     return samples.reshape(len(begins), count).astype(np.float64)
 
 
-def digitised(samples: Real) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
+def digitised(samples: Floats) -> tuple[NDArray[np.uint16], NDArray[np.int8]]:
     """Round samples (n, k) to whole numbers from `ZERO`, of a power of two that holds all of each.
 
     Returns them, uint16 (n, k), and the exponents (n,).

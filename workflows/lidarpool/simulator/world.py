@@ -12,7 +12,6 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import (
     Instance,
@@ -25,6 +24,7 @@ from raybeam import (
     available_backends,
 )
 
+from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
@@ -43,8 +43,6 @@ CELLS = 64  # cells that share one look at an actor's trajectory
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
 NEAR_M = 1.0  # rays of a cell start no farther than this from its position
 TURN = 2e-3  # radians: rays of a cell deviate at most so much from the pattern in its pose
-
-Float = NDArray[np.float64]
 
 
 def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
@@ -74,7 +72,7 @@ class World:
         self, scene: Scene, surfaces: Surfaces, like: World | None = None, **options: Any
     ) -> None:
         self._surfaces, self._shared = surfaces, scene.instances
-        self._begins: NDArray[np.int32] | None = None  # of each body of the caster
+        self._begins: Ints32 | None = None  # of each body of the caster
         self._faces = faces = len(scene.faces)
         if self._shared is not None:
             begins = faces + np.cumsum([0, *self._shared.sizes[:-1]])
@@ -94,14 +92,14 @@ class World:
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         self._firsts = (faces + np.cumsum([0, *sizes[:-1]])).astype(np.int32)  # triangles
 
-    def place(self, surfaces: Surfaces, shared: Instances, rows: NDArray[np.intp]) -> None:
+    def place(self, surfaces: Surfaces, shared: Instances, rows: Indices) -> None:
         """Move some instances to where they are now; no scan may be under way."""
         first = self.caster.instance_count - len(shared)
         for row in rows:
             self.caster.move(first + int(row), shared.transforms[row])
         self._surfaces, self._shared = surfaces, shared
 
-    def counters(self) -> tuple[NDArray[np.int64], int]:
+    def counters(self) -> tuple[Ints, int]:
         """Return counters of bodies as `RayCaster.visit` takes them, see `Scene.counters`."""
         shared = 0 if self._shared is None else len(self._shared)
         own = self.caster.instance_count - shared
@@ -122,7 +120,7 @@ class World:
         t_min: float = 0.0,
         t_max: float = np.inf,
         keep_every: int = 1,
-        groups: NDArray[np.int64] | None = None,
+        groups: Ints | None = None,
         tally: bool = False,
     ) -> ScanReturns:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
@@ -158,12 +156,12 @@ class World:
 
     def free(
         self,
-        origins: Float,
-        towards: Float,
-        distance: Float,
-        times: Float,
+        origins: Floats,
+        towards: Floats,
+        distance: Floats,
+        times: Floats,
         ways: tuple[Trajectory, ...],
-    ) -> NDArray[np.bool_]:
+    ) -> Bools:
         """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
         free = np.ones(len(distance), np.bool_)
         if len(distance):
@@ -179,7 +177,7 @@ class World:
         poses: Poses,
         window: tuple[int, int],
         reach: tuple[float, float],
-    ) -> tuple[NDArray[np.int64], Float, NDArray[np.int32]]:
+    ) -> tuple[Ints, Floats, Ints32]:
         """Rays, distances and triangles of all hits, those on actors among them."""
         rays = window[1] - window[0]
         distance = np.full(rays, np.inf)
@@ -198,7 +196,7 @@ class World:
         """Find the nearest hits of rays on actors, whether something stands before them or not."""
         cells = _Cells(pattern, poses, *window)
         found: list[tuple[Any, ...]] = []
-        waiting: list[tuple[int, NDArray[np.intp], tuple[Float, Float | None]]] = []
+        waiting: list[tuple[int, Indices, tuple[Floats, Floats | None]]] = []
         for number, way in enumerate(poses.ways):
             ray = cells.near(self._shapes[self._shape_of[number]], way, reach[1])
             if not len(ray):
@@ -223,7 +221,7 @@ class World:
 
     def _cast_near(
         self,
-        near: list[tuple[int, NDArray[np.intp], tuple[Float, Float | None]]],
+        near: list[tuple[int, Indices, tuple[Floats, Floats | None]]],
         pattern: Pattern,
         poses: Poses,
         start: int,
@@ -253,7 +251,7 @@ class World:
             yield ray[on], distance / lengths, triangle + self._firsts[numbers[on]]
 
 
-def _caster_of(scene: Scene, vertices: Float, options: dict[str, Any]) -> RayCaster:
+def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:
     """Build the trees of all that stands still, with vertices of the scene's faces."""
     if scene.instances is None:
         return RayCaster(vertices, scene.faces, **options)
@@ -302,7 +300,7 @@ class _Cells:
         ends = poses.times(last)
         self._lasts, self._end = (ends - self._begins).max(initial=0), ends.max(initial=0)
 
-    def near(self, actor: _Shape, way: Trajectory, t_max: float) -> NDArray[np.intp]:
+    def near(self, actor: _Shape, way: Trajectory, t_max: float) -> Indices:
         """Numbers of the rays that come near an actor; no other ray hits it."""
         if not self._rays:
             return np.zeros(0, np.intp)
@@ -345,8 +343,8 @@ class _Shape:
         self.radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
 
     def hits(
-        self, origins: Float, directions: Float, t_min: float, t_max: float
-    ) -> tuple[NDArray[np.intp], Float, NDArray[np.int32]]:
+        self, origins: Floats, directions: Floats, t_min: float, t_max: float
+    ) -> tuple[Indices, Floats, Ints32]:
         """Hits on it of rays (m, 3) in its own axes.
 
         Returns

@@ -11,15 +11,13 @@ from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ...base.allowance import check_fits
+from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, explained, prefixed
 from ...base.words import did_you_mean
 from ...base.xmlfile import xml_root
 from ...scene.transform import rotation_about
-
-Float = NDArray[np.float64]
 
 # Where a checkout of HELIOS++ has what its surveys call data/scanners_als.xml.
 _PACKAGE = Path("python/pyhelios")
@@ -113,14 +111,14 @@ def flag(values: dict[str, str], name: str, default: bool) -> bool:
     return values[name].lower() in ("true", "1") if name in values else default
 
 
-def vector(element: Element | None) -> Float:
+def vector(element: Element | None) -> Floats:
     """Return x, y and z of an element; zeros where there is none."""
     if element is None:
         return np.zeros(3)
     return np.array([number(element, axis, 0.0) for axis in "xyz"])
 
 
-def rotation(element: Element | None) -> Float:
+def rotation(element: Element | None) -> Floats:
     """Return the rotation (3, 3) of the <rot> in an element, one after the other.
 
     About the axes around the element; with rotations="local" about its own.
@@ -136,7 +134,7 @@ def rotation(element: Element | None) -> Float:
     return out
 
 
-def clean(values: Float | float | Sequence[float]) -> list[float] | float:
+def clean(values: Floats | float | Sequence[float]) -> list[float] | float:
     """Numbers as a scenario has them: 12 digits, nothing that is 0 but for rounding."""
     array = np.asarray(values, np.float64)
     if array.ndim:

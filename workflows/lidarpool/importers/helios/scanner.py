@@ -15,9 +15,10 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ...base.arrays import Floats
 from ...base.errors import LidarpoolError
 from ...scene.transform import rotation_about as about
-from .files import Float, clean, number, rotation, vector
+from .files import clean, number, rotation, vector
 
 _Z = np.array([0.0, 0.0, 1.0])
 # From the axes of our sensors to those of HELIOS++: of a line to both sides, of a cone about the
@@ -31,7 +32,7 @@ _FRAME_HZ = 10.0  # prisms have no cycle
 _SLACK = 1e-9  # of divisions that should come out even
 
 # A data file but for its name and light, and the rotation from our axes to those of HELIOS++.
-Made = tuple[dict[str, Any], Float]
+Made = tuple[dict[str, Any], Floats]
 
 
 @dataclass(frozen=True)
@@ -52,8 +53,8 @@ class Device:
     """
 
     data: dict[str, Any]
-    turn: Float
-    place: Float
+    turn: Floats
+    place: Floats
     head_s: float | None
     range_m: tuple[float, float]
 
@@ -172,7 +173,7 @@ def device(scanner: Scanner, settings: dict[str, str]) -> Device:
     )
 
 
-def _tilt(emitter: Float) -> float | None:
+def _tilt(emitter: Floats) -> float | None:
     """Degrees that a rotation about x turns by; None for others."""
     if not np.allclose(emitter[0], [1, 0, 0], atol=1e-12):
         return None

@@ -12,6 +12,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
 from ...scene.actors import one_mesh
 from ...scene.drawn import Drawn
@@ -22,7 +23,7 @@ from ...scene.meshfile import load_meshes
 from ...scene.scene import Scene, unique_names
 from ...scene.transform import Transform
 from ...sensor import Pose
-from .files import Assets, Float, clean, number, rotation
+from .files import Assets, clean, number, rotation
 
 # Loaders whose files hold no triangles.
 _UNREAD = ("geotiffloader", "xyzloader")
@@ -35,9 +36,9 @@ class Part:
 
     file: Path
     up_axis: str | None
-    turn: Float
+    turn: Floats
     scale: float
-    offset: Float
+    offset: Floats
     falls: bool  # until it stands on the ground
     library: Path | None = None  # of the material of voxels, and its name there
     material: str = ""
@@ -257,7 +258,7 @@ def _text(path: Path) -> str:
         return ""
 
 
-def _numbers(text: str, count: int) -> Float:
+def _numbers(text: str, count: int) -> Floats:
     """Numbers with ; between them."""
     try:
         values = np.array([float(word) for word in text.split(";")])

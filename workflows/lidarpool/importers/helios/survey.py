@@ -15,13 +15,14 @@ from xml.etree.ElementTree import Element
 import numpy as np
 import yaml
 
+from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
 from ...scenario.scenario import Scenario
 from ...scene.transform import rotation_about
 from ...sensor import Pose
 from ...sensor.disc import SUBRAYS
 from ...sensor.survey import SENSORS_MOST
-from .files import Assets, Float, clean, number, rotation, vector
+from .files import Assets, clean, number, rotation, vector
 from .scanner import Device, channels, device, unread
 from .scene import Surroundings
 from .way import Stretch, Way, flown, read_legs, read_way, stood
@@ -176,7 +177,7 @@ class _Import:
                 self._sensors[name] = self._sensor(one, stretch, turn)
         return way
 
-    def _sensor(self, one: Device, stretch: Stretch, mount: Float) -> dict[str, Any]:
+    def _sensor(self, one: Device, stretch: Stretch, mount: Floats) -> dict[str, Any]:
         """Entry of `sensors`."""
         step_deg, steps = one.steps(stretch.seconds)
         near, far = one.range_m

@@ -12,10 +12,11 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
 from ...scene.transform import rotation_about as about
 from ...sensor.trajectory import quaternions_of
-from .files import Assets, Float, clean, flag, number, read
+from .files import Assets, clean, flag, number, read
 
 _SPEED = 70.0  # metres a second, where nothing is said
 _BETWEEN_S = 0.001  # of legs, in which the carrier turns on the spot or goes to its next one
@@ -30,7 +31,7 @@ class Leg:
     """A leg: its number, where it begins, and its settings."""
 
     number: int
-    place: Float
+    place: Floats
     scanner: dict[str, str]
     platform: dict[str, str]
     longest_s: float  # infinite where there is no limit
@@ -58,7 +59,7 @@ class Way:
     `rows` hold seconds, x, y, z and yaw in degrees, or quaternions x, y, z, w in its place.
     """
 
-    rows: Float
+    rows: Floats
     stretches: list[Stretch]
 
     def written(self) -> tuple[dict[str, Any] | str, dict[str, str]]:
@@ -172,7 +173,7 @@ def read_way(survey: Element, legs: Sequence[Leg], assets: Assets) -> Way:
     return Way(np.vstack([rows, rows[-1] + [_AFTER_S, *7 * [0]]]), stretches)
 
 
-def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Float:
+def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Floats:
     """Rotation (3, 3) of a platform, degrees, as HELIOS++ takes a file's angles."""
     if kind == "CANONICAL":
         return about(_X, roll) @ about(_Y, pitch) @ about(_Z, yaw)
@@ -181,7 +182,7 @@ def _turned(kind: str, roll: float, pitch: float, yaw: float) -> Float:
     raise LidarpoolError(f"rotationSpec is {kind!r}; there are ARINC 705 and CANONICAL.")
 
 
-def _columns(text: str, settings: dict[str, str]) -> dict[str, Float]:
+def _columns(text: str, settings: dict[str, str]) -> dict[str, Floats]:
     """Columns of a trajectory by name: by indices, its header, or as usual."""
     usual = ["t", "roll", "pitch", "yaw", "x", "y", "z"]
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
