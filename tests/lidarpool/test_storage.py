@@ -113,7 +113,7 @@ USES = {
     "entries": lambda s: replace(s, url=f"{s.url}/link").entries(),
     "remove": lambda s: s.remove(["link/file"]),
     "discard": lambda s: s.discard("link/in"),
-    "discard own": lambda s: s.discard("link", lambda name: True),
+    "prune": lambda s: s.prune(["link/file"]),
     "tree": lambda s: s.tree("link"),
 }
 

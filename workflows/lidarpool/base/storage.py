@@ -13,7 +13,7 @@ import secrets
 import shutil
 import tempfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Collection, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -288,7 +288,7 @@ class Storage:
                 found[one["name"].rpartition("/")[2]] = (one["size"] or 0) if plain else None
         return found
 
-    def remove(self, names: list[str], *, folder: bool = False) -> None:
+    def remove(self, names: Iterable[str], *, folder: bool = False) -> None:
         """Remove files; no error for missing ones. Then the `folder` itself, if it is empty."""
         for name in names:
             if self.is_local:
@@ -301,14 +301,10 @@ class Storage:
                 self.local().rmdir()
 
     def tree(self, name: str = "") -> list[str]:
-        """Names, as of `read`, of a file itself, or of all in a folder and below; none if missing.
-
-        LidarpoolError if there is a link.
-        """
+        """Names, as of `read`, of all files in a folder and below; LidarpoolError for a link."""
         if self.is_local:
-            top = self.local(name)
-            found = [top] if top.is_file() else []
-            for folder, folders, files in os.walk(top):
+            found: list[Path] = []
+            for folder, folders, files in os.walk(self.local(name)):
                 paths = [Path(folder, one) for one in (*files, *folders)]
                 for path in filter(Path.is_symlink, paths):
                     self.local(path)
@@ -318,18 +314,16 @@ class Storage:
             below = system.find(f"{folder}/{name}".rstrip("/"))
             return [one.removeprefix(f"{folder}/") for one in below]
 
-    def discard(self, name: str, own: re.Pattern[str] | None = None) -> None:
-        """Remove a file, or a folder with its content, if it exists.
+    def prune(self, names: Collection[str]) -> None:
+        """Remove files in folders in it, in this order, and the folders that are then empty."""
+        self.remove(names)
+        folders = {str(folder) for name in names for folder in Path(name).parents}
+        for folder in sorted(folders - {"."}, key=len, reverse=True):
+            self.below(folder).remove([], folder=True)
 
-        With `own`, only files whose names, as those of `tree`, it matches, and folders that are
-        empty then.
-        """
-        if own is not None:
-            self.remove([file for file in self.tree(name) if own.fullmatch(file)])
-            for folder, _, _ in os.walk(self.local(name), False) if self.is_local else ():
-                with suppress(OSError):
-                    Path(folder).rmdir()
-        elif self.is_local:
+    def discard(self, name: str) -> None:
+        """Remove a file, or a folder with its content, if it exists."""
+        if self.is_local:
             path = self._target(name)
             if path.is_dir() and not path.is_symlink():
                 shutil.rmtree(path)

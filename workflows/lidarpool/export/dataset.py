@@ -254,13 +254,6 @@ class Listing(Storage):
         super().write(name, data)
         self.files[name] = [len(data), zlib.crc32(data)]
 
-    def undo(self) -> None:
-        """Remove the files, and folders that are then empty."""
-        self.remove([*self.files])
-        folders = {str(folder) for file in self.files for folder in Path(file).parents}
-        for folder in sorted(folders - {"."}, key=len, reverse=True):
-            self.below(folder).remove([], folder=True)
-
 
 def _manifest_file(name: str) -> str:
     return f".jobs/{name}.json"

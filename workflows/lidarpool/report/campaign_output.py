@@ -123,10 +123,10 @@ def make_dataset(
             resume=resume,
         )
         stack.enter_context(store.kept_on_error())
+        _own_files(out, begun=made is not None or bool(store.kept))
         if made is not None:
             store.take_over(made, read_table(out))
-        _own_files(out, begun=bool(store.kept))
-        if made is None:
+        else:
             _, wrong = _look(dataset, store.rows(), making.verify, campaign)
         if not store.kept:
             campaign.check_files()
@@ -317,12 +317,11 @@ def _own_files(out: Storage, *, begun: bool) -> list[str]:
 def _remove_dataset(out: Storage, kept: Storage) -> None:
     """Remove a data set and its run; LidarpoolError, and nothing is removed, if there is more."""
     begun = CAMPAIGN_FILE in out.sizes() or FILE in kept.sizes()
-    tops = {name.partition("/")[0] for name in _own_files(out, begun=begun)}
+    own = _own_files(out, begun=begun)
     with explained(f"{out} cannot be removed"):
         out.tidy()
         # First what says that it is finished, and last what says that it is a data set.
-        for name in sorted(tops, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)):
-            out.discard(name, _FINISHED)
+        out.prune(sorted(own, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)))
     drop_run(kept)
 
 

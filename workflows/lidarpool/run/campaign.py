@@ -291,7 +291,7 @@ def _written(
             told = f"{error}" if isinstance(error, LidarpoolError) else f"job {name}: {error}"
             raise LidarpoolError(told) from error
         with suppress(OSError):
-            listing.undo()
+            listing.prune(listing.files)
         raise JobError(str(error) if isinstance(error, LidarpoolError) else repr(error)) from error
     return {"points": tally.points, "sha256": tally.sha256, "classes": tally.classes}
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
@@ -111,7 +110,8 @@ class CampaignStore(KeptRun):
         for name in self.storage.entries():
             if mark := mark_of_folder(name):
                 with suppress(OSError):
-                    self.storage.discard(name, re.compile(f".*{mark}-.*"))
+                    own = [file for file in self.storage.tree(name) if f"{mark}-" in file]
+                    self.storage.prune(own)
         super().remove()
 
     def folder_of(self, store: RunStore) -> str:
