@@ -90,6 +90,19 @@ def test_files_of_no_result_are_neither_replaced_nor_removed_unasked(result, tmp
     result.report(tmp_path / "other", only_cloud=True)
 
 
+def test_a_folder_of_a_format_with_a_file_of_the_user_is_not_replaced(result, tmp_path):
+    result.report(tmp_path, only_cloud=True, formats=["pcd"])
+    own = tmp_path / "pcd" / "notes.txt"
+    own.write_text("mine")
+    for formats in (["pcd"], []):  # it would be replaced, and removed
+        with pytest.raises(LidarpoolError, match=r"pcd/notes\.txt is not a file of lidarpool"):
+            result.report(tmp_path, only_cloud=True, formats=formats, overwrite=True)
+    assert own.read_text() == "mine" and (tmp_path / "report.json").exists()
+    own.unlink()
+    result.report(tmp_path, only_cloud=True, overwrite=True)
+    assert not own.parent.exists()
+
+
 def test_the_command_does_not_either(tmp_path, cluster, lidarpool, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nsteps: 1\nplanning: {enabled: false}\n")

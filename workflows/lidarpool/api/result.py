@@ -76,9 +76,8 @@ class Result(RunResult):
         place = output_place(folder)
         wanted = [Format.of(entry) for entry in formats if entry != "ply"]
         with result_folder(place) as local:
-            if not overwrite:
-                further = further_files(self.survey, wanted)
-                refuse_to_replace(place, lambda: self.identity, further)
+            further = further_files(self.survey, wanted)
+            refuse_to_replace(place, lambda: self.identity, further, overwrite=overwrite)
             write_result(local, place, self, only_cloud=only_cloud, formats=wanted)
 
     @checked

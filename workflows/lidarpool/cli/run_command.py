@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -140,9 +141,9 @@ def _run(
     with result_folder(out) as folder:
         kept = Storage.at(out).below(RUN_FOLDER)
         goes_on = options.resume and FILE in kept.sizes()
-        if not (options.overwrite or goes_on):
-            further = further_files(job.survey, formats)
-            refuse_to_replace(out, lambda: identity_of(job), further)
+        if not goes_on:
+            further, own = further_files(job.survey, formats), partial(identity_of, job)
+            refuse_to_replace(out, own, further, overwrite=options.overwrite)
         store = _store(job, options, kept, goes_on)
         with conducted(
             store,

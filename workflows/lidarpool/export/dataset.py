@@ -28,7 +28,7 @@ from .jobs import JobRow
 from .nuscenes import merge
 from .pieces import RANGE_PIECES, RANGE_POINTS, Entry, Pieces, Written, pieces_of
 from .sweeps import MIXED_UP, SWEEPS_FILE, Sweeps
-from .table import LAYOUTS
+from .table import FORMATS, LAYOUTS
 
 # {format of a data set: format of its jobs}
 DATA_SETS = {
@@ -44,9 +44,9 @@ _LISTED = 32  # folders whose files are known at a time, some of which all jobs 
 # Files of jobs, in all formats, and that by which workers see whether they see the place.
 OF_JOBS = re.compile(
     r"[0-9a-f]{16}-dataset|\.jobs/[^/]+\.json|(sweeps|boxes)/[^/]+\.npz|bags/[^/]+\.mcap|"
-    r"jobs/[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)|points/job=\d+/part-\d+\.parquet|"
-    r"images/[^/]+/[^/]+/\d+\.npz|(samples|sweeps)/[^/]+/[^/]+/\d+\.pcd\.bin|poses/[^/]+\.txt|"
-    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
+    r"jobs/[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)|"
+    rf"points/job=\d+/{FORMATS['parquet'].inside}|images/[^/]+/{FORMATS['images'].inside}|"
+    rf"{FORMATS['kitti'].inside}|{FORMATS['nuscenes'].inside}"
 )
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from importlib import import_module
@@ -89,6 +90,7 @@ class Format:
             raise LidarpoolError(f"The folder {path.parent} does not exist: make it first.")
         if path.exists() and not overwrite:
             raise LidarpoolError(f"{path} exists: give another place with --out, or --overwrite.")
+        refuse_strangers(Storage.at(path.parent), [path.name])
         self.check_columns(cloud)
 
     def check_columns(self, cloud: CloudLike) -> None:
@@ -152,6 +154,18 @@ class Format:
                 with suppress(OSError):
                     storage.discard(self.file)
                 raise
+
+
+def refuse_strangers(place: Storage, names: Collection[str]) -> None:
+    """Refuse to replace those of some folders of formats that hold files of others."""
+    for row in (row for row in FORMATS.values() if row.inside and row.file in names):
+        own = re.compile(rf"{row.file}/(?:{row.inside}|(?:.*/)?\.(?:lidarpool-|writing).*)")
+        for name in place.tree(row.file):
+            if not own.fullmatch(name):
+                raise LidarpoolError(
+                    f"{place.path(name)} is not a file of lidarpool, and {row.file} would be "
+                    "replaced: move it elsewhere, or give another folder with --out."
+                )
 
 
 def save(

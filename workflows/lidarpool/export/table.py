@@ -25,6 +25,7 @@ class FormatRow:
     holds: tuple[str, ...] | None = None  # columns; None for all
     # {layout: columns that it needs and holds beside those}, where there are layouts
     layouts: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    inside: str = ""  # of a folder: pattern of the names of its files
 
     def needed(self, layout: str) -> tuple[str, ...]:
         """Names of the columns that it needs, with a layout if it has layouts."""
@@ -51,18 +52,31 @@ _BAG = (
     LAYOUTS,
 )
 
+_KITTI = (
+    r"poses/[^/]+\.txt|"
+    r"sequences/[^/]+/((poses|times|calib)\.txt|(velodyne|labels|label_2)/\d+\.(bin|label|txt))"
+)
+_NUSCENES = (
+    r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png"
+)
+_PARTS = r"part-\d+\.parquet"
+
 FORMATS = {
     "ply": FormatRow("cloud.ply", "ply"),
     "las": FormatRow("cloud.las", "las", False, _LAS),
     "laz": FormatRow("cloud.laz", "las", False, _LAS),
-    "parquet": FormatRow("cloud.parquet", "parquet", True, ("pyarrow",)),
-    "pcd": FormatRow("pcd", "pcd", True, ("pypcd4",), ("scan",)),
-    "images": FormatRow("images", "images", True, (), ("scan", *_ALL_RAYS)),
+    "parquet": FormatRow("cloud.parquet", "parquet", True, ("pyarrow",), inside=_PARTS),
+    "pcd": FormatRow("pcd", "pcd", True, ("pypcd4",), ("scan",), inside=r"\d+\.pcd"),
+    "images": FormatRow(
+        "images", "images", True, (), ("scan", *_ALL_RAYS), inside=r"[^/]+/\d+\.npz"
+    ),
     "e57": FormatRow("cloud.e57", "e57", False, ("pye57",), ("scan",), _E57),
-    "kitti": FormatRow("kitti", "kitti", True, (), ("scan", *_LABELS), _LABELS),
-    "nuscenes": FormatRow("nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS),
+    "kitti": FormatRow("kitti", "kitti", True, (), ("scan", *_LABELS), _LABELS, inside=_KITTI),
+    "nuscenes": FormatRow(
+        "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, inside=_NUSCENES
+    ),
     "mcap": FormatRow("cloud.mcap", "ros", *_BAG),
-    "rosbag2": FormatRow("rosbag2", "ros", *_BAG),
+    "rosbag2": FormatRow("rosbag2", "ros", *_BAG, inside=r"metadata\.yaml|rosbag2\w*\.mcap"),
 }
 EXPORTS = tuple(name for name in FORMATS if name != "ply")  # what a result has if it is asked for
 

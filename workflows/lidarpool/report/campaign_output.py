@@ -41,7 +41,7 @@ CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that
 # With what `_finish` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
     OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
-    r"jobs\.(csv|parquet)|splits/[^/]+\.txt|v1\.0-lidarpool/\w+\.json|maps/none\.png"
+    r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
 )
 # The run, results of single jobs, and what writers that have not heard of their end may add.
 _BESIDE = re.compile(r"(run|job-[^/]+)/.*|(.*/)?\.lidarpool-(tmp|writing)-.*")

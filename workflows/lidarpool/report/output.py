@@ -16,7 +16,7 @@ from ..base.interrupts import deferred_interrupts
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
 from ..export.folder import LAST_FILE, staging
-from ..export.formats import Format
+from ..export.formats import Format, refuse_strangers
 from ..export.navigation import FILES as INSTRUMENT_FILES
 from ..export.navigation import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -48,7 +48,11 @@ def further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
 
 
 def refuse_to_replace(
-    place: Path | Storage, identity: Callable[[], Mapping[str, str]], further: Sequence[str] = ()
+    place: Path | Storage,
+    identity: Callable[[], Mapping[str, str]],
+    further: Sequence[str] = (),
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Refuse a folder that holds the result of another survey, or files of no result.
 
@@ -58,8 +62,9 @@ def refuse_to_replace(
     Raises
     ------
     LidarpoolError
-        If there is a result of another scene or survey, or one that cannot be read; or a file that
-        this result would replace and that no report there lists.
+        If there is a result of another scene or survey, or one that cannot be read, or a file that
+        this result would replace and that no report there lists, each unless `overwrite`; or a
+        folder that would be replaced and holds files of others.
     """
     storage = Storage.at(place)
     advice = "give another folder with --out, or replace it with --overwrite (in Python "
@@ -70,13 +75,15 @@ def refuse_to_replace(
         except NotADirectoryError:
             return
     earlier, listed = _earlier(storage)
-    if REPORT in there:
+    if REPORT in there and not overwrite:
         here = identity()
         if earlier != {name: here[name] for name in _SURVEY}:
             raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
     names = (*FILES, *further)
-    if foreign := [name for name in names if name in there and name not in listed]:
+    foreign = [name for name in names if name in there and name not in listed]
+    if foreign and not overwrite:
         raise LidarpoolError(f"{place} holds {foreign[0]}, which no result there lists: {advice}")
+    refuse_strangers(storage, {*further, *listed})
 
 
 def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
@@ -129,6 +136,7 @@ def write_result(
         instruments = sweeps.instruments
         further = further_files(result.survey, formats)
         files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
+        refuse_strangers(Storage.at(storage or folder), {*further, *earlier})
 
         @cache
         def clear(storage: Storage) -> None:
