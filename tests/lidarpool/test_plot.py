@@ -254,3 +254,11 @@ def test_folders_that_cannot_be_used(result, tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(LidarpoolError, match=r"file.below cannot be made"):
         plot(result, "--out", tmp_path / "file" / "below")
+
+
+def test_a_picture_takes_the_place_of_a_link(tmp_path):
+    theirs, link = tmp_path / "theirs.png", tmp_path / "cloud.png"
+    theirs.write_bytes(b"of another")
+    link.symlink_to(theirs)
+    Page((300, 200)).save(link)
+    assert theirs.read_bytes() == b"of another" and not link.is_symlink()

@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from ..base.arrays import Floats
 from ..base.errors import explained
+from ..base.storage import Storage
 from . import theme
 from .shot import Shot
 
@@ -263,7 +264,7 @@ class Page:
             axes.yaxis.set_minor_formatter(lambda value, _: "")
 
     def save(self, path: Path) -> None:
-        """Write the page as a PNG, in its light colours.
+        """Write the page as a PNG, in its light colours; a link in its place goes.
 
         Raises
         ------
@@ -272,7 +273,9 @@ class Page:
         """
         advice = "choose a folder that exists, can be written to and has room"
         with explained(f"The picture {path} could not be written", advice):
-            self.figure.savefig(path, dpi=DPI)
+            image = io.BytesIO()
+            self.figure.savefig(image, dpi=DPI, format=path.suffix[1:] or "png")
+            Storage.at(path.parent, durable=False).write(path.name, image.getvalue())
 
     def svg(self) -> str:
         """Return the page as an element of HTML, whose ink may follow the style around it.
