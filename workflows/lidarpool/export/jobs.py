@@ -240,7 +240,8 @@ def read_table(place: Storage) -> Iterator[JobRow]:
         except (ValueError, csv.Error) as error:
             raise LidarpoolError(
                 f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
-                "--resume writes that of an unfinished campaign anew; else bring it back."
+                "--resume writes that of an unfinished campaign anew; --overwrite makes a finished "
+                "one again."
             ) from error
 
 

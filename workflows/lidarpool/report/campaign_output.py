@@ -248,9 +248,11 @@ def verify(place: Storage, number: int | None = None) -> str:
     """
     index = read_index(place)
     dataset = DataSet(place, index["format"], index["layout"])
-    rows = [JobRow(row["number"], row["name"]) for row in index["jobs"]]
+    rows = [row for row in read_table(place) if row.done]
+    whole = len(rows) == len(index["jobs"])
     rows = [row for row in rows if number in (None, row.number)]
-    if wrong := _look(dataset, rows, True)[1]:
+    wrong = _look(dataset, rows, True)[1] | ({} if whole else {-1: "rows of jobs.csv are missing"})
+    if wrong:
         raise LidarpoolError(
             f"{place} is damaged: {listed([*wrong.values()])}. With the campaign, --verify makes "
             "these jobs again."
