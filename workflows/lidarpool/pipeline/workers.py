@@ -20,16 +20,15 @@ from ..base.software import difference, software_there
 from .cast import intersect
 from .failures import (
     JobError,
+    error_of,
     raise_if_failed,
-    rig_has_failed,
-    rig_is_missing,
     sending,
     was_killed,
     words_on_memory,
 )
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigPlan, drop_all
+from .rigs import RigFailed, RigMissing, RigPlan, drop_all
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
@@ -182,19 +181,20 @@ class CastingWorkers:
             for packed in self._surveys[job]:
                 packed.there.add(worker)
             return Outcome.DONE
-        if future.status == "error" and rig_is_missing(future):
+        error = error_of(future)
+        if isinstance(error, RigMissing):
             for packed in self._surveys[job]:
                 packed.there.discard(worker)
             return Outcome.NO_RIG
-        if future.status == "error" and was_killed(future):
+        if was_killed(future):
             return Outcome.KILLED
-        what = PREPARING if rig_has_failed(future) else f"stage {INTERSECT}"
+        what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
         try:  # the error names the scans
             raise_if_failed(future, what)
-        except LidarpoolError as error:
+        except LidarpoolError as told:
             if future.status != "error":  # cancelled, and so are those of the others
                 raise
-            raise JobError(str(error)) from error.__cause__
+            raise JobError(str(told)) from told.__cause__
         return Outcome.PENDING
 
     def forget(self, key: str) -> None:
