@@ -390,7 +390,6 @@ def make_result(
         backend=store.backend,
         rays=job.survey.ray_count,
         hits=store.db.hits,
-        records=tuple(record for book in books for record in book.records),
         stages=tuple(totals for book in books for totals in book.stages.values()),
         resumed=store.resumed,
         notes=(*store.notes, *notes),
