@@ -18,14 +18,7 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from .cast import intersect
-from .failures import (
-    JobError,
-    error_of,
-    raise_if_failed,
-    sending,
-    was_killed,
-    words_on_memory,
-)
+from .failures import JobError, error_of, raise_if_failed, sending, was_killed, words_on_memory
 from .messages import Span
 from .names import INTERSECT
 from .rigs import RigFailed, RigMissing, RigPlan, drop_all

@@ -14,12 +14,7 @@ from distributed import Client
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from poolpart import (
-    Partition,
-    PipeClosed,
-    PipeFailed,
-    PoolError,
-)
+from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
