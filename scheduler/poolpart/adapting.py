@@ -14,7 +14,7 @@ import asyncio
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from distributed import Client
@@ -85,7 +85,6 @@ class _Record:
     """One partition."""
 
     kind: Kind
-    bounds: Bounds | None
     coming: int = 0  # jobs whose workers are not here
     heard: float = 0.0  # when the process that starts jobs said so
     lacked: float = 0.0  # slots that were missing at the last look
@@ -131,13 +130,6 @@ class Adaptation(SchedulerPlugin):
                 del self.wants[partition, other]
 
     # -- looks ------------------------------------------------------------------------
-
-    def coming(self, name: str) -> int:
-        """Jobs of a partition that wait in the queue, or start; 0 if nobody starts them."""
-        record = self.records.get(name)
-        if record is None or time.monotonic() - record.heard > _LOST_S:
-            return 0
-        return record.coming
 
     def waiting_slots(self) -> dict[str, float]:
         """Slots that tasks wait for without any worker, by partition."""
@@ -190,7 +182,7 @@ class Adaptation(SchedulerPlugin):
         gone = [job for job, names in jobs.items() if self._cancelled.issuperset(names)]
         queued = [job for job, group in workers.items() if not group and job not in gone]
         record.coming, record.heard = len(queued), now
-        bounds = record.bounds
+        bounds = record.kind.bounds
         if bounds is None:
             return None
         each = record.kind.slots * record.kind.workers
@@ -264,7 +256,7 @@ def begin(kinds: Mapping[str, Kind], dask_scheduler: Any = None) -> None:
     if NAME not in dask_scheduler.plugins:
         dask_scheduler.add_plugin(record)
     for name, kind in kinds.items():
-        record.records[name] = _Record(kind, kind.bounds)
+        record.records[name] = _Record(kind)
 
 
 async def look(
@@ -329,7 +321,7 @@ def adaptive_names(client: Client) -> set[str]:
 def _adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
     record = _record(dask_scheduler, name)
     if record is not None:
-        record.bounds = bounds
+        record.kind = replace(record.kind, bounds=bounds)
     return record is not None
 
 
@@ -341,8 +333,7 @@ def _want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> boo
     adaptation.wants.pop((name, asking), None)
     if slots:
         adaptation.wants[name, asking] = slots
-    record = adaptation.records.get(name)
-    return record is not None and record.bounds is not None
+    return slots_of_new(dask_scheduler, name) > 0
 
 
 def _running_most(name: str, slots: int, dask_scheduler: Any = None) -> int:
@@ -356,7 +347,7 @@ def _running_most(name: str, slots: int, dask_scheduler: Any = None) -> int:
 def _adaptive_names(dask_scheduler: Any = None) -> set[str]:
     adaptation = _of(dask_scheduler)
     records = adaptation.records if adaptation else {}
-    return {name for name, record in records.items() if record.bounds is not None}
+    return {name for name, record in records.items() if record.kind.bounds is not None}
 
 
 # -- for other requests, on the scheduler ----------------------------------------------------
@@ -365,7 +356,7 @@ def _adaptive_names(dask_scheduler: Any = None) -> set[str]:
 def slots_of_new(scheduler: Any, name: str) -> int:
     """Slots of a worker that a partition may get; 0 if it has a fixed number of them."""
     record = _record(scheduler, name)
-    return record.kind.slots if record is not None and record.bounds is not None else 0
+    return record.kind.slots if record is not None and record.kind.bounds is not None else 0
 
 
 def slots_at_most(scheduler: Any, name: str) -> int:
@@ -374,18 +365,18 @@ def slots_at_most(scheduler: Any, name: str) -> int:
 
 
 def jobs_coming(scheduler: Any, name: str) -> int:
-    """Jobs of an adaptive partition that wait in the queue, or start."""
-    adaptation = _of(scheduler)
-    if adaptation is None or not slots_of_new(scheduler, name):
+    """Jobs of an adaptive partition that wait in the queue, or start; 0 if nobody starts them."""
+    record = _record(scheduler, name)
+    if record is None or record.kind.bounds is None or time.monotonic() - record.heard > _LOST_S:
         return 0
-    return adaptation.coming(name)
+    return record.coming
 
 
 def _most_workers(scheduler: Any, name: str) -> int:
     record = _record(scheduler, name)
-    if record is None or record.bounds is None:
+    if record is None or record.kind.bounds is None:
         return 0
-    return record.bounds.maximum * record.kind.workers
+    return record.kind.bounds.maximum * record.kind.workers
 
 
 def _of(scheduler: Any) -> Adaptation | None:

@@ -204,12 +204,18 @@ class _Jobs:
         with suppress(OSError):  # the scheduler is ending
             changed = await self._adapt()
             now = time.monotonic()
-            if changed or now - self._looked >= _LOOK_EVERY_S:
-                await self._start_again()
-            if now - self._looked >= _LOOK_EVERY_S:
+            due = now - self._looked >= _LOOK_EVERY_S
+            if changed or due:
+                # A SpecCluster lets go of a worker that is lost, and starts another when asked to.
+                try:
+                    await _start(self._cluster)
+                except Exception as error:
+                    self._say(f"A worker cannot be started: {error}")
+            if due:
                 self._looked = now
-                for line in self._logs.endings() if self._missing() else ():
-                    self._say(line)
+                if self._cluster.plan - self._cluster.observed:  # workers are missing
+                    for line in self._logs.endings():
+                        self._say(line)
 
     async def _adapt(self) -> bool:
         """Do what the scheduler advises; returns whether jobs have to be started."""
@@ -236,16 +242,6 @@ class _Jobs:
                 await worker.close()
             worker.status = Status.closed
             self._cluster.workers.pop(job, None)
-
-    async def _start_again(self) -> None:
-        # A SpecCluster lets go of a worker that is lost, and starts another when it is asked to.
-        try:
-            await _start(self._cluster)
-        except Exception as error:
-            self._say(f"A worker cannot be started: {error}")
-
-    def _missing(self) -> bool:
-        return bool(self._cluster.plan - self._cluster.observed)
 
     def _say(self, words: str) -> None:
         line = " ".join(words.split())[:400]

@@ -49,9 +49,7 @@ def enclose(scheduler: Any, name: str) -> None:
     PoolError
         If this version of Dask places tasks in another way.
     """
-    fences: Fences | None = scheduler.plugins.get(NAME)
-    if fences is None:
-        fences = Fences(scheduler)
+    fences: Fences = scheduler.plugins.get(NAME) or Fences(scheduler)
     fences.names.add(name)
     fences.look_again()
 

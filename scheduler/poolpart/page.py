@@ -17,14 +17,7 @@ from .fence import fences_of
 from .internals import serve, serve_no_longer
 from .pipe import pipes_of
 from .stats import NAME as STATISTICS
-from .stats import (
-    StageStats,
-    forget_statistics,
-    running_on,
-    slots_of,
-    statistics_of,
-    stats_of,
-)
+from .stats import StageStats, forget_statistics, running_on, slots_of, statistics_of, stats_of
 from .steward import NAME as STEWARD
 from .workers import on_scheduler
 

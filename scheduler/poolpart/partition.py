@@ -16,9 +16,9 @@ from .errors import PoolError
 from .mapping import Results, Stage
 from .membership import addresses_of, check_slots, forget_memberships
 from .rules import check_count
-from .stats import PartitionStats, partition_stats
+from .stats import PartitionStats, stats_of
 from .task_context import own_client
-from .workers import WorkerInfo, all_workers
+from .workers import WorkerInfo, all_workers, on_scheduler
 
 # Exits of the `with partition:` blocks of this thread or coroutine, innermost last.
 _entered: ContextVar[tuple[ExitStack, ...]] = ContextVar("_entered", default=())
@@ -85,8 +85,14 @@ class Partition:
 
         Tasks are counted from the division of the pool on; in a partition that the workers were
         started with, from the first call.
+
+        Raises
+        ------
+        PoolError
+            If the scheduler lacks this package.
         """
-        return partition_stats(self.client, self.name)
+        found: list[PartitionStats] = on_scheduler(self.client, stats_of, names=[self.name])
+        return found[0]
 
     # -- tasks -------------------------------------------------------------------------
 

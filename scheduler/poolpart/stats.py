@@ -12,13 +12,11 @@ from collections import Counter, defaultdict
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import islice
-from typing import Any, cast
+from typing import Any
 
-from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .fence import fences_of
-from .workers import on_scheduler
 
 NAME = "poolpart-stats"
 _LOOK_AT_MOST = 1000  # tasks of one worker that are examined for running ones
@@ -145,18 +143,6 @@ class PartitionStats(StageStats):
     busy: int = 0
     exclusive: bool = False
     stages: Mapping[str, StageStats] = field(default_factory=dict)
-
-
-def partition_stats(client: Client, name: str) -> PartitionStats:
-    """Statistics of a partition, whoever made it.
-
-    Raises
-    ------
-    PoolError
-        If the scheduler lacks this package.
-    """
-    [found] = on_scheduler(client, stats_of, names=[name])
-    return cast(PartitionStats, found)
 
 
 def statistics_of(scheduler: Any) -> Statistics:

@@ -27,16 +27,7 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
 from .fence import expect
-from .internals import (
-    Resources,
-    call,
-    declare_on_worker,
-    hand_off,
-    held_by,
-    recount,
-    show,
-    wake,
-)
+from .internals import Resources, call, declare_on_worker, hand_off, held_by, recount, show, wake
 from .probe import worker_gpus
 from .rules import Rule, n_workers, partition_for, per_gpu, rest
 from .workers import WorkerInfo

@@ -122,7 +122,6 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
                 "backend": "numpy",
                 "rays": survey.ray_count,
                 "hits": 5 * points,
-                "records": tuple(book.records),
                 "stages": tuple(book.stages.values()),
                 "seconds": 10.0,
                 "survey_seconds": 6.2,

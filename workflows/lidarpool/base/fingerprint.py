@@ -144,10 +144,8 @@ class _Digest:
 
     def _add_object(self, thing: Any) -> None:
         kind = type(thing)
-        if dataclasses.is_dataclass(thing):
-            state = {f.name: getattr(thing, f.name) for f in dataclasses.fields(thing)}
-        else:
-            state = {}
+        named = dataclasses.fields(thing) if dataclasses.is_dataclass(thing) else ()
+        state = {field.name: getattr(thing, field.name) for field in named}
         own = getattr(thing, "__dict__", None)
         if own is None and not state:
             raise _refusal(thing)

@@ -12,7 +12,6 @@ from poolpart import WorkerLeft
 
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
-from .rigs import RigFailed, RigMissing
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
 
@@ -56,25 +55,19 @@ def storing(storage: Storage) -> AbstractContextManager[None]:
     return explained(f"The points cannot be kept in {storage.url}", advice)
 
 
+def error_of(future: Future) -> BaseException | None:
+    """Error of a task that has failed; None for any other."""
+    return future.exception(timeout=ASK_S) if future.status == "error" else None
+
+
 def was_killed(future: Future) -> bool:
-    """Whether the cause was not the task: its workers kept dying, or its worker left."""
-    return isinstance(future.exception(timeout=ASK_S), (KilledWorker, WorkerLeft))
-
-
-def rig_is_missing(future: Future) -> bool:
-    """Whether a task of stage 2 failed because its worker had no rig."""
-    return isinstance(future.exception(timeout=ASK_S), RigMissing)
-
-
-def rig_has_failed(future: Future) -> bool:
-    """Whether a task of stage 2 failed because its worker could not make the rig."""
-    return future.status == "error" and isinstance(future.exception(timeout=ASK_S), RigFailed)
+    """Whether a task failed without being the cause: its workers kept dying, or its worker left."""
+    return isinstance(error_of(future), (KilledWorker, WorkerLeft))
 
 
 def raise_if_failed(future: Future, what: str) -> None:
     """Raise LidarpoolError if a task has failed or was cancelled from outside."""
-    if future.status == "error":
-        error = future.exception(timeout=ASK_S)
+    if (error := error_of(future)) is not None:
         error.__traceback__ = future.traceback(timeout=ASK_S)
         words = str(error) or type(error).__name__  # some of Dask's have no message
         raise LidarpoolError(f"{what} failed: {words}") from error

@@ -92,6 +92,7 @@ class LongStages:
         self.client, self.partition, self.run = client, partition, run
         self.collector_count = collectors
         self._sources, self._storage = sources, storage
+        self._lock_name = f"lidarpool-start-{partition.name}"
         self._patience_s = patience_s
         self._names = [GENERATE, SORT, *(f"{COLLECT}-{number}" for number in range(collectors))]
         self._tasks: dict[str, _Task] = {}
@@ -188,10 +189,6 @@ class LongStages:
         finally:
             lock.release()
 
-    @property
-    def _lock_name(self) -> str:
-        return f"lidarpool-start-{self.partition.name}"
-
     def _start_all(self) -> None:
         seen = self._look()
         free = {address: count for address, count in seen.free.items() if count > 0}
@@ -274,7 +271,7 @@ class LongStages:
 
     def _check(self) -> None:
         for name, task in self._tasks.items():
-            if task.future.status != "error" or not was_killed(task.future):
+            if not was_killed(task.future):
                 raise_if_failed(task.future, f"stage {name}")
 
     def _is_behind_another(self, task: _Task, seen: Whereabouts, now: float) -> bool:

@@ -20,7 +20,6 @@ from distributed import get_worker
 from poolpart import own_device
 
 from ..base.tracing import trace
-from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.rig import Rig
@@ -102,11 +101,15 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
         name, actors, survey, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
-        found = _scenes.get(name)
-        if found is None and scene is None:
-            raise RigMissing(f"This worker has no scene {name!r}.")
         _drop_unused(name)
-        rig = _assembled(found, scene, actors, survey, backend)
+        if (found := _scenes.get(name)) is not None:
+            rig = found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
+        elif scene is not None:
+            still: Scene = pickle.loads(scene)  # noqa: S301
+            threads = get_worker().state.nthreads
+            rig = Rig(still.with_actors(actors), survey, backend, threads, own_device())
+        else:
+            raise RigMissing(f"This worker has no scene {name!r}.")
     except RigMissing:
         raise
     except Exception as error:
@@ -114,21 +117,6 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
     _scenes[name] = _Kept(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
     return _Kept(rig, name, time.monotonic())
-
-
-def _assembled(
-    found: _Kept | None,
-    scene: bytes | None,
-    actors: tuple[Actor, ...],
-    survey: Survey,
-    backend: str,
-) -> Rig:
-    if found is not None:
-        return found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
-    assert scene is not None
-    still: Scene = pickle.loads(scene)  # noqa: S301
-    threads = get_worker().state.nthreads
-    return Rig(still.with_actors(actors), survey, backend, threads, own_device())
 
 
 def _drop_unused(scene: str) -> None:

@@ -155,7 +155,7 @@ def collect(
     secede()
     recorder = Recorder(COLLECT, LIDAR)
     scans = 0
-    try:
+    with suppress(PipeClosed, PipeFailed):
         me.trace("start")
         there = storage if storage.sees(*probe) else None
         while True:
@@ -168,8 +168,6 @@ def collect(
                     scans += _send(me, outlet, answers)
                     answers, told = [], time.monotonic()
             scans += _send(me, outlet, answers)
-    except (PipeClosed, PipeFailed):
-        pass
     return recorder.done(scans)
 
 

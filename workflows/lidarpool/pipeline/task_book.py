@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 from poolpart import TaskRecord
@@ -31,16 +31,17 @@ class StageTotals:
     misplaced: list[TaskRecord] = field(default_factory=list)  # the first of these
     # Times when at least one was running, as far as known: (start, stop), in order.
     busy: list[tuple[float, float]] = field(default_factory=list)
-    _records: list[TaskRecord] = field(default_factory=list, repr=False)
+    # Of the tasks, or of every n-th if there are thousands.
+    records: list[TaskRecord] = field(default_factory=list, repr=False)
     _every: int = 1  # which records are kept
     _gap: float = 1e-4  # seconds between spans that are joined
 
     def add(self, record: TaskRecord) -> None:
         """Count a task."""
         if self.tasks % self._every == 0:
-            self._records.append(record)
-            if len(self._records) > RECORDS_MOST:
-                del self._records[1::2]
+            self.records.append(record)
+            if len(self.records) > RECORDS_MOST:
+                del self.records[1::2]
                 self._every *= 2
         self.tasks += 1
         self.items += record.items
@@ -60,11 +61,6 @@ class StageTotals:
                 self._gap *= 2
                 self.busy = union(self.busy, self._gap)
 
-    @property
-    def records(self) -> Sequence[TaskRecord]:
-        """Records of the tasks, or of every n-th if there are thousands."""
-        return self._records
-
 
 class TaskBook:
     """Records the tasks of a run in bounded memory."""
@@ -74,15 +70,8 @@ class TaskBook:
 
     def add(self, record: TaskRecord) -> None:
         """Add a task."""
-        totals = self.stages.get(record.stage)
-        if totals is None:
-            totals = self.stages[record.stage] = StageTotals(record.stage, record.partition)
-        totals.add(record)
-
-    @property
-    def records(self) -> list[TaskRecord]:
-        """Records of the tasks, stage by stage, or of every n-th if there are thousands."""
-        return [record for totals in self.stages.values() for record in totals.records]
+        new = StageTotals(record.stage, record.partition)
+        self.stages.setdefault(record.stage, new).add(record)
 
 
 def union(spans: Iterable[tuple[float, float]], gap: float = 0.0) -> list[tuple[float, float]]:

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
+from functools import partial
 from typing import Any
 
 from distributed import Client, Future
@@ -17,18 +18,10 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from .cast import intersect
-from .failures import (
-    JobError,
-    raise_if_failed,
-    rig_has_failed,
-    rig_is_missing,
-    sending,
-    was_killed,
-    words_on_memory,
-)
+from .failures import JobError, error_of, raise_if_failed, sending, was_killed, words_on_memory
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigPlan, drop_all
+from .rigs import RigFailed, RigMissing, RigPlan, drop_all
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
@@ -53,17 +46,9 @@ class _Packed:
     """What tasks bring to workers that lack it: bytes, or what a worker has of a large thing."""
 
     name: str  # on the workers
+    pack: Callable[[], bytes]  # makes it, again if it is lost
     data: bytes | Future
     there: set[str] = field(default_factory=set)  # addresses of workers that have it
-
-
-@dataclass(eq=False)
-class _Survey:
-    """What a survey's rig is made of."""
-
-    plan: RigPlan
-    rig: _Packed
-    scene: _Packed  # its still part, which other surveys may share
 
 
 class CastingWorkers:
@@ -86,9 +71,10 @@ class CastingWorkers:
     ) -> None:
         self._client, self._partition, self.run = client, partition, run
         self.backend, self._software = backend, dict(software)
-        self._surveys: dict[str, _Survey] = {}  # by job
-        # Of surveys, and those used last; their plans keep what they are known by.
-        self._scenes: dict[tuple[int, ...], tuple[RigPlan, _Packed]] = {}
+        # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
+        self._surveys: dict[str, tuple[_Packed, _Packed]] = {}
+        # Of surveys, and those used last; what packs them keeps what they are known by.
+        self._scenes: dict[tuple[int, ...], _Packed] = {}
         self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
         self._setups: dict[str, Future] = {}  # {address: task that is checking the worker}
         # {address of a worker that may cast: tasks at a time}. The answers are not kept on the
@@ -123,8 +109,7 @@ class CastingWorkers:
     @property
     def _packed_things(self) -> list[_Packed]:
         """What tasks bring."""
-        rigs = [one.rig for one in self._surveys.values()]
-        return [*rigs, *(scene for _, scene in self._scenes.values())]
+        return [*(rig for rig, _ in self._surveys.values()), *self._scenes.values()]
 
     @property
     def pending(self) -> list[str]:
@@ -136,13 +121,11 @@ class CastingWorkers:
 
     def add(self, job: str, plan: RigPlan) -> None:
         """Let a survey be cast; JobError if it cannot be sent to workers."""
-        _, scene = self._scenes.pop(plan.still, (plan, None))
         with sending():
-            if scene is None:
-                scene = self._packed("scene", plan.packed_scene())
-            self._scenes[plan.still] = (plan, scene)  # the last used
-            rig = self._packed(job, plan.packed(scene.name))
-        self._surveys[job] = _Survey(plan, rig, scene)
+            scene = self._scenes.pop(plan.still, None) or self._packed("scene", plan.packed_scene)
+            self._scenes[plan.still] = scene  # the last used
+            rig = self._packed(job, partial(plan.packed, scene.name))
+        self._surveys[job] = rig, scene
 
     def remove(self, job: str) -> None:
         """Cast nothing more of a survey; its tasks must have been forgotten.
@@ -151,17 +134,18 @@ class CastingWorkers:
         """
         if (left := self._surveys.pop(job, None)) is None:
             return
-        used = [one.scene for one in self._surveys.values()]
-        spare = [key for key, (_, scene) in self._scenes.items() if scene not in used]
-        old = [self._scenes.pop(key)[1] for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
+        used = [scene for _, scene in self._surveys.values()]
+        spare = [key for key, scene in self._scenes.items() if scene not in used]
+        old = [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
         for address in self.slots:
             names = self._unneeded.setdefault(address, [])
-            names += [packed.name for packed in (left.rig, *old)]
+            names += [packed.name for packed in (left[0], *old)]
 
-    def _packed(self, what: str, data: bytes) -> _Packed:
+    def _packed(self, what: str, pack: Callable[[], bytes]) -> _Packed:
+        data = pack()
         self._count += 1
         name = f"{self.run}.{what}-{self._count}"
-        return _Packed(name, data if len(data) <= INLINE_BYTES else self._shared(name, data))
+        return _Packed(name, pack, data if len(data) <= INLINE_BYTES else self._shared(name, data))
 
     def _shared(self, name: str, data: bytes) -> Future:
         self._count += 1
@@ -173,38 +157,37 @@ class CastingWorkers:
         """Offer batches of a survey to a worker as one task; returns its key."""
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
-        one = self._surveys[job]
+        rig, scene = self._surveys[job]
         self._offered += 1
-        key = f"{INTERSECT}-{one.rig.name}-{spans[0][0]}-{spans[-1][1]}.{self._offered}"
-        brought = [
-            None if worker in packed.there else packed.data for packed in (one.rig, one.scene)
-        ]
+        key = f"{INTERSECT}-{rig.name}-{spans[0][0]}-{spans[-1][1]}.{self._offered}"
+        brought = [None if worker in packed.there else packed.data for packed in (rig, scene)]
         unneeded = self._unneeded.pop(worker, [])
         self._casts[key] = self._partition.submit(
-            intersect, one.rig.name, spans, unneeded, *brought, key=key, workers=worker
+            intersect, rig.name, spans, unneeded, *brought, key=key, workers=worker
         )
         return key
 
     def outcome(self, job: str, key: str, worker: str) -> Outcome:
         """State of a casting task; JobError if it has failed."""
-        future, one = self._casts[key], self._surveys[job]
+        future = self._casts[key]
         if future.status == "finished":
-            for packed in (one.rig, one.scene):
+            for packed in self._surveys[job]:
                 packed.there.add(worker)
             return Outcome.DONE
-        if future.status == "error" and rig_is_missing(future):
-            for packed in (one.rig, one.scene):
+        error = error_of(future)
+        if isinstance(error, RigMissing):
+            for packed in self._surveys[job]:
                 packed.there.discard(worker)
             return Outcome.NO_RIG
-        if future.status == "error" and was_killed(future):
+        if was_killed(future):
             return Outcome.KILLED
-        what = PREPARING if rig_has_failed(future) else f"stage {INTERSECT}"
+        what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
         try:  # the error names the scans
             raise_if_failed(future, what)
-        except LidarpoolError as error:
+        except LidarpoolError as told:
             if future.status != "error":  # cancelled, and so are those of the others
                 raise
-            raise JobError(str(error)) from error.__cause__
+            raise JobError(str(told)) from told.__cause__
         return Outcome.PENDING
 
     def forget(self, key: str) -> None:
@@ -246,12 +229,10 @@ class CastingWorkers:
                 self._take(address, future)
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
-        for one in self._surveys.values():
-            if _is_gone(one.rig.data):
-                one.rig.data = self._shared(one.rig.name, one.plan.packed(one.scene.name))
-        for plan, scene in self._scenes.values():
-            if _is_gone(scene.data):
-                scene.data = self._shared(scene.name, plan.packed_scene())
+        for packed in self._packed_things:
+            data = packed.data
+            if isinstance(data, Future) and data.status in ("lost", "cancelled", "error"):
+                packed.data = self._shared(packed.name, packed.pack())
 
     def want(self, slots: int) -> None:
         """Want so many slots of a partition that grows with its work; 0 when there is no more.
@@ -330,10 +311,6 @@ class CastingWorkers:
                 f"{words_on_memory(self._client, self._died)}: "
                 "look into their logs."
             )
-
-
-def _is_gone(data: bytes | Future) -> bool:
-    return isinstance(data, Future) and data.status in ("lost", "cancelled", "error")
 
 
 def share(partition: Partition, thing: Any, **options: Any) -> Future:

@@ -114,9 +114,7 @@ class ClusterFile(BaseModel):
         """
         arguments = dict(self.arguments)
         partitions = {
-            name: ({} if one.adapt else {"workers": self._count(name)})
-            | one.model_dump(exclude_unset=True)
-            for name, one in self.partitions.items()
+            name: one.model_dump(exclude_unset=True) for name, one in self.partitions.items()
         }
         factory = self._factory()
         heard: list[str] = []

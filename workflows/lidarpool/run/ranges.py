@@ -81,12 +81,7 @@ class LidarWorkers:
 
     def recorded(self, result: RunResult) -> RunResult:
         """Return a result with the tasks that wrote ranges."""
-        book = self._book
-        return replace(
-            result,
-            records=(*result.records, *book.records),
-            stages=(*result.stages, *book.stages.values()),
-        )
+        return replace(result, stages=(*result.stages, *self._book.stages.values()))
 
 
 @lru_cache(maxsize=1)

@@ -31,8 +31,6 @@ class RunResult:
         Name of the ray-casting backend that was used.
     rays, hits
         Rays fired, and those that hit something.
-    records
-        Tasks of the run, with worker and time; every n-th of a stage with thousands.
     stages
         All tasks of each stage together.
     resumed
@@ -58,7 +56,6 @@ class RunResult:
     backend: str
     rays: int
     hits: int
-    records: tuple[TaskRecord, ...]
     stages: tuple[StageTotals, ...]
     resumed: int
     notes: tuple[str, ...]
@@ -75,6 +72,11 @@ class RunResult:
         """Why there are fewer points than hits, for behind their number; empty if all are kept."""
         every = self.survey.keep_every
         return f", one of every {every:,} hits of a scan (keep_every)" if every > 1 else ""
+
+    @property
+    def records(self) -> tuple[TaskRecord, ...]:
+        """Tasks of the run, with worker and time; every n-th of a stage with thousands."""
+        return tuple(record for totals in self.stages for record in totals.records)
 
     @cached_property
     def cloud(self) -> Cloud:

@@ -14,12 +14,7 @@ from distributed import Client
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from poolpart import (
-    Partition,
-    PipeClosed,
-    PipeFailed,
-    PoolError,
-)
+from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
@@ -390,7 +385,6 @@ def make_result(
         backend=store.backend,
         rays=job.survey.ray_count,
         hits=store.db.hits,
-        records=tuple(record for book in books for record in book.records),
         stages=tuple(totals for book in books for totals in book.stages.values()),
         resumed=store.resumed,
         notes=(*store.notes, *notes),

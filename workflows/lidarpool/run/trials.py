@@ -11,9 +11,8 @@ from distributed import Client, Future
 
 from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks, recorded
 
-from ..base.errors import LidarpoolError
 from ..base.software import call_alike
-from ..pipeline.failures import was_killed
+from ..pipeline.failures import raise_if_failed, was_killed
 from ..pipeline.task_book import TaskBook
 from ..plan import Planning, Trial, run_trial
 
@@ -62,7 +61,12 @@ class TrialPump:
             self._leave_silent_workers()
         done = [f for f in self._running if f.status in ("error", "cancelled")]
         for future in done:
-            self._take_failure(future, self._running.pop(future))
+            number = self._running.pop(future)
+            # Dask gives up tasks after several deaths of their workers, whatever the cause.
+            if was_killed(future) and self._rounds[number] < ROUNDS_MOST:
+                self._waiting.append(number)
+            else:
+                raise_if_failed(future, f"Planning trial {number}")
         finished = [f for f in self._running if f.status == "finished"]
         found = fetch_available(self.client, [f.key for f in finished]) if finished else {}
         for future in finished:
@@ -91,16 +95,6 @@ class TrialPump:
         )
         self._rounds[number] += 1
         self._running[future] = number
-
-    def _take_failure(self, future: Future, number: int) -> None:
-        if future.status == "cancelled":
-            raise LidarpoolError(f"Planning trial {number} was cancelled from outside this run.")
-        # Dask gives up tasks after several deaths of their workers, whatever the cause.
-        if was_killed(future) and self._rounds[number] < ROUNDS_MOST:
-            self._waiting.append(number)
-            return
-        error = future.exception(timeout=10)
-        raise LidarpoolError(f"Planning trial {number} failed: {error}")
 
     def _leave_silent_workers(self) -> None:
         """Rerun trials whose workers are silent or have gone."""
