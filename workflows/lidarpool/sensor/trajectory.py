@@ -8,11 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 
 from ..base.arguments import as_array, checked_fields, shown
 from ..base.arrays import Bools, Floats, Indices
-from ..base.declared import Angle, Triple, written_as
+from ..base.declared import Angle, Triple, told, written_as
 from ..base.errors import LidarpoolError
 from .spline import knots_of, on_curve
 
@@ -36,12 +35,10 @@ class Pose:
     Angles are in degrees, in aerospace order.
     """
 
-    position: Annotated[
-        tuple[float, float, float], written_as(Triple), Field(description="x, y and z, metres")
-    ]
-    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
+    position: Annotated[tuple[float, float, float], written_as(Triple), told("x, y and z, metres")]
+    yaw_deg: Annotated[Angle, told("rotation about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, told("rotation about the new y, second")] = 0.0
+    roll_deg: Annotated[Angle, told("rotation about the new x, last")] = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(map(float, self.position)))
