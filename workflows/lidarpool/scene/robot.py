@@ -12,12 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.allowance import check_fits
 from ..base.arguments import as_array, checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Pose, Stations, Trajectory
+from ..sensor.calibrations import text_of
 from ..sensor.trajectory import CENTRE, presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import Actor, one_mesh
@@ -273,10 +273,7 @@ class Robot:
     def _read_values(self, path: Path, tell: Callable[[str], None]) -> dict[str, Floats]:
         """Read a table of values; LidarpoolError if it cannot be used."""
         try:
-            check_fits(path)
-            text = path.read_text("utf-8-sig")
-            if not text.strip():
-                raise ValueError("it is empty")
+            text = text_of(path)
             known = ("time_s", "time_ns", *self.moving)
             table = columns_of_table(
                 text, {}, known, lambda found: ("time_ns" if "time_ns" in found else "time_s",)
