@@ -276,8 +276,7 @@ def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Flo
         turns = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
     speeds, rates = velocities(path, 0, times_ns)
     levers = np.einsum("nij,j->ni", turns, np.array(mount.position))
-    own = np.eye(3) if mount.rotation is None else mount.rotation
-    return places + levers, turns @ own, speeds + np.cross(rates, levers)
+    return places + levers, turns @ mount.turn, speeds + np.cross(rates, levers)
 
 
 def _rotation_vectors(before: Floats, after: Floats) -> Floats:

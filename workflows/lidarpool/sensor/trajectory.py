@@ -53,13 +53,17 @@ class Pose:
             return None
         return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
 
+    @property
+    def turn(self) -> Floats:
+        """`rotation`; the identity matrix without one."""
+        return np.eye(3) if self.rotation is None else self.rotation
+
     def then(self, mount: Pose) -> Pose:
         """Pose of something mounted at `mount` in the axes of this one."""
         if mount == CENTRE:
             return self
-        eye = np.eye(3)
-        one, other = (eye if p.rotation is None else p.rotation for p in (self, mount))
-        return Pose.of(self.position + one @ mount.position, one @ other)
+        turn = self.turn
+        return Pose.of(self.position + turn @ mount.position, turn @ mount.turn)
 
     @classmethod
     def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
