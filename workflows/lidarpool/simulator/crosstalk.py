@@ -187,8 +187,5 @@ def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
 def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
     """First firing within a span of time, and one past the last."""
     last, begins = range(sensor.firings(steps - 1)[1]), partial(begin_ns, sensor)
-    slowest = float(sensor.beams.time_ns.max())
-    return (
-        bisect_left(last, span[0] - slowest, key=begins),
-        bisect_left(last, span[1], key=begins),
-    )
+    early = span[0] - float(sensor.beams.time_ns.max())  # its slowest beam is in the span
+    return bisect_left(last, early, key=begins), bisect_left(last, span[1], key=begins)
