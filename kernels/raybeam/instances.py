@@ -257,10 +257,8 @@ def place(meshes: tuple[LocalMesh, ...], mesh: Indices, transforms: Floats) -> S
     scale = np.array([frame.scale for frame in frames])[mesh]
     # Middle of each mesh's coordinates in the scene, metres: large numbers are subtracted first.
     centre = _product(turn, np.array([frame.centre for frame in frames])[mesh]) + move
-    low, high = (
-        np.array([side(frame) for frame in frames])[mesh] / scale[:, None]
-        for side in (lambda frame: frame.low, lambda frame: frame.high)
-    )
+    low = np.array([frame.low for frame in frames])[mesh] / scale[:, None]
+    high = np.array([frame.high for frame in frames])[mesh] / scale[:, None]
     shift, half = _product(turn, (low + high) / 2), _product(np.abs(turn), (high - low) / 2)
     middles = centre + shift
     origin, unit = middle((middles - half).min(axis=0), (middles + half).max(axis=0))

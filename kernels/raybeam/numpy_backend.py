@@ -195,10 +195,9 @@ class NumpyBackend(Backend):
         if scene.nested:
             self._top = _Nodes(build_top(scene.boxes, _WIDTH))
             # Box of each instance's mesh: (3, n)
-            self._low, self._high = (
-                np.array([side(mesh.frame) for mesh in scene.meshes])[scene.mesh].T
-                for side in (lambda frame: frame.low, lambda frame: frame.high)
-            )
+            frames = [mesh.frame for mesh in scene.meshes]
+            self._low = np.array([frame.low for frame in frames])[scene.mesh].T
+            self._high = np.array([frame.high for frame in frames])[scene.mesh].T
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""

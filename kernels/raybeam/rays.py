@@ -113,9 +113,8 @@ def _normalised(table: Floats) -> Floats:
     if not off.any():
         return table
     rows = table[off]
-    rows = rows / np.abs(rows).max(
-        axis=1, keepdims=True
-    )  # squares of 1e200 or 1e-200 overflow or underflow
+    # Squares of 1e200 or 1e-200 overflow or underflow.
+    rows = rows / np.abs(rows).max(axis=1, keepdims=True)
     x, y, z = rows.T
     out = table.copy()
     out[off] = rows / np.sqrt((x * x + y * y) + z * z)[:, None]

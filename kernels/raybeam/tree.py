@@ -88,19 +88,17 @@ def join(trees: list[WideTree]) -> tuple[WideTree, Ints]:
     roots = np.cumsum([0, *(len(tree.child) for tree in trees)])
     if len(trees) == 1:
         return trees[0], roots[:1]
-    first = np.cumsum([0, *(len(tree.order) for tree in trees)])
+    children, orders, first = [], [], 0
+    for tree, root in zip(trees, roots[:-1], strict=True):
+        leaves = tree.child - (first << LEAF_BITS)
+        children.append(np.where(tree.child < 0, leaves, tree.child + root))
+        orders.append(tree.order + first)
+        first += len(tree.order)
     return WideTree(
         np.concatenate([tree.low for tree in trees]),
         np.concatenate([tree.high for tree in trees]),
-        np.concatenate(
-            [
-                np.where(tree.child < 0, tree.child - (f << LEAF_BITS), tree.child + root)
-                for tree, f, root in zip(trees, first[:-1], roots[:-1], strict=True)
-            ]
-        ).astype(np.int32),
-        np.concatenate([t.order + f for t, f in zip(trees, first[:-1], strict=True)]).astype(
-            np.int32
-        ),
+        np.concatenate(children).astype(np.int32),
+        np.concatenate(orders).astype(np.int32),
     ), roots[:-1]
 
 

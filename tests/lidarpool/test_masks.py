@@ -13,6 +13,7 @@ from tests.lidarpool.test_gltf import glb
 
 from lidarpool import LidarpoolError, Pose, Scanner, Scene
 from lidarpool.base import allowance
+from lidarpool.scene.actors import Actor
 from lidarpool.scene.instances import Instance
 from lidarpool.scene.mesh import Cutout, Mesh
 from lidarpool.scene.meshfile import load_meshes
@@ -456,6 +457,19 @@ def test_scenes_with_masks_are_written(tmp_path, suffix):
         assert [getattr(one, "alphaMode", "") for one in materials].count("MASK") == 3
         low, high = made.bounds[:, [0, 2, 1]] * [1, 1, -1]
         np.testing.assert_allclose(other.bounds, np.sort([low, high], axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("backend", BACKENDS)
+def test_actors_have_opaque_and_masked_parts(backend):
+    ends = np.concatenate([CORNERS, CORNERS * [-1, 1, 1]]).astype(np.float64)
+    faces = np.concatenate([FACES.reshape(2, 3), FACES.reshape(2, 3) + 4]).astype(np.int64)
+    uv = UV[FACES].reshape(2, 3, 2)
+    mesh = Mesh("Tree", ends, faces, cutouts=(Cutout(np.ones((2, 2), bool), uv),))
+    ground = Mesh("Ground", CORNERS - [0, 0, 50.0], faces[:2])
+    scene = Scene.from_meshes([ground]).with_actors([Actor(mesh)])
+    sensor = Sensor.grid(rays_per_revolution=4, layers=1, step_deg=90)
+    found = Scanner(scene, sensor, backend=backend).ranges(Pose((0.0, 0.1, 0.2)))
+    np.testing.assert_allclose(found.reshape(-1), [5, np.inf, 5, np.inf], rtol=1e-6)
 
 
 def test_a_scenario_ignores_masks_if_told(tmp_path):

@@ -17,7 +17,7 @@ from .instances import Instance
 from .mesh import Cutout, Mesh, stacked
 
 SAMPLES_MOST = 200_000  # poses of all actors
-_AT_ZERO = Stations((CENTRE,))
+AT_ZERO = Stations((CENTRE,))
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +40,7 @@ class Actor:
     """
 
     mesh: Mesh
-    trajectory: Trajectory = _AT_ZERO
+    trajectory: Trajectory = AT_ZERO
 
     def __post_init__(self) -> None:
         if self.mesh.voxels is not None:

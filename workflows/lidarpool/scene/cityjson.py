@@ -251,7 +251,8 @@ class _City:
 
     def content(self) -> Content:
         """All objects, in metres."""
-        found = re.search(r"EPSG\b.*?(\d+)$", str(self._reference()))
+        reference = (self._head.get("metadata") or {}).get("referenceSystem")
+        found = re.search(r"EPSG\b.*?(\d+)$", str(reference))
         epsg = int(found[1]) if found else None
         ends = [np.zeros((1, 3)), *(one.mesh.bounds + one.matrix[:3, 3] for one in self._placed)]
         corners = np.concatenate(ends)[bool(self._placed) :]
@@ -278,9 +279,6 @@ class _City:
             listed = ", ".join(f"{n} {kind}" for kind, n in self._left.items())
             content.notes.append(f"is read without {listed}")
         return content
-
-    def _reference(self) -> Any:
-        return (self._head.get("metadata") or {}).get("referenceSystem")
 
 
 def _points(rows: Any) -> Floats:

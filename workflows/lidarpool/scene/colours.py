@@ -100,7 +100,7 @@ class Colours:
         well &= all(one.dtype == np.uint8 and one.shape[2:] == (3,) for one in self.images)
         well &= all(one.size == 3 or (one.size > 3 and self.uv is not None) for one in self.images)
         well &= self.uv is None or bool(np.isfinite(self.uv).all())
-        if not well or not _within(self.image, len(self.images)):
+        if not well or not within(self.image, len(self.images)):
             raise LidarpoolError(
                 f"The colours of {name!r} do not fit its {faces} faces: images are uint8 "
                 "(h, w, 3), image (f,), uv (f, 3, 2), finite, and corners (f, 3, 3)."
@@ -129,8 +129,9 @@ FEW_FACES = 20_000
 _UNIT = np.array([[[0.0, 0, 0], [1, 0, 0], [0, 1, 0]]])
 
 
-def _within(numbers: Ints32, count: int) -> bool:
-    return not len(numbers) or 0 <= numbers.min() <= numbers.max() < count
+def within(numbers: Ints32, count: int) -> bool:
+    """Whether numbers of any shape are those of so many things, from 0 up."""
+    return not numbers.size or bool(0 <= numbers.min() <= numbers.max() < count)
 
 
 class Lookup:

@@ -24,6 +24,7 @@ import numpy as np
 from ..base.allowance import Allowance
 from ..base.arrays import AnyArray, Bytes, Floats, Ints
 from ..base.words import counted
+from ..sensor.trajectory import matrices
 from .beside import file_beside, spellings
 from .colours import LINEAR, WHITE, Colours, as_srgb
 from .masks import (
@@ -147,7 +148,8 @@ class _Reader:
             child: index for index, node in enumerate(nodes) for child in node.get("children", ())
         }
         self._bent = cache(self._read_bent)  # keys are (mesh, weights of its targets, skin)
-        self._mesh, self._accessor = cache(self._read_mesh), cache(self._read_accessor)
+        self._mesh = cache(partial(self._read_bent, weights=(), skin=None))
+        self._accessor = cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
         self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
         self._mask = remembered(self._read_mask)
@@ -221,12 +223,11 @@ class _Reader:
             matrix, at = _matrix(self._part("nodes", at)) @ matrix, self._parents.get(at)
         return matrix
 
-    def _read_mesh(self, index: int) -> list[Mesh]:
-        """One mesh of all primitives, which differ by material only."""
-        return self._read_bent(index, (), None)
-
     def _read_bent(self, index: int, weights: tuple[float, ...], skin: int | None) -> list[Mesh]:
-        """Return a mesh with its morph targets; of a skin, in the coordinates of the scene."""
+        """Return a mesh with its morph targets; of a skin, in the coordinates of the scene.
+
+        Its primitives, which differ by material only, are one.
+        """
         mesh = self._part("meshes", index)
         surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
         name = str(mesh.get("name") or self._path.stem)
@@ -578,8 +579,8 @@ def _matrix(node: dict[str, Any]) -> Floats:
         np.array([node[name]], np.float64) if name in node else None
         for name in ("translation", "rotation", "scale")
     )
-    matrices = _matrices(*rows)
-    return np.eye(4) if matrices is None else matrices[0]
+    made = _matrices(*rows)
+    return np.eye(4) if made is None else made[0]
 
 
 def _matrices(
@@ -593,12 +594,8 @@ def _matrices(
         return None
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     if rotation is not None:
-        x, y, z, w = (rotation / np.linalg.norm(rotation, axis=1, keepdims=True)).T
-        out[:, :3, :3] = np.array([
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]).transpose(2, 0, 1)  # fmt: skip
+        unit = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
+        out[:, :3, :3] = matrices(unit)
     if scale is not None:
         out[:, :3, :3] *= scale[:, None]
     if translation is not None:

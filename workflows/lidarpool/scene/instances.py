@@ -53,8 +53,7 @@ class Instance:
     def __post_init__(self) -> None:
         given = self.transform
         if isinstance(given, Pose):
-            turn = np.eye(3) if given.rotation is None else given.rotation
-            given = Transform(turn, np.array(given.position))
+            given = Transform(given.turn, np.array(given.position))
         placed = given if isinstance(given, Transform) else Transform.from_matrix(given)
         matrix = np.eye(4)
         matrix[:3, :3], matrix[:3, 3] = placed.linear, placed.offset

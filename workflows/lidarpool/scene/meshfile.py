@@ -179,7 +179,8 @@ def load_objects(
         except LidarpoolError as error:
             raise LidarpoolError(f"{error}{_other_format(path, data)}") from error
         unit_m = UNITS_M[unit] if unit else content.unit_m or 1.0
-        upright = Transform(UP_AXES[up_axis or content.up_axis or "z"] * unit_m, np.zeros(3))
+        up = up_axis or content.up_axis or "z"
+        upright = Transform(UP_AXES[up] * unit_m, np.zeros(3))
         placed = Transform(np.eye(3), np.zeros(3)) if transform is None else transform
         places = [upright] if transform is None else [upright, transform]
         with prefixed(path):
@@ -194,11 +195,8 @@ def load_objects(
     if content.raster is not None and tell_raster is not None:
         tell_raster(content.raster)
     all_of_it = objects.still(lambda _: None)
-    taken(
-        _summary(content, all_of_it, unit, up_axis, colours)
-        if content.raster is None
-        else content.raster.told
-    )
+    raster_told = content.raster and content.raster.told
+    taken(raster_told or _summary(all_of_it, unit_m, up, colours))
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
         _tell_axes(path, content, all_of_it, axes)
     return objects
@@ -212,13 +210,7 @@ def load_meshes(
     return found.still(lambda line: tell(f"{path} moves {line}"))
 
 
-def _summary(
-    content: Content,
-    meshes: Sequence[Mesh | Instance],
-    unit: str | None,
-    up_axis: str | None,
-    colours: bool,
-) -> str:
+def _summary(meshes: Sequence[Mesh | Instance], unit_m: float, up_axis: str, colours: bool) -> str:
     """Say what a file gave: «4 objects, 38 triangles, in m, Y-up, 1 texture»."""
     shapes = [one.mesh if isinstance(one, Instance) else one for one in meshes]
     shared = [mesh for one, mesh in zip(meshes, shapes, strict=True) if one is not mesh]
@@ -231,12 +223,11 @@ def _summary(
         for mesh in shapes
         if mesh.voxels is not None
     ]
-    size = UNITS_M[unit] if unit else content.unit_m or 1.0
-    names = [name for name, metres in UNITS_M.items() if metres == size]
+    names = [name for name, metres in UNITS_M.items() if metres == unit_m]
     words += [
         counted(sum(len(mesh.faces) for mesh in shapes), "triangle"),
-        f"in {names[0] if names else f'units of {size:g} m'}",
-        f"{(up_axis or content.up_axis or 'z').upper()}-up",
+        f"in {names[0] if names else f'units of {unit_m:g} m'}",
+        f"{up_axis.upper()}-up",
     ]
     return ", ".join([*words, *([told(mesh.colours for mesh in shapes)] if colours else [])])
 

@@ -55,9 +55,10 @@ class _Image:
         return cls(as_text(rest), options)
 
     @property
-    def clamped(self) -> bool:
-        """Whether it does not repeat."""
-        return [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
+    def wrap(self) -> Wrap:
+        """How it goes on beyond its edges."""
+        clamped = [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
+        return "clamp" if clamped else "repeat"
 
     def numbers(self, option: bytes, usual: float) -> Floats:
         """Two numbers of an option."""
@@ -136,7 +137,7 @@ class Materials:
             entry = self._entries.get(name, _Entry())
             if (image := entry.images.get(b"map_kd")) is not None:
                 with self._notes.without_colour(as_text(name)):
-                    texture = self._image((image.name, image.clamped))
+                    texture = self._image((image.name, image.wrap))
                     found[name] = _placed(texture, image)
             elif entry.colour is not None:
                 found[name] = entry.colour
@@ -179,7 +180,7 @@ class Materials:
         # Some programs name the same image twice: then its brightness is its colour's.
         grey = image is not colour and not (colour and colour.name == image.name)
         base, gain = map(float, image.options.get(b"-mm", (0, 1)))
-        texture = self._mask((image.name, grey, base, gain, image.clamped))
+        texture = self._mask((image.name, grey, base, gain, image.wrap))
         if isinstance(texture, Texture):
             return _placed(texture, image)
         if texture == "glass":
@@ -187,26 +188,24 @@ class Materials:
         return None
 
     def _read_mask(
-        self, key: tuple[str, bool, float, float, bool]
+        self, key: tuple[str, bool, float, float, Wrap]
     ) -> Texture | Literal["solid", "glass"]:
         """Mask of an image, or what it makes of a material."""
-        name, grey, base, gain, clamped = key
+        name, grey, base, gain, wrap = key
         opacity = self._opacity((name, grey))
         if opacity is None:
             return "solid"
         mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
         if mask.all() or not mask.any():
             return "solid" if mask.all() else "glass"
-        wrap: Wrap = "clamp" if clamped else "repeat"
         return Texture(mask, (wrap, wrap), self._allowance)
 
     def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
         name, grey = key
         return read_opacity(self._there(name), self._allowance, grey=grey)
 
-    def _read_image(self, key: tuple[str, bool]) -> Texture:
-        name, clamped = key
-        wrap: Wrap = "clamp" if clamped else "repeat"
+    def _read_image(self, key: tuple[str, Wrap]) -> Texture:
+        name, wrap = key
         image = read_colours(self._there(name), self._allowance, self._notes)
         return Texture(image, (wrap, wrap), self._allowance)
 

@@ -362,12 +362,7 @@ def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
     elements, order, body = _ply_header(data)
     counts = {element.name: element.count for element in elements}
     # Their types, before text is read as real numbers.
-    kinds = {
-        name: kind
-        for e in elements
-        for name, (kind, _) in e.properties.items()
-        if e.name == "vertex"
-    }
+    types = {element.name: element.properties for element in elements}
     if counts.get("tristrips"):
         raise MeshFileError("has triangle strips, which are not read: export it with faces")
     if not counts.get("face"):
@@ -386,7 +381,7 @@ def read_ply_mesh(data: bytes, path: Path, wanted: Wanted) -> Content:
     faces, shown = triangulated(vertices, corners, sizes), None
     if wanted.colours and all(name in rows["vertex"] for name in _PLY_COLOURS):
         given = np.stack([rows["vertex"][name][0] for name in _PLY_COLOURS], axis=1)
-        given, kind = given.astype(np.float64), np.dtype(kinds["red"])
+        given, kind = given.astype(np.float64), np.dtype(types["vertex"]["red"][0])
         # Integers of four bytes hold 0 to 255, too.
         small = kind.kind in "iu" and kind.itemsize < 4
         shown = _tinted(given / np.iinfo(kind).max if small else _shares(given), faces)

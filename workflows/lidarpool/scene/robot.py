@@ -12,23 +12,21 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.allowance import check_fits
 from ..base.arguments import as_array, checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Pose, Stations, Trajectory
-from ..sensor.trajectory import CENTRE, presence_ns, velocities
+from ..sensor.calibrations import text_of
+from ..sensor.trajectory import presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
-from .actors import Actor, one_mesh
+from .actors import AT_ZERO, Actor, one_mesh
 from .mesh import Mesh
 from .transform import rotation_about
 
 _LATE_S = 1e-3  # the beams of the last firing are fired a little after the survey's end
 MOVING = ("revolute", "continuous", "prismatic")
 HELD = ("fixed", "floating", "planar")
-
-_AT_ZERO = Stations((CENTRE,))
 
 Joints = str | Path | Mapping[str, ArrayLike]
 
@@ -120,7 +118,7 @@ class Robot:
         return tuple(joint.name for joint in self.joints.values() if joint.moves)
 
     def path(
-        self, link: str, trajectory: Trajectory = _AT_ZERO, joints: Joints | None = None
+        self, link: str, trajectory: Trajectory = AT_ZERO, joints: Joints | None = None
     ) -> Trajectory:
         """Trajectory of a link, whose root has a trajectory. It stands if nothing moves it.
 
@@ -138,7 +136,7 @@ class Robot:
     @checked
     def actors(
         self,
-        trajectory: Trajectory = _AT_ZERO,
+        trajectory: Trajectory = AT_ZERO,
         joints: Joints | None = None,
         *,
         name: str | None = None,
@@ -273,10 +271,7 @@ class Robot:
     def _read_values(self, path: Path, tell: Callable[[str], None]) -> dict[str, Floats]:
         """Read a table of values; LidarpoolError if it cannot be used."""
         try:
-            check_fits(path)
-            text = path.read_text("utf-8-sig")
-            if not text.strip():
-                raise ValueError("it is empty")
+            text = text_of(path)
             known = ("time_s", "time_ns", *self.moving)
             table = columns_of_table(
                 text, {}, known, lambda found: ("time_ns" if "time_ns" in found else "time_s",)

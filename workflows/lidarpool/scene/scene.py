@@ -18,7 +18,7 @@ from ..base.words import counted
 from ..sensor import Pose, Track
 from . import colours as coloured
 from .actors import Actor
-from .colours import Colours
+from .colours import Colours, within
 from .instances import Instance, Instances, Part, parts_of
 from .mesh import Cutout, Mesh, points_array, stacked
 from .meshfile import Objects, Opacity, load_objects
@@ -88,9 +88,9 @@ class Scene:
         (origin,) = points_array("the scene's origin", [as_array("origin", self.origin)])
         if faces.ndim != 2 or faces.shape[1:] != (3,) or not (len(faces) or self.instances):
             raise LidarpoolError(f"A scene needs triangles, faces of (f, 3), not {faces.shape}.")
-        if not _within(faces, len(vertices)):
+        if not within(faces, len(vertices)):
             raise LidarpoolError(f"Faces must name the {len(vertices)} vertices, from 0 up.")
-        if owners.shape != faces.shape[:1] or not _within(owners, len(self.names)):
+        if owners.shape != faces.shape[:1] or not within(owners, len(self.names)):
             raise LidarpoolError(
                 f"face_object must give one of the {len(self.names)} objects, from 0 up, for "
                 f"each of the {len(faces)} faces."
@@ -484,10 +484,6 @@ class Scene:
         if (shared := self.instances) is not None:
             np.maximum.at(reach, shared.owner, shared.reach(centres[shared.owner]))
         return np.column_stack([centres, reach])
-
-
-def _within(numbers: Ints32, count: int) -> bool:
-    return not numbers.size or bool(numbers.min() >= 0 and numbers.max() < count)
 
 
 def local_origin(vertices: Floats) -> Floats:

@@ -57,9 +57,8 @@ class _Object:
     components: list[_Placement] = field(default_factory=list)
     # Group of colours, and number in it, of triangles that name none.
     usual: tuple[str, str] = ("", "0")
-    shades: array[int] = field(
-        default_factory=lambda: array("B")
-    )  # of corners, where they are read
+    # Of corners, where they are read.
+    shades: array[int] = field(default_factory=lambda: array("B"))
 
     @cached_property
     def meshes(self) -> list[Mesh]:

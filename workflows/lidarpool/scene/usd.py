@@ -255,9 +255,8 @@ def _content(
         content.skipped += found.skipped
         if found.meshes:
             shared = [one.mesh for one in found.meshes if isinstance(one, Instance)]
-            allowance.take(
-                sum(80 * len(mesh.faces) for mesh in shared)
-            )  # an actor has no instances
+            # An actor has no instances.
+            allowance.take(sum(80 * len(mesh.faces) for mesh in shared))
             turns = places[:, :, :3] @ np.linalg.inv(stretch)
             times = (motion[:, 0] - frame["start"]) / frame["rate_hz"]
             if not (np.abs(times) < _LATEST_S).all():

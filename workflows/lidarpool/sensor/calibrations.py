@@ -55,10 +55,7 @@ def read_calibration(path: Path) -> Calibration:
         If it is none of these, or numbers are missing, not finite or in the wrong order.
     """
     try:
-        check_fits(path)
-        text = path.read_text("utf-8-sig")
-        if not text.strip():
-            raise ValueError("it is empty")
+        text = text_of(path)
         if path.suffix.lower() in (".yaml", ".yml"):
             return _velodyne(path.name, load_yaml(text))
         if path.suffix.lower() == ".json":
@@ -66,6 +63,15 @@ def read_calibration(path: Path) -> Calibration:
         return _table(path.name, text)
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable calibration: {said(error)}") from error
+
+
+def text_of(path: Path) -> str:
+    """Read a text file; ValueError if it is empty, and as `check_fits`."""
+    check_fits(path)
+    text = path.read_text("utf-8-sig")
+    if not text.strip():
+        raise ValueError("it is empty")
+    return text
 
 
 def said(error: Exception) -> str:

@@ -97,20 +97,17 @@ class Material:
         bool, told("whether light returns in its own direction, as from traffic signs")
     ] = False
     transparent: Annotated[
-        Transparent,
-        told("the rest of the light passes through (pass), or is reflected (mirror)"),
+        Transparent, told("the rest of the light passes through (pass), or is reflected (mirror)")
     ] = "none"
     scale: Annotated[
-        float,
-        told("with reflectance: texture, a factor of the luminance", gt=0, le=100),
+        float, told("with reflectance: texture, a factor of the luminance", gt=0, le=100)
     ] = 1.0
     material: Annotated[
         str | None,
         told("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
     ] = None
     roughness: Annotated[
-        float | None,
-        told("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1),
+        float | None, told("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1)
     ] = None
     metalness: Annotated[
         Share, told("with roughness: 1 for metals, which scatter by their gloss alone")
@@ -126,8 +123,7 @@ class Material:
         ),
     ] = None
     attenuation_per_m: Annotated[
-        float,
-        told("with refractive_index, extinction within the surface", ge=0, le=1e6),
+        float, told("with refractive_index, extinction within the surface", ge=0, le=1e6)
     ] = 0.0
     leaf_area_density: Annotated[
         float | None,

@@ -24,7 +24,7 @@ from pydantic import Field, Strict
 
 from ..base.arguments import checked_fields
 from ..base.arrays import Floats, Ints
-from ..base.declared import Seed, written_as
+from ..base.declared import Seed, told, written_as
 from ..base.errors import LidarpoolError
 from .noise import Purpose, named_seed, normal
 from .trajectory import CENTRE, Pose, Trajectory, velocities
@@ -36,6 +36,10 @@ Longitude = Annotated[float, Field(ge=-360, le=360)]
 Place = Annotated[
     tuple[Latitude, Longitude, Annotated[float, Field(ge=-1e5, le=1e6)]], Strict(False)
 ]
+TurnNoise = Annotated[float, Field(ge=0, le=100)]  # of a gyroscope
+SpeedNoise = Annotated[float, Field(ge=0, le=1000)]  # of an accelerometer
+Deviation = Annotated[float, Field(ge=0, le=1e6)]  # metres
+Correlation = Annotated[float, Field(ge=0.001, le=1e9)]  # seconds
 
 
 @dataclass(frozen=True)
@@ -53,44 +57,27 @@ class Imu:
     """
 
     rate_hz: Annotated[
-        float, Field(ge=0.001, le=100_000, description="samples a second; update_rate of kalibr")
+        float, told("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
     ] = 200.0
     mount: Pose = CENTRE
-    gyroscope_noise_density: Annotated[
-        float, Field(ge=0, le=100, description="angle random walk, rad/s/sqrt(Hz)")
-    ] = 0.0
+    gyroscope_noise_density: Annotated[TurnNoise, told("angle random walk, rad/s/sqrt(Hz)")] = 0.0
     gyroscope_bias: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=100,
-            description="standard deviation of a bias that wanders about zero (Gauss-Markov of "
-            "first order), rad/s",
+        TurnNoise,
+        told(
+            "standard deviation of a bias that wanders about zero (Gauss-Markov of "
+            "first order), rad/s"
         ),
     ] = 0.0
-    gyroscope_bias_time_s: Annotated[
-        float, Field(ge=0.001, le=1e9, description="its correlation time")
-    ] = 300.0
-    gyroscope_random_walk: Annotated[
-        float, Field(ge=0, le=100, description="of the bias, rad/s^2/sqrt(Hz)")
-    ] = 0.0
+    gyroscope_bias_time_s: Annotated[Correlation, told("its correlation time")] = 300.0
+    gyroscope_random_walk: Annotated[TurnNoise, told("of the bias, rad/s^2/sqrt(Hz)")] = 0.0
     accelerometer_noise_density: Annotated[
-        float, Field(ge=0, le=1000, description="velocity random walk, m/s^2/sqrt(Hz)")
+        SpeedNoise, told("velocity random walk, m/s^2/sqrt(Hz)")
     ] = 0.0
     accelerometer_bias: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=1000,
-            description="standard deviation of a bias that wanders about zero, m/s^2",
-        ),
+        SpeedNoise, told("standard deviation of a bias that wanders about zero, m/s^2")
     ] = 0.0
-    accelerometer_bias_time_s: Annotated[
-        float, Field(ge=0.001, le=1e9, description="its correlation time")
-    ] = 300.0
-    accelerometer_random_walk: Annotated[
-        float, Field(ge=0, le=1000, description="of the bias, m/s^3/sqrt(Hz)")
-    ] = 0.0
+    accelerometer_bias_time_s: Annotated[Correlation, told("its correlation time")] = 300.0
+    accelerometer_random_walk: Annotated[SpeedNoise, told("of the bias, m/s^3/sqrt(Hz)")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -106,33 +93,28 @@ class Gnss:
         If a number is outside its range.
     """
 
-    rate_hz: Annotated[float, Field(ge=0.0001, le=1000, description="positions a second")] = 10.0
+    rate_hz: Annotated[float, told("positions a second", ge=0.0001, le=1000)] = 10.0
     mount: Pose = CENTRE
     horizontal_m: Annotated[
-        float,
-        Field(ge=0, le=1e6, description="standard deviation of white noise to the east and north"),
+        Deviation, told("standard deviation of white noise to the east and north")
     ] = 0.0
-    vertical_m: Annotated[float, Field(ge=0, le=1e6, description="the same, up")] = 0.0
+    vertical_m: Annotated[Deviation, told("the same, up")] = 0.0
     drift_horizontal_m: Annotated[
-        float,
-        Field(
-            ge=0,
-            le=1e6,
-            description="standard deviation of an error that drifts (Gauss-Markov of first order), "
-            "to the east and north",
+        Deviation,
+        told(
+            "standard deviation of an error that drifts (Gauss-Markov of first order), "
+            "to the east and north"
         ),
     ] = 0.0
-    drift_vertical_m: Annotated[float, Field(ge=0, le=1e6, description="the same, up")] = 0.0
-    drift_time_s: Annotated[
-        float, Field(ge=0.001, le=1e9, description="correlation time of the drift")
-    ] = 600.0
+    drift_vertical_m: Annotated[Deviation, told("the same, up")] = 0.0
+    drift_time_s: Annotated[Correlation, told("correlation time of the drift")] = 600.0
     origin: Annotated[
         tuple[float, float, float] | None,
         written_as(Place | None),
-        Field(
-            description="latitude and longitude, degrees, and ellipsoidal height, metres, of the "
+        told(
+            "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
             "world's zero, x to the east and y to the north; by default by cloud.epsg",
-            examples=[[48.7758, 9.1829, 290.0]],
+            [48.7758, 9.1829, 290.0],
         ),
     ] = None
 
@@ -166,9 +148,9 @@ class Navigation:
     imu: Imu | None = None
     gnss: Gnss | None = None
     gravity_m_s2: Annotated[
-        float, Field(ge=-100, le=100, description="gravity, downwards along the world's z axis")
+        float, told("gravity, downwards along the world's z axis", ge=-100, le=100)
     ] = 9.80665
-    seed: Annotated[Seed, Field(description="the same seed gives the same errors")] = 0
+    seed: Annotated[Seed, told("the same seed gives the same errors")] = 0
 
 
 class Moving(Protocol):
@@ -294,8 +276,7 @@ def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Flo
         turns = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
     speeds, rates = velocities(path, 0, times_ns)
     levers = np.einsum("nij,j->ni", turns, np.array(mount.position))
-    own = np.eye(3) if mount.rotation is None else mount.rotation
-    return places + levers, turns @ own, speeds + np.cross(rates, levers)
+    return places + levers, turns @ mount.turn, speeds + np.cross(rates, levers)
 
 
 def _rotation_vectors(before: Floats, after: Floats) -> Floats:

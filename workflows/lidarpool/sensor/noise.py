@@ -15,6 +15,7 @@ from typing import Annotated
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
+from pydantic import Field
 
 from ..base.arguments import checked_fields
 from ..base.arrays import Bools, Floats, Indices, Integers
@@ -26,6 +27,8 @@ from .materials import at_right_angles
 THRESHOLD_SIGMAS = 5.0
 TARGET_REFLECTANCE = 0.1  # reflectance of stated ranges
 ALARMS_MOST = 20  # false alarms of a pulse on average: a ray has numbers for 255
+
+Metres = Annotated[float, Field(ge=0, le=1000)]
 
 _GAMMA = 0x9E3779B97F4A7C15
 _NUMBERS = 256  # of one ray
@@ -81,17 +84,12 @@ class Noise:
         If a number is outside its range, or needs a detection range and there is none.
     """
 
-    range_m: Annotated[
-        float,
-        told("standard deviation of ranges, metres", 0.02, ge=0, le=1000),
-    ] = 0.0
+    range_m: Annotated[Metres, told("standard deviation of ranges, metres", 0.02)] = 0.0
     range_per_m: Annotated[
-        float,
-        told("standard deviation added for each metre of range", 0.0002, ge=0, le=1),
+        float, told("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
-        float,
-        told("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10),
+        float, told("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10)
     ] = 0.0
     dropout: Annotated[Share, told("share of returns that are lost, whatever their energy")] = 0.0
     detection_range_m: Annotated[
@@ -106,22 +104,18 @@ class Noise:
     ] = None
     seed: Annotated[Seed, told("the same seed gives the same noise")] = 0
     overlap_m: Annotated[
-        float,
+        Metres,
         told(
             "from here on the receiver sees the whole beam; nearer, rain, snow, fog "
-            "and dust do not return more",
-            ge=0,
-            le=1000,
+            "and dust do not return more"
         ),
     ] = 10.0
     range_at_threshold_m: Annotated[
-        float,
+        Metres,
         told(
             "standard deviation of the range of a return at the threshold of "
             "detection, metres; falls as its energy grows, added in squares",
             0.05,
-            ge=0,
-            le=1000,
         ),
     ] = 0.0
     walk_m: Annotated[

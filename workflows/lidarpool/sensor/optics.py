@@ -53,8 +53,7 @@ class Optics:
         float, told("of the laser; 905 if no source states it", ge=200, le=20_000)
     ] = 905.0
     divergence_mrad: Annotated[
-        Divergence | None,
-        told("full angle of the beam, or two, across and up; None if unknown"),
+        Divergence | None, told("full angle of the beam, or two, across and up; None if unknown")
     ] = None
     pulse_ns: Annotated[Pulse, told("length of a pulse")] = 5.0
     resolution_m: Annotated[
@@ -84,8 +83,7 @@ class Returns:
     """
 
     mode: Annotated[
-        Mode,
-        told("returns reported for a pulse; dual: strongest and last", "dual"),
+        Mode, told("returns reported for a pulse; dual: strongest and last", "dual")
     ] = "strongest"
     subrays: Annotated[
         Literal[SUBRAYS],  # type: ignore[valid-type]

@@ -360,7 +360,7 @@ class Survey(CloudOptions, Weather):
                 f"A scan would have {rays:,} rays, more than {RAYS_MOST:,}: make step_deg smaller, "
                 "or take fewer rays."
             )
-        lasts = _begin_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
+        lasts = begin_ns(sensor, sensor.firings(steps - 1)[1]) * self.path.stations
         if not lasts < LASTS_MOST_NS:
             raise LidarpoolError(
                 f"The survey would last {lasts / 1e9:.3g} s, and times are counted in nanoseconds "
@@ -462,7 +462,7 @@ class Survey(CloudOptions, Weather):
     def station_ns(self) -> int:
         """Duration of a station: until the last sensor is done."""
         return max(
-            round(_begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
+            round(begin_ns(carried.sensor, carried.sensor.firings(steps - 1)[1]))
             for carried, steps in zip(self.carried, self.steps_each, strict=True)
         )
 
@@ -495,7 +495,7 @@ class Survey(CloudOptions, Weather):
         """Start of scan `index`, nanoseconds since the survey's start."""
         spec = self.scan(index)
         sensor = self.carried[spec.sensor].sensor
-        return spec.start_ns + _begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
+        return spec.start_ns + begin_ns(sensor, spec.firings[0]) + sensor.lead_ns
 
 
 def _check_alarms(noise: Noise, sensor: Sensor) -> None:
@@ -512,13 +512,14 @@ def _check_alarms(noise: Noise, sensor: Sensor) -> None:
         )
 
 
-def _begin_ns(sensor: Sensor, firing: int) -> float:
+def begin_ns(sensor: Sensor, firing: int) -> float:
+    """Start of a firing, nanoseconds since that of the station."""
     return float(sensor.begins_ns(np.array([firing], np.int64))[0])
 
 
 def _end_ns(sensor: Sensor, steps: int) -> float:
     """Start of the last firing of so many time steps."""
-    return _begin_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
+    return begin_ns(sensor, sensor.firings(steps - 1)[1] - 1) + sensor.lead_ns
 
 
 def _poses(given: Sequence[Any]) -> tuple[Pose, ...]:

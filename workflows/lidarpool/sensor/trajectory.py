@@ -8,11 +8,10 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from pydantic import Field
 
 from ..base.arguments import as_array, checked_fields, shown
 from ..base.arrays import Bools, Floats, Indices
-from ..base.declared import Angle, Triple, written_as
+from ..base.declared import Angle, Triple, told, written_as
 from ..base.errors import LidarpoolError
 from .spline import knots_of, on_curve
 
@@ -36,12 +35,10 @@ class Pose:
     Angles are in degrees, in aerospace order.
     """
 
-    position: Annotated[
-        tuple[float, float, float], written_as(Triple), Field(description="x, y and z, metres")
-    ]
-    yaw_deg: Annotated[Angle, Field(description="rotation about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, Field(description="rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[Angle, Field(description="rotation about the new x, last")] = 0.0
+    position: Annotated[tuple[float, float, float], written_as(Triple), told("x, y and z, metres")]
+    yaw_deg: Annotated[Angle, told("rotation about z, first")] = 0.0
+    pitch_deg: Annotated[Angle, told("rotation about the new y, second")] = 0.0
+    roll_deg: Annotated[Angle, told("rotation about the new x, last")] = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(map(float, self.position)))
@@ -56,13 +53,17 @@ class Pose:
             return None
         return rotations_of(np.array([self.yaw_deg, self.pitch_deg, self.roll_deg]))
 
+    @property
+    def turn(self) -> Floats:
+        """`rotation`; the identity matrix without one."""
+        return np.eye(3) if self.rotation is None else self.rotation
+
     def then(self, mount: Pose) -> Pose:
         """Pose of something mounted at `mount` in the axes of this one."""
         if mount == CENTRE:
             return self
-        eye = np.eye(3)
-        one, other = (eye if p.rotation is None else p.rotation for p in (self, mount))
-        return Pose.of(self.position + one @ mount.position, one @ other)
+        turn = self.turn
+        return Pose.of(self.position + turn @ mount.position, turn @ mount.turn)
 
     @classmethod
     def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:

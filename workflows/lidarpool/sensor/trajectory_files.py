@@ -15,7 +15,7 @@ from ..base.allowance import check_fits
 from ..base.arguments import checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
-from .calibrations import said
+from .calibrations import said, text_of
 from .trajectory import Beyond, Track, quaternions_of, rotations_of
 
 TrajectoryFormat = Literal["tum", "kitti", "csv"]
@@ -73,11 +73,9 @@ def load_trajectory(
     path = Path(path)
     kind = format or ("kitti" if times else "csv" if path.suffix.lower() == ".csv" else "tum")
     try:
-        for file in (path, Path(times)) if times else (path,):
-            check_fits(file)
-        text = path.read_text("utf-8-sig")
-        if not text.strip():
-            raise ValueError("it is empty")
+        text = text_of(path)
+        if times:
+            check_fits(Path(times))
         if kind == "csv":
             seconds, places, turns = _table(text, dict(columns or {}))
         elif kind == "kitti":

@@ -64,8 +64,7 @@ class Weather:
     ] = None
     rain_mm_h: Annotated[float, told("rain; drops return light, and take some", ge=0, le=300)] = 0.0
     snow_mm_h: Annotated[
-        float,
-        told("dry snow, melted; flakes return light, and take some", ge=0, le=50),
+        float, told("dry snow, melted; flakes return light, and take some", ge=0, le=50)
     ] = 0.0
     dust_mg_m3: Annotated[
         float, told("mineral dust; it returns light, and takes some", ge=0, le=1e5)

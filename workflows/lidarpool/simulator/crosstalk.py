@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,7 @@ from ..base.arrays import Floats, Indices, Ints, Ints32
 from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
+from ..sensor.survey import begin_ns
 from .motion import Clock, Poses, into_axes, products, turned
 from .surfaces import Surfaces
 from .world import World
@@ -184,13 +186,6 @@ def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:
 
 def _fired_in(sensor: Sensor, steps: int, span: tuple[float, float]) -> tuple[int, int]:
     """First firing within a span of time, and one past the last."""
-    last = range(sensor.firings(steps - 1)[1])
-
-    def begins(firing: int) -> float:
-        return float(sensor.begins_ns(np.array([firing], np.int64))[0])
-
-    slowest = float(sensor.beams.time_ns.max())
-    return (
-        bisect_left(last, span[0] - slowest, key=begins),
-        bisect_left(last, span[1], key=begins),
-    )
+    last, begins = range(sensor.firings(steps - 1)[1]), partial(begin_ns, sensor)
+    early = span[0] - float(sensor.beams.time_ns.max())  # its slowest beam is in the span
+    return bisect_left(last, early, key=begins), bisect_left(last, span[1], key=begins)

@@ -284,23 +284,16 @@ class EchoCaster:
         kept = place % self._survey.keep_every == 0
         thinned = returns.take(kept)
         amplitude = None if thinned.width is None else self._heights(thinned).energy
+        own = thinned._asdict() | {"ray": thinned.ray.astype(np.uint32)}
         return Echoes(
-            ray=thinned.ray.astype(np.uint32),
-            distance=thinned.distance,
-            triangle=thinned.triangle,
+            **own,
             hits=np.diff(cuts),
             tally=self._tally(returns.triangle) if tally else None,
             instance=np.zeros(len(thinned.ray), np.int32),
-            energy=thinned.energy,
             number=np.minimum(number[kept] + 1, 255).astype(np.uint8),
             returns=np.minimum(each[kept], 255).astype(np.uint8),
             reported=thinned.distance,
-            colour=thinned.colour,
-            cause=thinned.cause,
-            velocity=thinned.velocity,
-            width=thinned.width,
             amplitude=amplitude,
-            waveform=thinned.waveform,
         )
 
 

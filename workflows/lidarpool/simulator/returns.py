@@ -124,6 +124,11 @@ class BatchReturns:
         return self.specs[0].start_ns + np.rint(times, out=times).astype(np.int64)
 
     @property
+    def _times(self) -> Ints:
+        """Firing times, where they matter, for actors."""
+        return self.time if self._poses.ways else np.zeros(len(self), np.int64)
+
+    @property
     def _firings(self) -> Ints:
         """All rays of the scans, with and without returns."""
         return np.arange(self.specs[0].firings[0], self.specs[-1].firings[1])
@@ -247,9 +252,7 @@ class BatchReturns:
 
         It means nothing where there is no surface.
         """
-        ways = self._poses.ways
-        times = self.time if ways else np.zeros(len(self), np.int64)
-        normals = self._surfaces.normals(self.found.triangle, times, ways)
+        normals = self._surfaces.normals(self.found.triangle, self._times, self._poses.ways)
         return np.abs(products(normals.T, self.directions.T))
 
     @cached_property
@@ -268,12 +271,10 @@ class BatchReturns:
         """Packed colours."""
         if self.found.colour is not None:
             return self.found.colour
-        ways = self._poses.ways
-        times = self.time if ways else np.zeros(len(self), np.int64)
         points = self.positions
         if self.found.reported is not self.found.distance:
             points = self.directions * self.found.distance[:, None] + self._rays[0]
-        return self._surfaces.colours(self.found.triangle, points, times, ways)
+        return self._surfaces.colours(self.found.triangle, points, self._times, self._poses.ways)
 
     @property
     def red(self) -> Bytes:
@@ -302,7 +303,6 @@ class BatchReturns:
         """How fast the range grows, m/s, with noise; NaN of what no light returned from."""
         found, velocity = self.found, self.found.velocity
         if velocity is None:
-            times = self.time if self._poses.ways else np.zeros(len(self), np.int64)
             velocity = radial_velocities(
                 self._surfaces,
                 self._poses,
@@ -310,7 +310,7 @@ class BatchReturns:
                 self._rays,
                 found.distance,
                 found.triangle,
-                times,
+                self._times,
             )
             if found.cause is not None:
                 no_light = (found.cause >= FALSE_ALARM) & (found.triangle == NO_SURFACE)

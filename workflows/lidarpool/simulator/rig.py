@@ -140,13 +140,12 @@ class Rig:
         """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
         firings = np.arange(first, stop, dtype=np.int64)
         carried = self.survey.carried[number]
-        directions = carried.sensor.directions(firings).reshape(-1, 3)
-        origins = carried.sensor.origins(firings)
-        origins = None if origins is None else origins.reshape(-1, 3)
-        directions = turned(directions, carried.mount.rotation)
-        origins = None if origins is None else turned(origins, carried.mount.rotation)
-        if any(carried.mount.position):
-            origins = np.add(np.zeros(3) if origins is None else origins, carried.mount.position)
+        mount, origins = carried.mount, carried.sensor.origins(firings)
+        directions = turned(carried.sensor.directions(firings).reshape(-1, 3), mount.rotation)
+        if origins is not None:
+            origins = turned(origins.reshape(-1, 3), mount.rotation)
+        if any(mount.position):
+            origins = np.add(np.zeros(3) if origins is None else origins, mount.position)
         return Pattern(directions, origins)
 
     def cast(self, first: int, stop: int) -> Iterator[BatchReturns | DeviceReturns]:

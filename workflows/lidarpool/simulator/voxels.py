@@ -81,28 +81,14 @@ class Grids:
         Metres to that leaf (n,), inf if there is none; what is left of `left` (n,), -inf if there
         is a leaf; and optical depths for each metre of the grids there (n, k).
         """
+        if len(left) > BLOCK_RAYS:
+            given: tuple[Any, ...] = which, starts, ways, crossing, even, length, left
+            blocks = (slice(k, k + BLOCK_RAYS) for k in range(0, len(left), BLOCK_RAYS))
+            found = [self.through(*(values[block] for values in given)) for block in blocks]
+            metres, rest, there = map(np.concatenate, zip(*found, strict=True))
+            return metres, rest, there
         metres, rest = np.full(len(left), np.inf), np.full(len(left), -np.inf)
         there = np.zeros(which.shape)
-        for begin in range(0, len(left), BLOCK_RAYS):
-            b = slice(begin, begin + BLOCK_RAYS)
-            given = which[b], starts[b], ways[b], crossing[b], even[b], length[b], left[b]
-            self._through(*given, metres[b], rest[b], there[b])
-        return metres, rest, there
-
-    def _through(
-        self,
-        which: Indices,
-        starts: Floats,
-        ways: Floats,
-        crossing: Floats,
-        even: Floats,
-        length: Floats,
-        left: Floats,
-        metres: Floats,
-        rest: Floats,
-        there: Floats,
-    ) -> None:
-        """Do it for a block, and write what was found into the last three."""
         back = self._back[which].transpose(2, 3, 1, 0)  # (axis, axis, k, n)
         x, y, z = (starts[:, None] - self._origins[which]).transpose(2, 1, 0)
         u, v, w = ways.T[:, None]
@@ -150,6 +136,7 @@ class Grids:
                 ahead, even, left, length = (a[on] for a in (ahead, even, left, length))
             cell = np.where(border <= ahead, cell + step, cell)
             at = np.maximum(ahead, 0)  # the first may be before the start, by rounding
+        return metres, rest, there
 
     def _density(self, cell: Floats, size: Floats, first: Any) -> tuple[Floats, Bools]:
         """Densities of voxels (3, k, n), and whether they are in their grids: (k, n)."""

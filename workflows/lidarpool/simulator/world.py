@@ -335,7 +335,7 @@ class _Shape:
     """A mesh of actors with its ray caster, and the bounding sphere of its vertices."""
 
     def __init__(self, mesh: ActorMesh, options: dict[str, Any]) -> None:
-        parts = parts_of(mesh)
+        parts = [*parts_of(mesh)]
         self._caster = RayCaster.of([Instance(_mesh_of(part)) for part in parts], **options)
         sizes = [len(part.faces) for part in parts]
         self._parts = np.cumsum([0, *sizes[:-1]]).astype(np.int32)
