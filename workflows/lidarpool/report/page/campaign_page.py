@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from markupsafe import Markup
@@ -12,8 +10,7 @@ from markupsafe import Markup
 from ...base.words import counted
 from ...export.jobs import Value
 from ..campaign_figures import CampaignInfo, Figures
-from .page import OBJECTS_MOST, STAGES, Bar, environment
-from .timeline import make_timeline
+from .page import OBJECTS_MOST, Bar, environment, of_tasks
 from .words import bound, duration, large, share
 
 FAILED_SHOWN, FAILED_FEW = 100, 8  # all of them, and those that are open at first
@@ -32,15 +29,12 @@ def campaign_page(
     """
     pages = environment()
     pages.filters["told"] = told
-    ordered = sorted(info.stages, key=lambda stage: list(STAGES).index(stage.stage))
-    begun = min((stage.start for stage in ordered), default=math.inf)
     bars, rest = class_bars(info, figures)
     splits = figures.splits if any(figures.splits) else {}
     return pages.get_template("campaign.html").render(
         report=report,
         info=info,
         title=info.title,
-        begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
         summary=summary(info, figures),
         facts=list(_facts(info, figures)),
         pictures=[(Markup(image), caption) for image, caption in pictures],
@@ -54,9 +48,7 @@ def campaign_page(
         sensors=[(name or "model", words) for name, words in info.sensors.items()],
         command=info.file,
         most=VALUES_SHOWN,
-        stages=ordered,
-        names=STAGES,
-        timeline=make_timeline(ordered, info.records, STAGES),
+        **of_tasks(info.stages, info.records),
     )
 
 
