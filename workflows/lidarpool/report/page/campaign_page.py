@@ -10,8 +10,8 @@ from markupsafe import Markup
 from ...base.words import counted
 from ...export.jobs import Value
 from ..campaign_figures import CampaignInfo, Figures
-from .page import OBJECTS_MOST, Bar, environment, of_tasks
-from .words import bound, duration, large, share
+from .page import Bar, bars_of, environment, of_tasks
+from .words import bound, duration, large
 
 FAILED_SHOWN, FAILED_FEW = 100, 8  # all of them, and those that are open at first
 VALUES_SHOWN = 12  # of a quantity with labels
@@ -81,16 +81,8 @@ def _facts(info: CampaignInfo, figures: Figures) -> Iterator[tuple[str, str]]:
 
 def class_bars(info: CampaignInfo, figures: Figures) -> tuple[list[Bar], str]:
     """Bars of the classes with the most points, and a sentence about the others."""
-    total, ranked = sum(figures.classes.values()), figures.classes.most_common()
-    most = ranked[0][1] if ranked else 1
-    names = {number: class_name(info, number) for number, _ in ranked}
-    shown = ranked[:OBJECTS_MOST]
-    bars = [Bar(names[k], names[k], n, share(n, total), 100 * n / most) for k, n in shown]
-    if not (others := ranked[OBJECTS_MOST:]):
-        return bars, ""
-    points = sum(count for _, count in others)
-    more = counted(len(others), "more class", "more classes")
-    return bars, f"{more} with {counted(points, 'point')} ({share(points, total)})"
+    named = [(class_name(info, k), n) for k, n in figures.classes.most_common()]
+    return bars_of([(name, name, n) for name, n in named], "more class", "more classes")
 
 
 def class_name(info: CampaignInfo, number: int) -> str:

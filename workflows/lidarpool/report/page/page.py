@@ -115,22 +115,28 @@ def _written(scenario: Scenario) -> str:
 
 def _object_bars(counts: Mapping[str, int]) -> tuple[list[Bar], str]:
     """Bars of the objects with the most points, and a sentence about the others."""
-    total, ranked = sum(counts.values()), sorted(counts.items(), key=lambda item: -item[1])
-    hit = [item for item in ranked if item[1]]
-    shown = hit[:OBJECTS_MOST]
-    most = shown[0][1] if shown else 1
     labels = dict(zip(counts, without_common_prefix(list(counts)), strict=True))
-    bars = [Bar(name, labels[name], n, share(n, total), 100 * n / most) for name, n in shown]
-    rest = []
-    if more := hit[OBJECTS_MOST:]:
-        points = sum(count for _, count in more)
-        rest.append(
-            f"{counted(len(more), 'more object')} with {counted(points, 'point')} "
-            f"({share(points, total)})"
-        )
-    if missed := len(ranked) - len(hit):
-        rest.append(f"{counted(missed, 'object')} without points")
-    return bars, "; ".join(rest)
+    ranked = sorted(counts.items(), key=lambda item: -item[1])
+    bars, rest = bars_of([(name, labels[name], n) for name, n in ranked if n], "more object")
+    if missed := sum(not n for n in counts.values()):
+        rest += "; " if rest else ""
+        rest += f"{counted(missed, 'object')} without points"
+    return bars, rest
+
+
+def bars_of(
+    ranked: Sequence[tuple[str, str, int]], more: str, several: str = ""
+) -> tuple[list[Bar], str]:
+    """Bars of the first of (name, label, points), and a sentence about `more` of them."""
+    total = sum(points for *_, points in ranked)
+    bars = [
+        Bar(name, label, points, share(points, total), 100 * points / ranked[0][2])
+        for name, label, points in ranked[:OBJECTS_MOST]
+    ]
+    if not (others := [points for *_, points in ranked[OBJECTS_MOST:]]):
+        return bars, ""
+    told = f"{counted(len(others), more, several)} with {counted(sum(others), 'point')}"
+    return bars, f"{told} ({share(sum(others), total)})"
 
 
 def environment() -> Environment:
