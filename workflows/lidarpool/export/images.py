@@ -16,7 +16,6 @@ from ..base.arrays import AnyArray, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor import Sensor
-from ..sensor.trajectory import matrices
 from . import pieces, reading
 from .boxes import Boxes
 from .pieces import Entry
@@ -128,9 +127,7 @@ class Pieces(pieces.Pieces):
                 if (key := _key(name, plane)) in arrays:
                     raise LidarpoolError(f"Two arrays of an image would be {key!r}: rename one.")
                 arrays[key] = made
-        arrays["pose"] = pose = np.eye(4)
-        pose[:3, :3] = matrices(sweeps.pose.quaternions[number, None])[0]
-        pose[:3, 3] = sweeps.pose.positions[number]
+        arrays["pose"] = sweeps.pose.matrix(number)
         memory = io.BytesIO()
         np.savez_compressed(memory, **arrays)
         boxes = Boxes.of(sweeps, number, points) if sweeps.actors and self.entry else None

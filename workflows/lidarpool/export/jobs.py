@@ -8,6 +8,7 @@ its type: ``12``, ``0.5``, ``true``; text stands as it is unless it looks like o
 
 from __future__ import annotations
 
+import codecs
 import csv
 import hashlib
 import json
@@ -47,6 +48,8 @@ _TAIL = {
     "sha256": str,
 }
 _CLASS = re.compile(r"class_(\d+)", re.ASCII)
+_UTF8 = codecs.getwriter("utf-8")
+_ESCAPED = "backslashreplace"  # of text that may hold parts of names that are no UTF-8
 # Before the name of a varied value that would look like another column.
 _VARIED = "varied."
 
@@ -199,7 +202,7 @@ def write_table(place: Storage, names: Sequence[str], jobs: Iterable[JobRow]) ->
         classes, kinds = _spool(spooled, names, jobs)
         header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes)]
         with place.writing(TABLE_FILE) as file:
-            writer = csv.writer(_Utf8(file), lineterminator="\n")
+            writer = csv.writer(_UTF8(file, _ESCAPED), lineterminator="\n")
             writer.writerow(header)
             for row in _unspooled(spooled):
                 writer.writerow(_cells(row, names, classes))
@@ -277,21 +280,6 @@ def _unspooled(file: IO[bytes]) -> Iterator[JobRow]:
             yield pickle.load(file)  # noqa: S301 - this process wrote it
         except EOFError:
             return
-
-
-class _Utf8:
-    """What csv.writer writes to."""
-
-    def __init__(self, file: IO[bytes]) -> None:
-        self.file = file
-
-    def write(self, text: str) -> None:
-        self.file.write(_encoded(text))
-
-
-def _encoded(text: str) -> bytes:
-    """Encode text, which may hold parts of names that are no UTF-8."""
-    return text.encode("utf-8", "backslashreplace")
 
 
 def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterator[str]:
@@ -393,7 +381,8 @@ def _write_parquet(
             plain = _plain(value)
             # An older pyarrow refuses whole numbers beyond 2^53 as floats.
             return float(plain) if types[name] == pa.float64() and value is not None else plain
-        return _encoded(value if isinstance(value, str) else json.dumps(_plain(value))).decode()
+        text = value if isinstance(value, str) else json.dumps(_plain(value))
+        return text.encode("utf-8", _ESCAPED).decode()
 
     with pq.ParquetWriter(file, schema) as writer:
         while group := list(islice(rows, ROW_GROUP)):

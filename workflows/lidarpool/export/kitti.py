@@ -97,7 +97,8 @@ class Reader(reading.Reader):
         rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 4)
         file = self._file(sweep, "labels", "label")
         labels = self.rows(file, np.dtype("<u4"))
-        reading.checked_length(len(labels), len(rows), file)
+        if len(labels) != len(rows):
+            raise ValueError(f"{file} has {len(labels):,} points, not {len(rows):,}")
         return np.ascontiguousarray(rows[:, :3]), {
             "intensity": np.ascontiguousarray(rows[:, 3]),
             "class": labels.astype(np.uint16),
@@ -149,7 +150,8 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
     places = sweeps.pose.inward(sweep, boxes.centres) @ camera.T
     places[:, 1] += boxes.sizes[:, 2] / 2
     around = np.arctan2(-ahead[:, 2], ahead[:, 0])
-    seen = _wrapped(around - np.arctan2(places[:, 0], places[:, 2]))
+    seen = around - np.arctan2(places[:, 0], places[:, 2])
+    seen = np.angle(np.exp(1j * seen))  # between -pi and pi
     lines = []
     for actor in np.flatnonzero(boxes.points):
         length, width, height = boxes.sizes[actor]
@@ -157,8 +159,3 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
         numbers = " ".join(f"{value:.4f}" for value in values)
         lines.append(f"{type_of(sweeps.actors[actor])} 0.00 3 {numbers}\n")
     return "".join(lines)
-
-
-def _wrapped(angles: Floats) -> Floats:
-    """Angles between -pi and pi."""
-    return np.angle(np.exp(1j * angles))

@@ -234,9 +234,7 @@ class _OpenJob:
             points, columns = self.reader.read(sweep)
         except Exception as error:  # libraries of five formats have many kinds
             raise _unreadable(file, error) from error
-        pose = np.eye(4)
-        pose[:3, :3] = matrices(sweeps.pose.quaternions[sweep, None])[0]
-        pose[:3, 3] = sweeps.pose.positions[sweep]
+        pose = sweeps.pose.matrix(sweep)
         return Sweep(
             job.name, job.number, job.split, job.values,
             sweeps.sensors[sweeps.sensor[sweep]], int(sweeps.numbers[sweep]),

@@ -13,7 +13,7 @@ import pyarrow.dataset
 import pyarrow.parquet as pq
 
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
-from ..columns.table import AXES, TABLE, Column
+from ..columns.table import AXES, TABLE
 from . import pieces, reading
 from .pieces import Entry
 from .sweeps import Sweeps
@@ -34,13 +34,16 @@ class Pieces(pieces.Pieces):
         super().__init__(cloud, sweeps, entry)
         self.folders = [] if entry is None else [f"points/job={entry.number}"]
         fields = [
-            pa.field(c.in_files, pa.from_numpy_dtype(kind), True, _words(c))
+            pa.field(
+                c.in_files, pa.from_numpy_dtype(kind), True, {"unit": c.unit, "meaning": c.meaning}
+            )
             for c, kind in (
                 *((axis, np.dtype(np.float64)) for axis in AXES),
                 *((column, np.dtype(column.dtype)) for column in cloud.table),
             )
         ]
-        words = {"coordinates": sweeps.coordinates, "objects": _list(sweeps)}
+        objects = "\n".join((*sweeps.objects, *sweeps.actors))  # that the column `object` counts
+        words = {"coordinates": sweeps.coordinates, "objects": objects}
         self.schema = pa.schema(fields, words)
 
     def __len__(self) -> int:
@@ -94,12 +97,3 @@ class Reader(reading.Reader):
         columns = {names.get(name, name): rows[name].to_numpy() for name in rows.column_names}
         positions = np.stack([columns.pop(axis) for axis in "xyz"], axis=1)
         return self.inside(sweep, Cloud(positions, columns))
-
-
-def _words(column: Column) -> dict[str, str]:
-    return {"unit": column.unit, "meaning": column.meaning}
-
-
-def _list(sweeps: Sweeps) -> str:
-    """Names that the column `object` counts."""
-    return "\n".join((*sweeps.objects, *sweeps.actors))

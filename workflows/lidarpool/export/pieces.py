@@ -106,7 +106,7 @@ class RangeWriter:
         None if this process does not see the folder, lacks the format's package, or after `stop`.
         """
         try:
-            pieces = self._pieces()
+            pieces = pieces_of(self.module, self.cloud, self.sweeps)
         except ImportError:
             return None
         if not self.place.sees(_MARK, self._mark):
@@ -125,7 +125,7 @@ class RangeWriter:
         LidarpoolError
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
-        pieces = self._pieces()
+        pieces = pieces_of(self.module, self.cloud, self.sweeps)
         for folder in ("", *pieces.folders):
             self.place.prepare(folder)
         count = len(pieces)
@@ -141,9 +141,6 @@ class RangeWriter:
             raise LidarpoolError(MIXED_UP)
         pieces.write_others(self.place, [more for span in spans for more in made[span][1]])
         self.place.tidy()
-
-    def _pieces(self) -> Pieces:
-        return pieces_of(self.module, self.cloud, self.sweeps)
 
 
 def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> Pieces:

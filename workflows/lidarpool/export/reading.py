@@ -69,9 +69,3 @@ def _remove(folder: Path, process: int) -> None:
     """Remove a folder, unless this is a fork of the process that made it."""
     if os.getpid() == process:
         shutil.rmtree(folder, ignore_errors=True)
-
-
-def checked_length(found: int, wanted: int, file: str) -> None:
-    """Check the number of points in a second file; ValueError names it."""
-    if found != wanted:
-        raise ValueError(f"{file} has {found:,} points, not {wanted:,}")

@@ -26,10 +26,9 @@ from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
 from ..scene.polygon_files import read_ply_columns
-from ..sensor.trajectory import matrices
 from .dataset import INDEX_FILE
 from .loader import sweeps
-from .sweeps import SWEEPS_FILE, Sweeps
+from .sweeps import SWEEPS_FILE, Placed, Sweeps
 
 KINDS = (
     "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, or a "
@@ -42,7 +41,7 @@ _POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
 _RECORD = 54  # least bytes of a variable-length record of .las
 
 Columns = Mapping[str, AnyArray]
-# Positions (n, 3), columns, and the pose of their axes in the world (3, 4); None if unknown.
+# Positions (n, 3), columns, and the pose of their axes in the world (4, 4); None if unknown.
 Read = tuple[AnyArray, Columns, Floats | None]
 
 
@@ -113,7 +112,7 @@ class Recording:
                     f"{self.name} is in the axes of its sensor, and does not say where that was: "
                     "compare it with a recording of sweeps."
                 )
-            places = places @ pose[:, :3].T + pose[:, 3]
+            places = places @ pose[:3, :3].T + pose[:3, 3]
         lights = _LIGHTS if self.light is None else (self.light,)
         rings, light = (
             next((columns[name][there] for name in names if name in columns), None)
@@ -196,8 +195,7 @@ def _of_cloud(
     def sweep(number: int) -> Read:
         at = numbers[number]
         points = next(there.points(cloud, at, at + 1))
-        pose = _pose(there.pose.positions[at], there.pose.quaternions[at])
-        return there.in_sensor(at, points.positions), points.columns, pose
+        return there.in_sensor(at, points.positions), points.columns, there.pose.matrix(at)
 
     times = there.begins_ns[numbers] + (there.start_ns or 0)
     columns = {column.name for column in cloud.table}
@@ -251,7 +249,7 @@ def _of_data_set(path: Path, name: str, sensor: str | None, light: str | None) -
 
     def read(number: int) -> Read:
         sweep = saved[number]
-        return sweep.points, sweep.columns, sweep.pose[:3]
+        return sweep.points, sweep.columns, sweep.pose
 
     return Recording(name, len(saved), read, light)
 
@@ -269,7 +267,8 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
         if len(rows) != file.metadata.points:
             raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
         columns = {name: rows[name] for name in rows.dtype.names or ()}
-        return _places(columns), columns, _pose(np.array(place), np.array([x, y, z, w]))
+        pose = Placed(np.array([place]), np.array([[x, y, z, w]])).matrix(0)
+        return _places(columns), columns, pose
 
     return Recording(name, len(files), read, light)
 
@@ -343,10 +342,6 @@ def _places(columns: Columns) -> Floats:
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its points have no {', '.join(missing)}")
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
-
-
-def _pose(place: Floats, quaternion: Floats) -> Floats:
-    return np.column_stack([matrices(quaternion[None])[0], place])
 
 
 def _need(package: str, extra: str, name: str) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from functools import cache
+from functools import cache, cached_property
 from heapq import merge
 from pathlib import Path
 from typing import Any
@@ -33,6 +33,8 @@ from .boxes import Boxes
 from .images import Image
 from .navigation import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import Placed, Sweeps, plain_names
+
+Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
 
 WORLD, CARRIER = "map", "base_link"  # frames
 _INSTRUMENTS = "imu", "gnss"
@@ -108,11 +110,10 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def _messages(
-    cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any
-) -> Iterator[tuple[str, Any, int]]:
-    """Topics, messages and times in nanoseconds, sweep by sweep."""
-    row = _row(layout, _extra({column.name for column in cloud.table}))
+def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iterator[Sent]:
+    """Messages of a cloud, sweep by sweep."""
+    held = {column.name for column in cloud.table}
+    row = _row(layout, [name for name, (_, needs) in _EXTRA.items() if needs <= held])
     field = types["sensor_msgs/msg/PointField"]
     fields = [
         field(name, offset, _KINDS[kind.str[1:]], 1)
@@ -183,22 +184,16 @@ def _instruments(sweeps: Sweeps) -> list[tuple[str, str, Placed, int]]:
 class Reader(reading.Reader):
     """Reads sweeps of a data set: intensity (0 to 1 with autoware) and channel of each point."""
 
-    def __init__(self, *given: Any) -> None:
-        super().__init__(*given)
-        self._opened: Bag | None = None
-
     def file(self, sweep: int) -> str:
         """Return the name of the job's bag."""
         return f"bags/{self.entry.name}.mcap"
 
-    @property
+    @cached_property
     def _bag(self) -> Bag:
-        if self._opened is None:
-            # AnyReader would parse the definitions of messages, which takes longer than a sweep.
-            bag = Bag(self.local(self.file(0)))
-            bag.open()
-            self._opened = bag
-        return self._opened
+        # AnyReader would parse the definitions of messages, which takes longer than a sweep.
+        bag = Bag(self.local(self.file(0)))
+        bag.open()
+        return bag
 
     def read(self, sweep: int) -> reading.Points:
         """Return the points of a sweep."""
@@ -225,8 +220,8 @@ class Reader(reading.Reader):
 
     def close(self) -> None:
         """Close the bag."""
-        if self._opened is not None:
-            self._opened.close()
+        if "_bag" in self.__dict__:
+            self._bag.close()
         super().close()
 
 
@@ -273,11 +268,6 @@ def _topic(sweeps: Sweeps, frames: list[str], sweep: int) -> str:
 
 def _start_ns(sweeps: Sweeps) -> int:
     return START_NS if sweeps.start_ns is None else sweeps.start_ns
-
-
-def _extra(columns: set[str]) -> list[str]:
-    """Names of fields that points have behind those of their layout."""
-    return [name for name, (_, needs) in _EXTRA.items() if needs <= columns]
 
 
 def _row(layout: str, extra: list[str]) -> np.dtype[np.void]:
@@ -338,6 +328,9 @@ class _Messages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
+    def _kinds(self, package: str, *names: str) -> list[Any]:
+        return [self._types[f"{package}/msg/{name}"] for name in names]
+
     def stamp(self, time_ns: int) -> Any:
         """Time of a message."""
         return self._types["builtin_interfaces/msg/Time"](*divmod(time_ns, 1_000_000_000))
@@ -348,9 +341,8 @@ class _Messages:
 
     def transforms(self, frames: list[tuple[str, str, Placed, int]], time_ns: int) -> Any:
         """Frames in others: parent, name, poses, and which of them."""
-        kind = "geometry_msgs/msg/"
-        vector, turn = self._types[f"{kind}Vector3"], self._types[f"{kind}Quaternion"]
-        transform, stamped = self._types[f"{kind}Transform"], self._types[f"{kind}TransformStamped"]
+        vector, turn = self._kinds("geometry_msgs", "Vector3", "Quaternion")
+        transform, stamped = self._kinds("geometry_msgs", "Transform", "TransformStamped")
         return self._types["tf2_msgs/msg/TFMessage"]([
             stamped(
                 self.header(parent, time_ns), name,
@@ -362,25 +354,18 @@ class _Messages:
             for parent, name, placed, which in frames
         ])  # fmt: skip
 
-    def measured(self, sweeps: Sweeps, start_ns: int) -> Iterator[tuple[str, Any, int]]:
-        """Topics, messages and times of what instruments measured, in the order of time."""
+    def measured(self, sweeps: Sweeps, start_ns: int) -> Iterator[Sent]:
+        """Messages of what instruments measured, in the order of time."""
         there = sweeps.instruments
         if there is None:
             return iter(())
         imu, gnss = _instrument_frames(sweeps)
-        return merge(
-            self._imu(there, imu, start_ns),
-            self._gnss(there, gnss, start_ns),
-            key=lambda one: one[2],
-        )
+        both = self._imu(there, imu, start_ns), self._gnss(there, gnss, start_ns)
+        return merge(*both, key=lambda one: one[2])
 
-    def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[tuple[str, Any, int]]:
-        vector, turn, imu = (
-            self._types[f"{kind}"]
-            for kind in (
-                "geometry_msgs/msg/Vector3", "geometry_msgs/msg/Quaternion", "sensor_msgs/msg/Imu"
-            )
-        )  # fmt: skip
+    def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
+        vector, turn = self._kinds("geometry_msgs", "Vector3", "Quaternion")
+        (imu,) = self._kinds("sensor_msgs", "Imu")
         unknown = np.zeros(9)
         unknown[0] = -1  # there is no orientation
         rate, force = (
@@ -396,16 +381,9 @@ class _Messages:
             )  # fmt: skip
             yield "/imu/data_raw", message, time_ns
 
-    def _gnss(
-        self, there: Instruments, frame: str, start_ns: int
-    ) -> Iterator[tuple[str, Any, int]]:
-        point, stamped, fix, status = (
-            self._types[kind]
-            for kind in (
-                "geometry_msgs/msg/Point", "geometry_msgs/msg/PointStamped",
-                "sensor_msgs/msg/NavSatFix", "sensor_msgs/msg/NavSatStatus",
-            )
-        )  # fmt: skip
+    def _gnss(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
+        point, stamped = self._kinds("geometry_msgs", "Point", "PointStamped")
+        fix, status = self._kinds("sensor_msgs", "NavSatFix", "NavSatStatus")
         variances = np.zeros(3) if there.gnss is None else np.array(there.gnss.variances)
         known = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
         for time, x, y, z, *place in there.rows(GNSS_FILE):
@@ -431,13 +409,10 @@ class _Messages:
 
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""
-        kind, types = "geometry_msgs/msg/", self._types
-        point, turn, pose, vector = (
-            types[f"{kind}{name}"] for name in ("Point", "Quaternion", "Pose", "Vector3")
-        )
-        marker = types["visualization_msgs/msg/Marker"]
+        types, names = self._types, ("Point", "Quaternion", "Pose", "Vector3")
+        point, turn, pose, vector = self._kinds("geometry_msgs", *names)
+        marker, mesh = self._kinds("visualization_msgs", "Marker", "MeshFile")
         image = types["sensor_msgs/msg/CompressedImage"]
-        mesh = types["visualization_msgs/msg/MeshFile"]
         header, none = self.header(WORLD, time_ns), np.empty(0, np.uint8)
         orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)
         always = types["builtin_interfaces/msg/Duration"](0, 0)

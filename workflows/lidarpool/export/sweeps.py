@@ -45,6 +45,13 @@ class Placed:
     positions: Floats  # (n, 3): metres, world coordinates
     quaternions: Floats  # (n, 4): x, y, z, w of the rotation from its own axes to the world's
 
+    def matrix(self, sweep: int) -> Floats:
+        """Matrix (4, 4) from its own axes at the start of a sweep to the world's."""
+        pose = np.eye(4)
+        pose[:3, :3] = matrices(self.quaternions[sweep, None])[0]
+        pose[:3, 3] = self.positions[sweep]
+        return pose
+
     def inward(self, sweep: int, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to its axes at the start of a sweep."""
         turn = matrices(self.quaternions[sweep, None])[0]

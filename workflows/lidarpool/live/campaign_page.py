@@ -16,8 +16,6 @@ from dataclasses import replace
 from queue import Empty, SimpleQueue
 from typing import Any
 
-import click
-
 from poolpart import Partition
 
 from ..base.errors import LidarpoolError
@@ -25,7 +23,7 @@ from ..export.jobs import JobRow, Value
 from ..export.sweeps import Sweeps
 from ..report.campaign_figures import Figures
 from ..report.campaign_pictures import draw_results, draw_varied
-from ..run.bars import Pace, standing_still
+from ..run.bars import standing_still
 from ..run.campaign import CampaignPage, CampaignRun, UnderWay
 from ..run.job import Job
 from ..run.progress import Progress, in_words, is_sure, time_in_words
@@ -33,43 +31,35 @@ from ..run.store import RunStore
 from ..scenario.campaign import Campaign
 from .live_points import LivePoints
 from .points import HeldPoints
-from .run_page import view_of
-from .server import PORT, Answer, Arguments, PageServer, announced, page_server
+from .run_page import LivePage, view_of
+from .server import PORT, Answer, Arguments, announced, page_server
 from .view import View
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
 READING_SHARE = 0.05  # of a core, for points of single jobs
 LOOK_EVERY_S = 5.0  # at most, for the points of another job
-ASK_EVERY_S = 2.0  # how busy the partitions are
 LIST_EVERY_S = 0.5  # jobs under way
 WATCHED_S = 10.0  # after a question somebody looks at the page
 ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST = 10, 6, 12  # rows of the table
 VIEWS_KEPT = 4  # jobs whose points are kept: a browser may show, or ask for, an earlier one
 
 
-class LiveCampaign(CampaignPage):
+class LiveCampaign(LivePage, CampaignPage):
     """Connects the run of a campaign and its page."""
 
-    page: PageServer
-
     def __init__(self, campaign: Campaign) -> None:
+        super().__init__()
         self._title, self._count = campaign.title or "campaign", campaign.count
         self._names = campaign.names
-        self.stopped = threading.Event()  # by a user of the page; --resume continues
         self.charts = Charts(self._names, self._count)
-        self._state = "starting"
-        self._progress: Progress | None = None
-        self._pace, self._rate, self._left = Pace(), "", ""
-        self._partitions: Mapping[str, Partition] = {}
-        self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
+        self._left = ""  # time
         self._under_way: Sequence[UnderWay] = ()
-        self._ask_at = self._list_at = self._look_at = 0.0
+        self._list_at = self._look_at = 0.0
         self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
         self._done = self._failed = self._points = self._rays = 0
         self._ended: deque[dict[str, Any]] = deque(maxlen=ENDED_MOST)
         self._failures: deque[dict[str, Any]] = deque(maxlen=FAILED_MOST)
         self._jobs: dict[int, _Shown] = {}  # {number: its points}, the newest last
-        self._over = False
 
     # -- the run's side ------------------------------------------------------------------
 
@@ -112,11 +102,7 @@ class LiveCampaign(CampaignPage):
                 self._state = "writing the table and the card"
             elif any(job.stored for job in self._under_way):
                 self._state = "running"
-        if now >= self._ask_at:
-            self._ask_at = now + ASK_EVERY_S
-            with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
-                stats = {name: part.stats() for name, part in self._partitions.items()}
-                self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
+        self.ask_partitions()
 
     def look(self, row: JobRow, store: RunStore) -> None:
         """Read points of a job, if a browser shows them and there is time for it."""
@@ -148,10 +134,7 @@ class LiveCampaign(CampaignPage):
 
     def stay(self) -> None:
         """Keep the page until Ctrl-C or its button."""
-        click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
-        with suppress(KeyboardInterrupt):
-            while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
-                pass
+        self.keep()
 
     # -- the page's side -----------------------------------------------------------------
 

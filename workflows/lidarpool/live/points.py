@@ -130,11 +130,16 @@ class Eye:
         column, row = (across * _ACROSS).astype(np.int64), (down * _DOWN).astype(np.int64)
         return np.where(inside, row * _ACROSS + column, -1)
 
-    def may_see(self, box: AnyFloats) -> bool:
+    def may_see(self, box: Floats) -> bool:
         """Whether a box (2, 3) may be partly in the picture."""
-        x, y, z, w = self._clip(np.array(list(itertools.product(*box.T))))
+        x, y, z, w = self._clip(corners_of(box))
         outside = (x > w, x < -w, y > w, y < -w, z < -w)
         return not any(bool(beyond.all()) for beyond in outside)
+
+
+def corners_of(box: Floats) -> Floats:
+    """Corners (8, 3) of a box (2, 3)."""
+    return np.array(list(itertools.product(*box.T)))
 
 
 def even_shares(counts: AnyArray, most: int) -> Floats:
@@ -199,7 +204,9 @@ class PointFinder:
         Abandoned
             If nobody waits for the answer.
         """
-        ranges = self._ranges(scans)
+        ranges = [(0, len(self.points))]  # of rows, first and after the last
+        if scans is not None:
+            ranges = sorted(map(self.points.rows_of, scans))
         whole = sum(high - low for low, high in ranges)
         if not wanted.limits and (eye is None or whole <= most):
             rows = _spread(ranges, one_of_each_part(whole, most))
@@ -213,12 +220,6 @@ class PointFinder:
             counts += 1
         rows, _ = self._search(ranges, most, wanted, eye, even_shares(counts, most), abandoned)
         return rows, count
-
-    def _ranges(self, scans: Scans | None) -> list[tuple[int, int]]:
-        """Rows, first and after the last, of ranges of scans."""
-        if scans is None:
-            return [(0, len(self.points))]
-        return sorted(self.points.rows_of(some) for some in scans)
 
     def _local(self, rows: Ints | slice) -> Floats:
         return positions(self.points, rows) - self._origin
@@ -239,7 +240,9 @@ class PointFinder:
                 if abandoned():
                     raise Abandoned
                 first, last = max(low, number * BLOCK), min(high, (number + 1) * BLOCK)
-                if not self._may_be_seen(number, eye):
+                box = self._boxes[number]
+                is_read = not np.isnan(box[0, 0])
+                if eye is not None and is_read and not eye.may_see(box):
                     continue
                 rows = first + np.flatnonzero(wanted.keeps(self.points, slice(first, last)))
                 found += len(rows)
@@ -247,9 +250,8 @@ class PointFinder:
                 if eye is not None and shares is not None and len(rows):
                     places = self._local(rows)
                     whole = len(rows) == min(BLOCK, len(self.points) - number * BLOCK)
-                    if whole and np.isnan(self._boxes[number, 0, 0]):
-                        ends = [(axis.min(), axis.max()) for axis in places.T]
-                        self._boxes[number] = np.array(ends).T
+                    if whole and not is_read:
+                        box[:] = places.min(axis=0), places.max(axis=0)
                     tiles = eye.tiles(places)
                     share *= np.where(tiles >= 0, shares[tiles], 0.0)
                 kept.append(rows[random.random(len(rows)) < share])
@@ -258,10 +260,6 @@ class PointFinder:
                     joined = np.concatenate(kept)
                     kept = [joined[random.random(len(joined)) < _KEPT]]
         return np.concatenate(kept), found
-
-    def _may_be_seen(self, number: int, eye: Eye | None) -> bool:
-        box = self._boxes[number]
-        return eye is None or bool(np.isnan(box[0, 0])) or eye.may_see(box)
 
 
 def _spread(ranges: Sequence[tuple[int, int]], numbers: Ints) -> Ints:

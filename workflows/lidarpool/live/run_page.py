@@ -44,26 +44,50 @@ ASK_EVERY_S = 2.0  # how busy the partitions are
 FRAMES_SHOWN = 40  # whose rays are shown
 
 
-class LiveRun(Page):
-    """Connects a run and its page, in both directions."""
+class LivePage:
+    """What the pages of a run and of a campaign have in common."""
 
     page: PageServer
 
-    def __init__(self, job: Job) -> None:
-        self._job = job
+    def __init__(self) -> None:
         self.stopped = threading.Event()  # by a user of the page; --resume continues
-        self._drawn, self._view = view_of(job, "lidarpool")
-        self._view.hits = self._hits
         self._state = "starting"
-        self._store: RunStore | None = None
-        self._points: LivePoints | None = None
         self._progress: Progress | None = None
         self._pace, self._rate = Pace(), ""
-        self._frames: deque[Frame] = deque(maxlen=FRAMES_SHOWN)
         self._partitions: Mapping[str, Partition] = {}
         self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
-        self._ask_at = self._read_at = 0.0  # from when on the cluster is asked, and parts are read
+        self._ask_at = 0.0
         self._over = False
+
+    def ask_partitions(self) -> None:
+        """Ask how busy the partitions are, now and then."""
+        now = time.monotonic()
+        if now >= self._ask_at:
+            self._ask_at = now + ASK_EVERY_S
+            with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
+                stats = {name: part.stats() for name, part in self._partitions.items()}
+                self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
+
+    def keep(self) -> None:
+        """Keep the page until Ctrl-C or its button."""
+        click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
+        with suppress(KeyboardInterrupt):
+            while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+                pass
+
+
+class LiveRun(LivePage, Page):
+    """Connects a run and its page, in both directions."""
+
+    def __init__(self, job: Job) -> None:
+        super().__init__()
+        self._job = job
+        self._drawn, self._view = view_of(job, "lidarpool")
+        self._view.hits = self._hits
+        self._store: RunStore | None = None
+        self._points: LivePoints | None = None
+        self._frames: deque[Frame] = deque(maxlen=FRAMES_SHOWN)
+        self._read_at = 0.0  # from when on parts are read
         self._ends = 0  # how often something came at the run's end that the page must ask for
 
     # -- the run's side, in its thread ---------------------------------------------------
@@ -104,12 +128,7 @@ class LiveRun(Page):
         if progress.cast:
             self._state = "running"
         self._rate = self._pace.told(progress.seconds, progress.collected, progress.scans)
-        now = time.monotonic()
-        if now >= self._ask_at:
-            self._ask_at = now + ASK_EVERY_S
-            with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
-                stats = {name: part.stats() for name, part in self._partitions.items()}
-                self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
+        self.ask_partitions()
         if self.stopped.is_set():
             raise KeyboardInterrupt
 
@@ -135,10 +154,7 @@ class LiveRun(Page):
         self._view.sweeps = Sweeps.of(self._job.survey, self._job.scene)
         self._view.show(CloudFile(cloud, own))
         self._ends += 1
-        click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
-        with suppress(KeyboardInterrupt):
-            while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
-                pass
+        self.keep()
 
     # -- the page's side -----------------------------------------------------------------
 

@@ -36,11 +36,11 @@ class Surface:
         most: int = MOST_TRIANGLES,
     ) -> None:
         self._scene, self._reflectance = scene, reflectance
-        self.coarse, self._objects = scene, scene.face_object
+        self.coarse = scene
         self._stands: Ints | None = None  # for each triangle of the scene
         if len(scene.faces) > most:
             self.coarse, self._stands = simplified(scene, most)
-            self._objects = self.coarse.face_object
+        self._objects = self.coarse.face_object
         size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
         moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
         self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
@@ -26,7 +25,7 @@ from ..run.picture_file import Pictured, SensorWay, ways_of
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..sensor.trajectory import presence_ns
 from .legend import Legend, as_bytes, legend_of
-from .points import Eye, Filter, PointFinder, Points, Scans, positions
+from .points import Eye, Filter, PointFinder, Points, Scans, corners_of, positions
 from .server import Answer, Arguments
 from .surface import Surface, colours_for
 
@@ -210,8 +209,8 @@ class View:
         """
         pictured = self.pictured
         if near is not None or pictured is None:
-            return _corners_of(self._bounds if near is None else near)
-        corners = [_corners_of(pictured.scene.bounds)]
+            return corners_of(self._bounds if near is None else near)
+        corners = [corners_of(pictured.scene.bounds)]
         corners += [way.positions[:: len(way.positions) // _PLACES + 1] for way in self.sensors]
         return np.concatenate([*corners, self._ends(self._bounds[0, 2])])
 
@@ -264,15 +263,11 @@ class View:
             known[name, wanted] = colours_of(values, column, self._names(name))
         return known[name, wanted]
 
-    def _sample(self, name: str) -> AnyArray:
-        """Finite values of a column in an evenly spaced sample of the points."""
-        values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
-        return values[np.isfinite(values)]
-
     def _column(self, name: str) -> Answer:
         """Tell what a column can be filtered by: its limits, or its labels."""
         column = self.columns[name]
-        values = self._sample(name)
+        values = self._finder.points.values(name, self._finder.find(_SAMPLE)[0])
+        values = values[np.isfinite(values)]
         names, found = self._names(name), np.unique(values)
         few = len(found) <= (_MOST_NAMES if names else MOST_ENTRIES) and name != "scan"
         if column.kind == "label" and len(found) and few:
@@ -414,10 +409,6 @@ def _of_points(points: Points) -> Bounds:
     box = np.percentile(places, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     return origin, box - origin
-
-
-def _corners_of(box: Floats) -> Floats:
-    return np.array(list(itertools.product(*box.T)))
 
 
 def _actor_arrays(name: str, actor: Actor, duration_ns: float, count: int) -> dict[str, AnyArray]:

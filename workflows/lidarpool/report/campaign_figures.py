@@ -18,6 +18,7 @@ from poolpart import TaskRecord
 from ..base.arrays import Bools, Floats
 from ..export.jobs import JobRow, Value
 from ..pipeline.task_book import StageTotals
+from .ranks import rank_correlation
 
 FAILED_MOST, SLOWEST_MOST = 200, 10  # jobs that are kept whole
 _COUNTS = ("scans", "sweeps", "rays", "hits", "points")
@@ -219,24 +220,7 @@ class Figures:
             elif len(there):
                 low, median, high = np.percentile(there, (0, 50, 100)).tolist()
                 out |= {"lowest": low, "median": median, "highest": high}
-                out["rank_correlation_with_points"] = rank_correlation(
-                    varied.values[known], points[known]
-                )
+                correlation = rank_correlation(varied.values[known], points[known])
+                told = None if correlation is None else round(correlation, 6)
+                out["rank_correlation_with_points"] = told
             yield out
-
-
-def rank_correlation(first: Floats, second: Floats) -> float | None:
-    """Spearman's correlation of two quantities (n,); None where one of them does not vary.
-
-    Examples
-    --------
-    >>> rank_correlation(np.array([1.0, 2.0, 5.0, 9.0]), np.array([4.0, 3.0, 2.0, 1.0]))
-    -1.0
-    """
-    ranks = []
-    for values in (first, second):
-        _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-        if len(counts) < 2:
-            return None
-        ranks.append((np.cumsum(counts) - (counts - 1) / 2)[inverse])  # equal values share one
-    return round(float(np.corrcoef(ranks[0], ranks[1]).flat[1]), 6)

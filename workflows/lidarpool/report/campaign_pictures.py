@@ -295,11 +295,10 @@ def _percentiles(values: Floats) -> tuple[float, float, float]:
 
 
 def _set_scale(axes: Axes, scale: Scale) -> None:
-    if scale.is_log:
-        axes.set_xscale("log")
     low, high = scale.edges[[0, -1]].tolist()
     aside = 0.0 if scale.labels else 0.02
     if scale.is_log:
+        axes.set_xscale("log")
         ratio = (high / low) ** aside
         axes.set_xlim(low / ratio, high * ratio)
     else:

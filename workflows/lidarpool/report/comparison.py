@@ -24,6 +24,7 @@ from ..export.recordings import Recording, Turn, open_recording
 from ..sensor.noise import Purpose, uniform
 from .page.words import millimetres, ratio
 from .range_image import RangeImages, paired_images, range_images
+from .ranks import rank_correlation
 
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
@@ -349,20 +350,6 @@ def nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
     tree.knn_index()
     index, square = tree.knn_search(core.Tensor(points - origin), 1)
     return np.sqrt(square.numpy()[:, 0]), index.numpy()[:, 0]
-
-
-def rank_correlation(a: AnyArray, b: AnyArray) -> float | None:
-    """Spearman's rank correlation, ties with their mean rank; None if one is constant or empty."""
-    if not len(a):
-        return None
-    ranks: list[Floats] = []
-    for values in (a, b):
-        _, inverse, counts = np.unique(values, return_inverse=True, return_counts=True)
-        ends = np.cumsum(counts)
-        rank = (ends - (counts - 1) / 2)[inverse]
-        ranks.append(rank - rank.mean())
-    size = np.sqrt((ranks[0] @ ranks[0]) * (ranks[1] @ ranks[1]))
-    return float(ranks[0] @ ranks[1] / size) if size else None
 
 
 def _residuals(values: Floats) -> dict[str, Any]:

@@ -33,8 +33,7 @@ ROOM_BYTES = 32 << 20  # room for pictures and report
 
 CLOUD, PAGE, REPORT = FORMATS["ply"].file, "report.html", LAST_FILE
 _OF_CLOUD = ("hits", "intensity", "cloud")  # are drawn from the cloud's file
-_IMAGES = tuple(f"{name}.png" for name in PICTURES)
-FILES = (CLOUD, *_IMAGES, PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
+FILES = (CLOUD, *(f"{name}.png" for name in PICTURES), PICTURE_FILE, SWEEPS_FILE, PAGE, REPORT)
 _SURVEY = ("scene", "survey")  # what tells one from another
 # What only some results have.
 _FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)

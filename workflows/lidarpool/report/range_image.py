@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 
@@ -161,11 +160,11 @@ def range_images(
         with the same rings; a clause without a full stop.
     """
     first, second = _Polar.of(a, names[0]), _Polar.of(b, names[1])
-    common = _common(first, second, names)
+    rings, elevation, rows_a, rows_b, notes = _common(first, second, names)
+    count = len(rings)
     steps = [first.step(), second.step()]
     alike = abs(steps[0] / steps[1] - 1) < _ALIKE
     step = azimuth_deg or (steps[1] if alike else max(steps))
-    rows_a, rows_b, count = common.rows_a, common.rows_b, len(common.rings)
     phases_a, phases_b = first.phases(rows_a, count, step), second.phases(rows_b, count, step)
     own, other = (phases_b, phases_a) if alike or steps[0] < steps[1] else (phases_a, phases_b)
     blocks, middle = np.arange(_BLOCKS), np.where(np.isnan(own), other, own)
@@ -189,8 +188,8 @@ def range_images(
     order, begin = _field(seen, columns, step)
     images = images[..., order]
     return RangeImages(
-        common.rings, common.elevation, step, begin, images[:, 0], (hidden_a, hidden_b),
-        common.notes, np.repeat(np.arange(count), len(order)), images.reshape(2, 2, -1),
+        rings, elevation, step, begin, images[:, 0], (hidden_a, hidden_b),
+        notes, np.repeat(np.arange(count), len(order)), images.reshape(2, 2, -1),
     )  # fmt: skip
 
 
@@ -223,21 +222,14 @@ def _spacing(elevation: Floats) -> float:
     return float(np.median(apart)) if len(apart) else 1.0
 
 
-class _Common(NamedTuple):
-    """Rings of A and B in common rows, the highest first."""
-
-    rings: Ints  # (r,): as B numbers them
-    elevation: Floats  # (r,)
-    rows_a: Ints  # of each ring of A
-    rows_b: Ints
-    notes: tuple[str, ...]
-
-
-def _common(a: _Polar, b: _Polar, names: tuple[str, str]) -> _Common:
-    """Find which rings look at the same elevation, whatever their numbers.
+def _common(
+    a: _Polar, b: _Polar, names: tuple[str, str]
+) -> tuple[Ints, Floats, Ints, Ints, tuple[str, ...]]:
+    """Put rings of A and B that look at the same elevation into common rows, the highest first.
 
     Some programs count from below, others from above or from 1: if one count can be had from the
-    other, rings of which only A or B has returns have a row, too.
+    other, rings of which only A or B has returns have a row, too. Returns the rings as B numbers
+    them and their elevations, (r,) each; the rows of each ring of A, and of B; and notes.
     """
     apart = np.abs(a.elevation[:, None] - b.elevation)
     near = max(_spacing(b.elevation) / 2, 0.05)
@@ -273,7 +265,7 @@ def _common(a: _Polar, b: _Polar, names: tuple[str, str]) -> _Common:
     row = np.empty(len(order), np.int64)
     row[order] = np.arange(len(order))
     rows_a, rows_b = (row[np.searchsorted(rings, one)] for one in (numbers, b.rings))
-    return _Common(rings[order], elevation[order], rows_a, rows_b, tuple(notes))
+    return rings[order], elevation[order], rows_a, rows_b, tuple(notes)
 
 
 def _field(seen: Indices, columns: int, step: float) -> tuple[Ints, float]:

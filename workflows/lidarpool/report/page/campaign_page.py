@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping, Sequence
-from datetime import UTC, datetime
 from typing import Any
 
 from markupsafe import Markup
@@ -12,9 +10,8 @@ from markupsafe import Markup
 from ...base.words import counted
 from ...export.jobs import Value
 from ..campaign_figures import CampaignInfo, Figures
-from .page import OBJECTS_MOST, STAGES, Bar, environment
-from .timeline import make_timeline
-from .words import bound, duration, large, share
+from .page import Bar, bars_of, environment, of_tasks
+from .words import bound, duration, large
 
 FAILED_SHOWN, FAILED_FEW = 100, 8  # all of them, and those that are open at first
 VALUES_SHOWN = 12  # of a quantity with labels
@@ -32,15 +29,12 @@ def campaign_page(
     """
     pages = environment()
     pages.filters["told"] = told
-    ordered = sorted(info.stages, key=lambda stage: list(STAGES).index(stage.stage))
-    begun = min((stage.start for stage in ordered), default=math.inf)
     bars, rest = class_bars(info, figures)
     splits = figures.splits if any(figures.splits) else {}
     return pages.get_template("campaign.html").render(
         report=report,
         info=info,
         title=info.title,
-        begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
         summary=summary(info, figures),
         facts=list(_facts(info, figures)),
         pictures=[(Markup(image), caption) for image, caption in pictures],
@@ -54,9 +48,7 @@ def campaign_page(
         sensors=[(name or "model", words) for name, words in info.sensors.items()],
         command=info.file,
         most=VALUES_SHOWN,
-        stages=ordered,
-        names=STAGES,
-        timeline=make_timeline(ordered, info.records, STAGES),
+        **of_tasks(info.stages, info.records),
     )
 
 
@@ -89,16 +81,8 @@ def _facts(info: CampaignInfo, figures: Figures) -> Iterator[tuple[str, str]]:
 
 def class_bars(info: CampaignInfo, figures: Figures) -> tuple[list[Bar], str]:
     """Bars of the classes with the most points, and a sentence about the others."""
-    total, ranked = sum(figures.classes.values()), figures.classes.most_common()
-    most = ranked[0][1] if ranked else 1
-    names = {number: class_name(info, number) for number, _ in ranked}
-    shown = ranked[:OBJECTS_MOST]
-    bars = [Bar(names[k], names[k], n, share(n, total), 100 * n / most) for k, n in shown]
-    if not (others := ranked[OBJECTS_MOST:]):
-        return bars, ""
-    points = sum(count for _, count in others)
-    more = counted(len(others), "more class", "more classes")
-    return bars, f"{more} with {counted(points, 'point')} ({share(points, total)})"
+    named = [(class_name(info, k), n) for k, n in figures.classes.most_common()]
+    return bars_of([(name, name, n) for name, n in named], "more class", "more classes")
 
 
 def class_name(info: CampaignInfo, number: int) -> str:

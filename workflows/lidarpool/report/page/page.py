@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
@@ -14,9 +13,12 @@ import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from poolpart import TaskRecord
+
 from ...base.declared import declared
 from ...base.words import counted
 from ...pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
+from ...pipeline.task_book import StageTotals
 from ...render.page import shortened, without_common_prefix
 from ...run.result import RunResult
 from ...run.trials import TRIAL
@@ -71,28 +73,34 @@ def write_page(
     OSError
         If it cannot be written.
     """
-    ordered = sorted(result.stages, key=lambda stage: list(STAGES).index(stage.stage))
-    begun = min((stage.start for stage in ordered), default=math.inf)
     bars, rest = _object_bars(report["points_by_object"])
     page = environment().get_template("page.html")
     text = page.render(
         report=report,
         title=_title(report["parameters"]),
-        begun=f"{datetime.fromtimestamp(begun, UTC):%Y-%m-%d %H:%M UTC}" if ordered else "",
         summary=_summary(report),
         facts=list(_facts(report, cloud)),
         pictures=list(_pictures(report, pictures)),
         changed=_changed,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
-        stages=ordered,
-        names=STAGES,
-        timeline=make_timeline(ordered, result.records, STAGES),
+        **of_tasks(result.stages, result.records),
         bars=bars,
         rest=rest,
         bounds=cloud.bounds.tolist(),
         scenario=_written(scenario) if scenario else "",
     )
     path.write_text(text, encoding="utf-8")
+
+
+def of_tasks(stages: Sequence[StageTotals], records: Sequence[TaskRecord]) -> dict[str, Any]:
+    """Return what templates show of the tasks of a run: when it began, stages, timeline."""
+    ordered = sorted(stages, key=lambda stage: list(STAGES).index(stage.stage))
+    begun = ""
+    if ordered:
+        first = datetime.fromtimestamp(min(stage.start for stage in ordered), UTC)
+        begun = f"{first:%Y-%m-%d %H:%M UTC}"
+    timeline = make_timeline(ordered, records, STAGES)
+    return {"begun": begun, "stages": ordered, "names": STAGES, "timeline": timeline}
 
 
 def _written(scenario: Scenario) -> str:
@@ -107,22 +115,28 @@ def _written(scenario: Scenario) -> str:
 
 def _object_bars(counts: Mapping[str, int]) -> tuple[list[Bar], str]:
     """Bars of the objects with the most points, and a sentence about the others."""
-    total, ranked = sum(counts.values()), sorted(counts.items(), key=lambda item: -item[1])
-    hit = [item for item in ranked if item[1]]
-    shown = hit[:OBJECTS_MOST]
-    most = shown[0][1] if shown else 1
     labels = dict(zip(counts, without_common_prefix(list(counts)), strict=True))
-    bars = [Bar(name, labels[name], n, share(n, total), 100 * n / most) for name, n in shown]
-    rest = []
-    if more := hit[OBJECTS_MOST:]:
-        points = sum(count for _, count in more)
-        rest.append(
-            f"{counted(len(more), 'more object')} with {counted(points, 'point')} "
-            f"({share(points, total)})"
-        )
-    if missed := len(ranked) - len(hit):
-        rest.append(f"{counted(missed, 'object')} without points")
-    return bars, "; ".join(rest)
+    ranked = sorted(counts.items(), key=lambda item: -item[1])
+    bars, rest = bars_of([(name, labels[name], n) for name, n in ranked if n], "more object")
+    if missed := sum(not n for n in counts.values()):
+        rest += "; " if rest else ""
+        rest += f"{counted(missed, 'object')} without points"
+    return bars, rest
+
+
+def bars_of(
+    ranked: Sequence[tuple[str, str, int]], more: str, several: str = ""
+) -> tuple[list[Bar], str]:
+    """Bars of the first of (name, label, points), and a sentence about `more` of them."""
+    total = sum(points for *_, points in ranked)
+    bars = [
+        Bar(name, label, points, share(points, total), 100 * points / ranked[0][2])
+        for name, label, points in ranked[:OBJECTS_MOST]
+    ]
+    if not (others := [points for *_, points in ranked[OBJECTS_MOST:]]):
+        return bars, ""
+    told = f"{counted(len(others), more, several)} with {counted(sum(others), 'point')}"
+    return bars, f"{told} ({share(sum(others), total)})"
 
 
 def environment() -> Environment:
