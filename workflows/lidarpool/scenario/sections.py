@@ -672,9 +672,9 @@ class PoolSection(Section, TaskOptions, _Workers):
     """
 
 
-def may_be_empty(section: type[Section]) -> Any:
-    """Treat a section with all fields commented out as one of defaults."""
-    return short(lambda v: v is None, lambda v: {}, section | None)
+def may_be_empty(kind: Any) -> Any:
+    """Treat a section or mapping with all lines commented out as one of defaults."""
+    return short(lambda v: v is None, lambda v: {}, kind | None)
 
 
 def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
