@@ -136,14 +136,13 @@ class Surroundings:
             kind = step.get("type", "").lower()
             given = {param.get("key", ""): param for param in step.findall("param")}
             text = {key: param.get("value", "") for key, param in given.items()}
-            if kind in _UNREAD:
-                what = text.get("filepath") or text.get("efilepath", "")
-                self.unread.append(f"{name}, {kind} of {what}: no triangles, left out")
-                return
             mode = text.get("intersectionMode", "transmittive").lower()
+            why = "no triangles" if kind in _UNREAD else ""
             if kind == "detailedvoxels" and mode != "transmittive":
+                why = f"intersectionMode {mode}"
+            if why:
                 what = text.get("filepath") or text.get("efilepath", "")
-                self.unread.append(f"{name}, {kind} of {what}: intersectionMode {mode}, left out")
+                self.unread.append(f"{name}, {kind} of {what}: {why}, left out")
                 return
             if kind in _LOADERS:
                 files, up = _files(text, assets), text.get("up")
@@ -169,8 +168,7 @@ class Surroundings:
             raise LidarpoolError("no filter loads a file.")
         up = up if up in ("y", "z") else None
         for file in files:
-            placed = up, turn, float(scale), offset.copy(), falls
-            yield Part(file, *placed, library, material)
+            yield Part(file, up, turn, float(scale), offset.copy(), falls, library, material)
 
     @cached_property
     def _ground(self) -> Scene | None:
