@@ -110,14 +110,8 @@ def check(
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        given: dict[str, Any] = {
-            "out": out,
-            "scheduler": scheduler,
-            "cluster": cluster,
-            "backend": backend,
-        }
-        given["job"] = number
-        for name, value in given.items():
+        given: dict[str, Any] = {"out": out, "scheduler": scheduler, "cluster": cluster}
+        for name, value in (given | {"backend": backend, "job": number}).items():
             wanted = value is not None and str(value) != "lidarpool-out"
             words += [f"--{name}", str(value)] if wanted else []
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")

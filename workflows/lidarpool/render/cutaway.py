@@ -23,7 +23,6 @@ class Cutaway:
     outer shell, and its plane has the camera on one side and most sensors on the other. So both
     faces of near walls and the roof are removed, while far walls, the floor and things inside
     stay, whatever the winding and grouping of triangles.
-
     """
 
     surface: Surface

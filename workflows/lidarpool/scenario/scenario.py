@@ -248,10 +248,9 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        if path.suffix.lower() in SUFFIXES:
-            data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD}
-            return cls.from_data(data, source=str(path), folder=path.parent)
-        return cls.from_data(read_yaml(path), source=str(path), folder=path.parent)
+        mesh = path.suffix.lower() in SUFFIXES
+        data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD} if mesh else read_yaml(path)
+        return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod
     def from_data(
