@@ -50,9 +50,8 @@ class Part:
         used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
         found: dict[str, dict[str, str]] = {}
         named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
-        libraries = [self.file.parent / name for name in named] + [self.library] * bool(
-            self.library
-        )
+        libraries = [self.file.parent / name for name in named]
+        libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
             for words in (line.split() for line in _text(library).splitlines()):
