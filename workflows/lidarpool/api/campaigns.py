@@ -12,10 +12,11 @@ from distributed import Client
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
+from ..live.pages import page_of_campaign
 from ..pipeline import LIDAR
 from ..report.campaign_output import Making, make_dataset
 from ..run.bars import bars_here
-from ..run.campaign import CampaignPage, CampaignRun
+from ..run.campaign import CampaignRun
 from ..run.checks import slots_needed
 from ..run.connection import local_client
 from ..run.job import Job
@@ -112,13 +113,5 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             parts, backend, wait_s, patience_s,
         )  # fmt: skip
         progress = bars_here() if on_progress is None else nullcontext(on_progress)
-        with _page(self, live) as page:
+        with page_of_campaign(self, live) as page:
             return make_dataset(self, making, cluster, progress, logger.info, page)
-
-
-def _page(campaign: Campaign, wanted: bool) -> AbstractContextManager[CampaignPage]:
-    if not wanted:
-        return nullcontext(CampaignPage())
-    from ..live.campaign_page import live_campaign  # with Matplotlib
-
-    return live_campaign(campaign)

@@ -11,11 +11,12 @@ from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
+from ..live.pages import page_of_run
 from ..pipeline import LIDAR, Frame
 from ..plan import Planning
 from ..run.bars import bars_here
 from ..run.checks import slots_needed
-from ..run.conductor import Page, conducted
+from ..run.conductor import conducted
 from ..run.connection import local_client
 from ..run.job import Job
 from ..run.progress import Progress
@@ -158,17 +159,9 @@ def simulate(
         cluster,
         own=client is None,
         progress=bars_here() if on_progress is None else nullcontext(on_progress),
-        page=_page(job, live and not store.complete),
+        page=page_of_run(job, live and not store.complete),
         tell=logger.info,
         on_frame=on_frame or (lambda frame: None),
     ) as (result, _):
         store.db.close()
         return Result(**vars(result))
-
-
-def _page(job: Job, wanted: bool) -> AbstractContextManager[Page]:
-    if not wanted:
-        return nullcontext(Page())
-    from ..live.run_page import live_run  # with Matplotlib, for its colours
-
-    return live_run(job)

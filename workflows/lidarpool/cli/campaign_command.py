@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import AbstractContextManager
 from dataclasses import replace
 from typing import Any
 
@@ -16,6 +16,7 @@ from ..base.words import counted
 from ..export.dataset import DataSet
 from ..export.folder import output_place
 from ..export.jobs import Tally
+from ..live.pages import page_of_campaign
 from ..pipeline import LIDAR
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
@@ -27,7 +28,7 @@ from ..report.campaign_output import (
     row_of,
     verify,
 )
-from ..run.campaign import CampaignPage, CampaignRun
+from ..run.campaign import CampaignRun
 from ..run.checks import slots_needed
 from ..run.job import Job
 from ..run.result import RunResult
@@ -57,7 +58,7 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
         options.out, options.here, options.resume, options.fresh, retry_failed, options.verify,
         options.overwrite, options.parts, options.backend, options.wait_s, options.patience_s,
     )  # fmt: skip
-    with _page(campaign, options) as page:
+    with page_of_campaign(campaign, options.live) as page:
         progress = shown_progress(options.quiet)
         run = make_dataset(campaign, making, cluster, progress, teller(options), page)
         _tell(run, options)
@@ -65,14 +66,6 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
             page.stay()
     if run.failed:
         raise LidarpoolError(failures(run))
-
-
-def _page(campaign: Campaign, options: RunOptions) -> AbstractContextManager[CampaignPage]:
-    if not options.live:
-        return nullcontext(CampaignPage())
-    from ..live.campaign_page import live_campaign
-
-    return live_campaign(campaign)
 
 
 def _tell(run: CampaignRun, options: RunOptions) -> None:

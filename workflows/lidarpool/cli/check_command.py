@@ -110,14 +110,8 @@ def check(
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        given: dict[str, Any] = {
-            "out": out,
-            "scheduler": scheduler,
-            "cluster": cluster,
-            "backend": backend,
-        }
-        given["job"] = number
-        for name, value in given.items():
+        given: dict[str, Any] = {"out": out, "scheduler": scheduler, "cluster": cluster}
+        for name, value in (given | {"backend": backend, "job": number}).items():
             wanted = value is not None and str(value) != "lidarpool-out"
             words += [f"--{name}", str(value)] if wanted else []
         click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
@@ -184,7 +178,8 @@ def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
         )
     if found["jobs"]:
         share = campaign.count / len(found["jobs"])
-        scans, rays = (round(share * sum(job[name] for job in found["jobs"])) for name in _SUMMED)
+        scans = round(share * sum(job["scans"] for job in found["jobs"]))
+        rays = round(share * sum(job["rays"] for job in found["jobs"]))
         points = sum((job["estimate"] or {"points": 0})["points"] for job in found["jobs"])
         yield (
             f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
@@ -192,9 +187,6 @@ def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
         )
     for note in found["notes"]:
         yield f"note: {note}"
-
-
-_SUMMED = ("scans", "rays")
 
 
 def _in_words(job: dict[str, Any]) -> str:

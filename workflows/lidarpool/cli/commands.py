@@ -10,7 +10,6 @@ import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
-from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -40,13 +39,13 @@ from .stations_command import stations
 from .view_command import view
 
 if TYPE_CHECKING:
-    from ..base.storage import Storage
     from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"
+_COMMANDS = [init, import_, check, schema, scene, sensors, stations, view, plot, export, compare]
 
 # What `demo` and `run` have in common; each is a field of RunOptions.
-_SHOWN = (
+_shown = options.together(
     options.flag("--tls", help="Encrypt the traffic of the local cluster."),
     options.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
     click.option(
@@ -80,37 +79,19 @@ def _seconds(_: click.Context, __: click.Parameter, text: str | None) -> float |
         raise click.BadParameter(told) from error
 
 
-def _shown(command: options.Command) -> options.Command:
-    """Give a command the options of `_SHOWN`, in their order."""
-    return reduce(lambda command, option: option(command), reversed(_SHOWN), command)
-
-
-@click.group(context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]})
+@click.group(
+    commands=_COMMANDS,
+    context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
+)
 @click.version_option(__version__, prog_name=PROGRAM)
 def cli() -> None:
     """Simulate lidar surveys on a partitioned Dask cluster."""
 
 
-for _command in (
-    init,
-    import_,
-    check,
-    schema,
-    scene,
-    sensors,
-    stations,
-    view,
-    plot,
-    export,
-    compare,
-):
-    cli.add_command(_command)
-
-
 @cli.command()
 @options.out
 @_shown
-def demo(out: Path | Storage, **shown: Any) -> None:
+def demo(**given: Any) -> None:
     """Run the default survey and plan a path, on this machine.
 
     \b
@@ -118,7 +99,7 @@ def demo(out: Path | Storage, **shown: Any) -> None:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    _run((), out=out, resumable=False, **shown)
+    _run((), resumable=False, **given)
 
 
 @cli.command()

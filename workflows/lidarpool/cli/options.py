@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial, wraps
+from functools import partial, reduce, wraps
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,11 @@ result = click.argument("result", metavar="FOLDER", type=Place())
 copies = click.option(
     "--out", type=Place(file_okay=False), help="Folder for the files.  [default: FOLDER]"
 )
+
+
+def together(*added: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Return what adds options to a command, in their order."""
+    return lambda command: reduce(lambda made, option: option(made), reversed(added), command)
 
 
 def scheduler(command: Command) -> Command:

@@ -20,6 +20,7 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
+from ..live.pages import page_of_run
 from ..pipeline import LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..report.output import CLOUD, further_files, refuse_to_replace, write_result
@@ -105,7 +106,7 @@ def run_scenario(
     if not options.quiet:
         for note in scenario.advice(job.scene):
             tell(f"note: {note}")
-    with ExitStack() as whole, _page(job, options.live) as page:
+    with ExitStack() as whole, page_of_run(job, options.live) as page:
         result, report = _run(scenario, job, options, page, whole, judge)
         if options.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
@@ -187,14 +188,6 @@ def _noting_complete(out: Path | Storage) -> Iterator[None]:
     except BaseException as error:
         error.add_note(f"The result in {out} is complete.")
         raise
-
-
-def _page(job: Job, live: bool) -> AbstractContextManager[Page]:
-    if not live:
-        return nullcontext(Page())
-    from ..live.run_page import live_run
-
-    return live_run(job)
 
 
 def _store(job: Job, options: RunOptions, place: Storage, goes_on: bool) -> RunStore:

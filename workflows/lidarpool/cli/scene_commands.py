@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import reduce
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import click
 
-from .options import Command, overwrite
+from .options import Command, overwrite, together
 
 if TYPE_CHECKING:
     from ..scene.scene import Scene
@@ -28,13 +27,12 @@ _out = click.argument("out", type=click.Path(path_type=Path), metavar="OUT.ply|.
 
 def _made(triangles: int) -> Callable[[Command], Command]:
     """Add the output file, the number of triangles, and a seed."""
-    added = (
-        click.option("--seed", default=0, help="The same seed gives the same scene."),
-        click.option("--triangles", default=triangles, help="Approximate number."),
-        overwrite,
+    return together(
         _out,
+        overwrite,
+        click.option("--triangles", default=triangles, help="Approximate number."),
+        click.option("--seed", default=0, help="The same seed gives the same scene."),
     )
-    return lambda command: reduce(lambda made, option: option(made), added, command)
 
 
 @scene.command(context_settings={"show_default": True})
@@ -113,7 +111,7 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     made = make()
     if out.suffix.lower() == ".glb":  # others keep no colours
         made = painted(made)
-    if made.instances and out.suffix.lower() != ".glb" and made.triangles > MOST_COPIED:
+    elif made.instances and made.triangles > MOST_COPIED:
         raise LidarpoolError(
             f"{out} would hold {made.triangles:,} triangles, because only .glb files have a tree "
             "once for many places: write one."

@@ -80,11 +80,9 @@ class PlainLines:
         now = progress.seconds
         if (standing := standing_still(progress)) != self._standing:
             self._standing = standing
-            words = standing or "goes on"
-            done, unit = (progress.collected, "scans")
-            if progress.jobs:
-                done, unit = (progress.jobs_done, "jobs")
-            _tell(self.stream, f"run  {words}, {done:,} {unit} are done")
+            jobs = f"{progress.jobs_done:,} jobs" if progress.jobs else ""
+            ready = jobs or f"{progress.collected:,} scans"
+            _tell(self.stream, f"run  {standing or 'goes on'}, {ready} are done")
         due = now >= self._next
         if due:
             least, most = PLAIN_EVERY_S

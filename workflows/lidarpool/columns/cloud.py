@@ -246,9 +246,8 @@ class Cloud(Savable):
         columns = {
             name: np.concatenate([part.columns[name] for part in parts]) for name in first.columns
         }
-        return cls(
-            np.concatenate([part.positions for part in parts]), columns, first.own, first.sweeps
-        )
+        positions = np.concatenate([part.positions for part in parts])
+        return cls(positions, columns, first.own, first.sweeps)
 
 
 def need_packages(*packages: str) -> None:

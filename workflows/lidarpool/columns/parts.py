@@ -276,9 +276,8 @@ class StoredCloud(Savable):
         row = sum(self.rows[: max(0, at)])
         if at < 0 or scan == self.firsts[at]:
             return row
-        return row + int(
-            read_part(self.storage, self.names[at]).counts[: scan - self.firsts[at]].sum()
-        )
+        counts = read_part(self.storage, self.names[at]).counts
+        return row + int(counts[: scan - self.firsts[at]].sum())
 
     def sample(self, most: int, parts: int) -> Cloud:
         """Read at most so many evenly spaced points, of at most so many parts."""

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import AnyArray
-from ..base.errors import LidarpoolError
+from ..base.errors import LidarpoolError, explained
 from .table import Column
 
 AXES = ("x", "y", "z")
@@ -99,11 +99,10 @@ def mapped_rows(path: Path) -> NDArray[np.void]:
     properties.
     """
     try:
-        start, count, dtype = layout(path)
-        # An empty file cannot be mapped.
-        return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+        with explained(f"{path} cannot be read"):
+            start, count, dtype = layout(path)
+            # An empty file cannot be mapped.
+            return np.memmap(path, dtype, "r", start, (count,)) if count else np.empty(0, dtype)
     except ValueError as error:
         raise LidarpoolError(f"{path} is not a point cloud of lidarpool: {error}.") from error
 

@@ -9,13 +9,10 @@ every machine.
 from __future__ import annotations
 
 import itertools
-from typing import TypeAlias
 
 import numpy as np
 
 from ..base.arrays import Floats, Floats32
-
-Singles: TypeAlias = Floats32
 
 # Discs are made larger by this share of their distance and size: some 30 rounding errors of
 # single precision, so that a path which passes here also passes the exact check.
@@ -42,7 +39,7 @@ class PathCost:
         self._points = np.zeros((waypoints + 2, 2, particles), np.float32)
         self._points[0, 0], self._points[-1, 0] = -0.5, 0.5
         # (waypoints, 2, particles), contiguous. Write to it, then call `evaluate`.
-        self.waypoints: Singles = self._points[1:-1]
+        self.waypoints: Floats32 = self._points[1:-1]
         # The fixed part of the penalty for entering discs.
         # The boundaries of all discs together are at least as long as any path around them.
         self.entry_price = 2.0 + 2 * np.pi * float(radii.sum())
@@ -58,7 +55,7 @@ class PathCost:
             for width in {block.stop - block.start for block in self._blocks}
         }
 
-    def evaluate(self) -> Singles:
+    def evaluate(self) -> Floats32:
         """Costs of the paths in `waypoints`: (particles,), the same buffer at every call."""
         for block in self._blocks:
             workspace = self._workspaces[block.stop - block.start]
@@ -88,7 +85,7 @@ class _Workspace:
     """
 
     def __init__(self, centres: Floats, radii: Floats, segments: int, width: int) -> None:
-        def singles(*shape: int) -> Singles:
+        def singles(*shape: int) -> Floats32:
             return np.empty(shape, np.float32)
 
         discs = min(len(radii), max(1, _BLOCK_ELEMENTS // (segments * width)))  # at a time
@@ -110,7 +107,7 @@ class _Workspace:
         self._price, self._entered = singles(width), np.empty(width, np.bool_)
         self._zeros = np.zeros(width, np.float32)  # as an array, see above
 
-    def evaluate(self, points: Singles, cost: Singles, entry_price: float) -> None:
+    def evaluate(self, points: Floats32, cost: Floats32, entry_price: float) -> None:
         """Write to `cost`, (width,), the costs of paths through `points`, (k + 2, 2, width)."""
         direction, products, length = self._direction, self._products, self._length
         first, last = points[:-1].transpose(1, 0, 2), points[1:].transpose(1, 0, 2)

@@ -305,11 +305,11 @@ def _clear(scene: Scene, caster: RayCaster, places: Floats) -> Ints:
     turn = np.pi * (3 - 5**0.5) * n
     level = np.sqrt(1 - z * z)
     rays = np.stack([level * np.cos(turn), level * np.sin(turn), z], axis=1)
-    hits = caster.cast(np.repeat(places, _AROUND, axis=0), np.tile(rays, (len(places), 1)))
+    ways = np.tile(rays, (len(places), 1))
+    hits = caster.cast(np.repeat(places, _AROUND, axis=0), ways)
     free = hits.distance.reshape(-1, _AROUND).min(axis=1, initial=np.inf) >= _CLEAR_M
     corners = scene.vertices[scene.faces[hits.triangle]]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-    ways = np.tile(rays, (len(places), 1))
     back = hits.hit & (np.einsum("ij,ij->i", normals, ways) > 0)
     upper = back.reshape(-1, _AROUND)[:, : _AROUND // 2]
     owner = scene.face_object[hits.triangle].reshape(-1, _AROUND)[:, : _AROUND // 2]

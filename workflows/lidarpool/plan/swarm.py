@@ -8,7 +8,7 @@ import math
 import numpy as np
 
 from ..base.arrays import Floats, Floats32
-from .cost import PathCost, Singles
+from .cost import PathCost
 
 _GROUPS = 5
 _LEAST_GROUP = 20  # particles
@@ -104,11 +104,11 @@ class Swarm:
         self._remember(self.paths.evaluate())
         self._move()
 
-    def best(self) -> Singles:
+    def best(self) -> Floats32:
         """Corners of the best path so far: (waypoints, 2)."""
         return self._best[:, self._best_cost.argmin()].reshape(-1, 2)
 
-    def _remember(self, cost: Singles) -> None:
+    def _remember(self, cost: Floats32) -> None:
         np.less(cost, self._best_cost, out=self._better)  # 1.0 or 0.0
         np.minimum(cost, self._best_cost, out=self._best_cost)
         # A product and a sum take half the time of a masked copy. The sum equals the position from
@@ -144,7 +144,7 @@ def _spreads(groups: int, widest: float) -> Floats:
     return _NARROWEST + (widest - _NARROWEST) * share * share
 
 
-def _scattered(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Singles:
+def _scattered(corners: int, particles: int, spreads: Floats, randoms: Randoms) -> Floats32:
     """First positions: polylines about the straight line, (corners, 2, groups, size).
 
     A group's paths turn at 1, 2, 3, … points, drawn within its spread about the straight line, and

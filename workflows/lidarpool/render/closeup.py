@@ -115,9 +115,8 @@ class Part:
             vertices, faces.astype(np.int32), owners, scene.names, scene.origin, colours=colours
         )
         was = triangle_areas(scene.vertices[scene.faces[own]])
-        shares = np.divide(
-            triangle_areas(vertices[faces]), was, out=np.ones(len(was)), where=was > 0
-        )
+        areas = triangle_areas(vertices[faces])
+        shares = np.divide(areas, was, out=np.ones(len(was)), where=was > 0)
         return Part(part, self.parents[own], self.shares[own] * shares)
 
 

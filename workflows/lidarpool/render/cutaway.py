@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Ints
-from .surface import Surface, dot
+from .surface import Surface, dot, spiral
 
 MOST_SENSORS = 8  # sensors that are tested for what they see
 MAX_LAYERS = 12  # walls have two faces, roofs have beams; more surfaces are not a wall
@@ -23,7 +23,6 @@ class Cutaway:
     outer shell, and its plane has the camera on one side and most sensors on the other. So both
     faces of near walls and the roof are removed, while far walls, the floor and things inside
     stay, whatever the winding and grouping of triangles.
-
     """
 
     surface: Surface
@@ -88,12 +87,7 @@ def plan_cutaway(surface: Surface, poses: Floats, eye: Floats) -> Cutaway | None
 
 def _probes(sensors: Floats, count: int, low_deg: float, high_deg: float) -> tuple[Floats, Floats]:
     """Origins and directions (p * count, 3) of `count` rays from each, between two elevations."""
-    n = np.arange(count)
-    azimuth = 2 * np.pi * 0.6180339887 * n
-    low, high = np.sin(np.radians([low_deg, high_deg]))
-    up = low + (high - low) * (n + 0.5) / count
-    level = np.sqrt(1 - up * up)
-    rays = np.stack([level * np.cos(azimuth), level * np.sin(azimuth), up], axis=1)
+    rays = spiral(count, *np.sin(np.radians([low_deg, high_deg])))
     return np.repeat(sensors, count, axis=0), np.tile(rays, (len(sensors), 1))
 
 

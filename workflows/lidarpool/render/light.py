@@ -140,11 +140,6 @@ def _lights(sun: Floats) -> tuple[Floats, Floats, Floats]:
     side /= np.linalg.norm(side)
     disc = np.cos(turn)[:, None] * side + np.sin(turn)[:, None] * np.cross(side, sun)
     counts = [SKY_LIGHTS, SUN_LIGHTS]
-    strengths = np.repeat(
-        [2 * (1 - SUN_SHARE) / SKY_LIGHTS, SUN_SHARE / sun[2] / SUN_LIGHTS], counts
-    )
-    return (
-        np.concatenate([spiral(SKY_LIGHTS), sun + radius[:, None] * disc]),
-        strengths,
-        np.repeat(TURNS, counts),
-    )
+    strengths = [2 * (1 - SUN_SHARE) / SKY_LIGHTS, SUN_SHARE / sun[2] / SUN_LIGHTS]
+    lights = np.concatenate([spiral(SKY_LIGHTS), sun + radius[:, None] * disc])
+    return lights, np.repeat(strengths, counts), np.repeat(TURNS, counts)

@@ -58,10 +58,8 @@ class Page:
 
         The returned axes have the shot's pixels as coordinates.
         """
-        opacity = image[..., 3:]
-        plain = np.divide(
-            image[..., :3], opacity, out=np.zeros_like(image[..., :3]), where=opacity > 0
-        )
+        colours, opacity = image[..., :3], image[..., 3:]
+        plain = np.divide(colours, opacity, out=np.zeros_like(colours), where=opacity > 0)
         bytes_ = np.round(255 * np.concatenate([plain, opacity], axis=2)).astype(np.uint8)
         self.figure.figimage(bytes_, zorder=-1)
         axes = self.figure.add_axes((0, 0, 1, 1))
@@ -94,9 +92,8 @@ class Page:
                     taken.append(place)
                     lines.append(np.stack([pixel, pixel + TICK * self.unit * outward]))
                     self._text(axes, place, text, 6.6, theme.MUTED)
-            axes.add_collection(
-                LineCollection(lines, colors=theme.MUTED, linewidths=0.6 * self.unit)
-            )
+            marks = LineCollection(lines, colors=theme.MUTED, linewidths=0.6 * self.unit)
+            axes.add_collection(marks)
             along = ends[1] - ends[0]
             angle = (90 - math.degrees(math.atan2(along[1], along[0]))) % 180 - 90
             widest = max((len(text) for text in axis.labels), default=0)

@@ -112,20 +112,16 @@ def draw_cloud(
     if len(cloud):
         values = cloud.positions[:, 2] if column is Z else values_of(column, cloud.__getitem__)
         coloured = colours_of(values, column, names)
-        image = with_points(
-            image, shot, cloud.positions - shot.scene.origin, coloured.paint(values), solid
-        )
+        places = cloud.positions - shot.scene.origin
+        image = with_points(image, shot, places, coloured.paint(values), solid)
         if coloured.limits is None:
             page.legend(coloured.labels)
         else:
             unit = f" ({coloured.unit})" if coloured.unit else f"\n{fill(coloured.meaning, 42)}"
             low, high = coloured.limits
             scale = LogNorm if coloured.logarithmic else Normalize
-            page.colour_bar(
-                coloured.scale,
-                scale(low, high if high > low else low + 1),
-                (coloured.name + unit).rstrip(),
-            )
+            norm = scale(low, high if high > low else low + 1)
+            page.colour_bar(coloured.scale, norm, (coloured.name + unit).rstrip())
     page.show(shot, image)
     by = "height" if column is Z else column.name.replace("_", " ")
     page.title(f"Point cloud by {by}", f"{counted(count, 'point')} · {shot.when}", shot.models)

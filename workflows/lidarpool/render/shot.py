@@ -57,9 +57,8 @@ class Samples:
     def paint(self, face_colours: Floats, contrast: float) -> Floats32:
         """Colours (n, 4) of the samples; see `Shot.paint`."""
         image = np.zeros((len(self.triangle), 4), np.float32)
-        surface, ground = (
-            np.flatnonzero(there) for there in (self.triangle >= 0, self.triangle == GROUND)
-        )
+        surface = np.flatnonzero(self.triangle >= 0)
+        ground = np.flatnonzero(self.triangle == GROUND)
         colours = face_colours.astype(np.float32)[self.triangle[surface]]
         if colours.ndim == 3:
             colours = np.einsum("nc,nck->nk", self.weights[surface], colours)

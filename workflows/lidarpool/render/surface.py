@@ -100,10 +100,10 @@ def dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating
     return np.asarray(np.einsum("...i,...i->...", a, b))
 
 
-def spiral(count: int, lowest: float = 0.0) -> Floats:
-    """Spread unit vectors (count, 3) over the sphere above a height: a golden spiral."""
+def spiral(count: int, lowest: float = 0.0, highest: float = 1.0) -> Floats:
+    """Spread unit vectors (count, 3) over the sphere between two heights: a golden spiral."""
     n = np.arange(count)
-    turn, up = 2 * np.pi * 0.6180339887 * n, lowest + (1 - lowest) * (n + 0.5) / count
+    turn, up = 2 * np.pi * 0.6180339887 * n, lowest + (highest - lowest) * (n + 0.5) / count
     level = np.sqrt(1 - up * up)
     return np.stack([level * np.cos(turn), level * np.sin(turn), up], axis=1)
 

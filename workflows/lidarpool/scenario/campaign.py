@@ -394,9 +394,8 @@ class _Given:
         return {"scenarios": fingerprint(self._prints)}
 
     def job(self, number: int) -> Described:
-        return Described(
-            number, self._names[number], {}, scenario=Scenario.load(self.paths[number])
-        )
+        scenario = Scenario.load(self.paths[number])
+        return Described(number, self._names[number], {}, scenario=scenario)
 
 
 def _unique(stems: Iterable[str]) -> list[str]:

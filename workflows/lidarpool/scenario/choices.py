@@ -19,7 +19,7 @@ from ..base.arguments import shown as given
 from ..base.declared import Seed, Text, TextOrTexts, is_text, short, told
 from ..export.table import FORMATS, LAYOUTS
 from .draws import SHARE_LEAST, SIGMAS, Draw
-from .sections import Section
+from .sections import Section, may_be_empty
 
 COUNT_MOST = 10_000_000
 KEPT = ("kitti", "nuscenes", "mcap", "parquet", "images", "folder")
@@ -286,11 +286,6 @@ KeepEntry = Annotated[
 ]
 
 
-def _or_empty(kind: Any) -> Any:
-    """Take a field whose lines are all commented out."""
-    return short(lambda v: v is None, lambda v: {}, kind | None)
-
-
 class CampaignSection(Section):
     """Many jobs from one description: scenarios, and what differs from job to job.
 
@@ -313,7 +308,7 @@ class CampaignSection(Section):
     seed: Annotated[Seed, told("another seed draws other values")] = 0
     vary: Annotated[
         dict[Text, ChoiceEntry],
-        _or_empty(dict[Text, Choice]),
+        may_be_empty(dict[Text, Choice]),
         told(
             "{path: how its value is chosen}; a path has keys, numbers of entries, or their names",
             {"weather.visibility_km": {"log_uniform": [0.2, 20]}},
@@ -323,7 +318,7 @@ class CampaignSection(Section):
     keep: Annotated[KeepEntry, told("format of the data set")] = KeepSection()
     splits: Annotated[
         dict[str, Share],
-        _or_empty(dict[str, Share]),
+        may_be_empty(dict[str, Share]),
         told(
             "{name: share of the jobs}; they add up to 1", {"train": 0.8, "val": 0.1, "test": 0.1}
         ),

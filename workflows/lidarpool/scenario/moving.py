@@ -10,29 +10,22 @@ import numpy as np
 from pydantic import Strict, model_validator
 
 from ..base.arrays import Floats
-from ..base.declared import Text, TextOrTexts, Triple, is_text, short, told
+from ..base.declared import Text, TextOrTexts, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
 from ..sensor import Sensor, Track, load_trajectory
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import (
-    MeshEntry,
-    PoseSection,
-    Section,
-    SensorSection,
-    ShapeSection,
-)
+from .sections import InstrumentPose, MeshEntry, PoseSection, Section, SensorSection, ShapeSection
 from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
 
 
-class MountSection(PoseSection):
+class MountSection(InstrumentPose):
     """Position and angles of a sensor on its carrier, in the carrier's axes."""
 
-    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
     link: Annotated[
         Text | None,
         told(

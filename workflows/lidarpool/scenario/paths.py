@@ -11,7 +11,7 @@ from pydantic import BaseModel
 from ..base.errors import LidarpoolError
 from ..base.words import counted, did_you_mean
 from .scenario import Scenario
-from .validation_errors import models_in
+from .validation_errors import dotted, models_in
 
 
 @dataclass(frozen=True)
@@ -38,7 +38,7 @@ class FieldPath:
     @property
     def place(self) -> str:
         """As errors of a scenario write it: ``scene.files[0].file``."""
-        return "".join(f"[{k}]" if isinstance(k, int) else f".{k}" for k in self.keys)[1:]
+        return dotted(self.keys)
 
 
 def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:

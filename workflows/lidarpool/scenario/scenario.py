@@ -6,7 +6,7 @@ import os
 from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import partial
 from glob import escape
@@ -85,15 +85,26 @@ SEED_KEPT = 5
 MESH_CLOUD = {"precision_m": 0.001}
 
 
+@dataclass
+class Findings:
+    """What was noted when a scene was built."""
+
+    notes: list[str] = field(default_factory=list)  # about objects left out of the scene
+    remarks: list[str] = field(default_factory=list)  # about axes of files
+    sources: dict[str, str] = field(default_factory=dict)  # {file: what it gave}
+    rasters: list[tuple[MeshFile, Raster]] = field(default_factory=list)
+
+    def copy(self) -> Findings:
+        """Return the same, to be added to."""
+        return Findings(*(found.copy() for found in vars(self).values()))
+
+
 class Still(NamedTuple):
     """The still part of a scenario's scene, and what was noted when it was built."""
 
     scene: Scene
     standing: Standing
-    notes: tuple[str, ...]
-    remarks: tuple[str, ...]
-    sources: dict[str, str]
-    rasters: tuple[tuple[MeshFile, Raster], ...]
+    found: Findings
 
 
 class KeptScenes:
@@ -219,14 +230,11 @@ class Scenario(Section):
 
     _folder: Path = PrivateAttr(default=Path())  # that relative file names start from
     _source: str = PrivateAttr(default="the default survey")  # for messages
-    _notes: list[str] = PrivateAttr(default_factory=list)  # about objects left out of the scene
-    _remarks: list[str] = PrivateAttr(default_factory=list)  # about axes of files
-    _sources: dict[str, str] = PrivateAttr(default_factory=dict)  # {file: what it gave}
+    _found: Findings = PrivateAttr(default_factory=Findings)
     _robots: dict[MeshFile, Robot] = PrivateAttr(default_factory=dict)  # {their file: robot}
     _vehicles: list[int | None] = PrivateAttr(default_factory=list)  # classes of the last actors
     # Triangles of a scene, and the trajectory there.
     _way: tuple[Any, Track] | None = PrivateAttr(default=None)
-    _rasters: list[tuple[MeshFile, Raster]] = PrivateAttr(default_factory=list)
     _epsg: int | None = PrivateAttr(default=None)  # of the rasters, where they are in their place
     _placing: Placing | None = PrivateAttr(default=None)  # if no poses are given
 
@@ -240,10 +248,9 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        if path.suffix.lower() in SUFFIXES:
-            data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD}
-            return cls.from_data(data, source=str(path), folder=path.parent)
-        return cls.from_data(read_yaml(path), source=str(path), folder=path.parent)
+        mesh = path.suffix.lower() in SUFFIXES
+        data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD} if mesh else read_yaml(path)
+        return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod
     def from_data(
@@ -355,9 +362,9 @@ class Scenario(Section):
         Also on objects that `build_scene` left out, on files whose axes it guessed, on where the
         sensor is, and on settings without effect.
         """
-        notes = [*self._notes, *self._remarks[:1]]
-        if self._remarks[1:]:
-            notes[-1] += f"; {counted(len(self._remarks) - 1, 'more file')}, too"
+        notes = [*self._found.notes, *self._found.remarks[:1]]
+        if self._found.remarks[1:]:
+            notes[-1] += f"; {counted(len(self._found.remarks) - 1, 'more file')}, too"
         poses = self._of_poses(scene)  # first, because that finds out whether it is an object
         some = filter(None, (self._of_size(scene), poses, self._of_colours(scene)))
         return [*notes, *some, *self._idle()]
@@ -365,7 +372,7 @@ class Scenario(Section):
     @property
     def sources(self) -> dict[str, str]:
         """What `build_scene` read: {file: a line on what it gave}."""
-        return dict(self._sources)
+        return dict(self._found.sources)
 
     def _idle(self) -> Iterator[str]:
         """Tell of settings that another one keeps from having an effect."""
@@ -451,10 +458,7 @@ class Scenario(Section):
         self._placing = None
         still = self._still() if kept is None else kept.find(self._of_scene, self._still)
         scene, standing = still.scene, still.standing
-        self._notes[:], self._remarks[:] = still.notes, still.remarks
-        self._rasters[:] = still.rasters
-        self._sources.clear()
-        self._sources |= still.sources
+        self._found = still.found.copy()
         self._epsg = self._system()
         if not (self.actors or self.traffic):
             return scene
@@ -481,10 +485,7 @@ class Scenario(Section):
 
     def _still(self) -> Still:
         """Build the scene without the actors and traffic of the scenario."""
-        self._notes.clear()
-        self._remarks.clear()
-        self._sources.clear()
-        self._rasters.clear()
+        self._found = Findings()
         meshes: list[Mesh | Instance] = list(seed_objects()) if self.scene.has_seed else []
         moving: list[Actor] = []
         mistakes = Mistakes()
@@ -500,15 +501,8 @@ class Scenario(Section):
         if self.scene.ground is not None:
             below = Scene.from_meshes(meshes or objects.still(lambda _: None))
             objects = objects._replace(standing=(*meshes, self._ground(below)))
-        scene = Scene.of_objects(objects, self._notes.append)
-        return Still(
-            scene,
-            Standing(scene),
-            tuple(self._notes),
-            tuple(self._remarks),
-            dict(self._sources),
-            tuple(self._rasters),
-        )
+        scene = Scene.of_objects(objects, self._found.notes.append)
+        return Still(scene, Standing(scene), self._found)
 
     def _track(self, scene: Scene, standing: Standing | None = None) -> Track:
         """Return the trajectory in the coordinates of a scene; it is made once."""
@@ -520,7 +514,7 @@ class Scenario(Section):
 
     def _system(self) -> int | None:
         """EPSG code of the rasters that stay where they are; they must be of one system."""
-        stay = [(e.file, raster) for e, raster in self._rasters if e.transform().keeps_xy]
+        stay = [(e.file, raster) for e, raster in self._found.rasters if e.transform().keeps_xy]
         systems = {raster.crs: file for file, raster in stay if raster.crs}
         if len(systems) > 1:
             listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
@@ -547,7 +541,7 @@ class Scenario(Section):
                     made = copies_of(entry, mesh, standing, table)
                 if entry.file is not None:
                     words = f", {counted(len(made), 'copy', 'copies')}"
-                    self._sources[entry.file.file] += words
+                    self._found.sources[entry.file.file] += words
                 out += made
         mistakes.tell()
         return out
@@ -591,14 +585,16 @@ class Scenario(Section):
         robot = self._robot(entry)
         without = self._links.intersection(robot.meshes) if entry.trajectory is None else ()
         for link in sorted(without):
-            self._notes.append(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
+            self._found.notes.append(
+                f"{entry.name}: link {link} is left out: a sensor is mounted on it"
+            )
         with prefixed(f"{self._source}: actor {entry.name!r}"):
             return robot.actors(
                 way,
                 self._joints(entry),
                 name=entry.name,
                 without=without,
-                tell=self._notes.append,
+                tell=self._found.notes.append,
             )
 
     def _robot(self, entry: ActorSection) -> Robot:
@@ -609,9 +605,9 @@ class Scenario(Section):
             with prefixed(self._source):
                 path = self._path(file.file)
             self._robots[file] = load_robot(
-                path, opacity=file.opacity, colours=self.coloured, tell=self._notes.append
+                path, opacity=file.opacity, colours=self.coloured, tell=self._found.notes.append
             )
-            self._sources[file.file] = self._robots[file].summary
+            self._found.sources[file.file] = self._robots[file].summary
         return self._robots[file]
 
     def _joints(self, entry: ActorSection) -> Path | None:
@@ -653,7 +649,9 @@ class Scenario(Section):
         if shape not in made:
             name = entry.name or "vehicle"
             if isinstance(shape, MeshFile):
-                made[shape] = one_mesh(name, self._read_still(shape))
+                lost = f"{self._path(shape.file)} moves "
+                read = self._read(shape).still(lambda line: self._found.notes.append(lost + line))
+                made[shape] = one_mesh(name, read)
             else:
                 made[shape] = box(name, shape)
         return made[shape]
@@ -675,11 +673,11 @@ class Scenario(Section):
         self._vehicles = [entry.semantic_class for _, entry in found]
         actors = [actor for actor, _ in found]
         if not actors:
-            self._notes.append(
+            self._found.notes.append(
                 f"{section.file}: no vehicle or person is in the scene from {begin:g} to "
                 f"{begin + duration:g} s of the file: check offset_s, translation and surfaces"
             )
-        self._sources[section.file] = (
+        self._found.sources[section.file] = (
             f"{counted(len(actors), 'actor')} during the survey, of {counted(count, 'vehicle')} "
             "and persons until its end"
         )
@@ -801,10 +799,6 @@ class Scenario(Section):
         mount = MountSection() if self.mount is None else self.mount
         return [self.sensor.mounted(self._folder, self._mount(mount), *common)]
 
-    def _read_still(self, entry: MeshFile) -> tuple[Mesh | Instance, ...]:
-        lost = f"{self._path(entry.file)} moves "
-        return self._read(entry).still(lambda line: self._notes.append(lost + line))
-
     def _read(self, entry: MeshFile) -> Objects:
         with prefixed(self._source):
             path, transform = self._path(entry.file), entry.transform()
@@ -820,10 +814,10 @@ class Scenario(Section):
             window=entry.window,
             epsg=self.cloud.epsg,
             assets=assets,
-            tell=self._notes.append,
-            axes=self._remarks.append,
-            tell_raster=lambda raster: self._rasters.append((entry, raster)),
-            taken=partial(self._sources.setdefault, entry.file),
+            tell=self._found.notes.append,
+            axes=self._found.remarks.append,
+            tell_raster=lambda raster: self._found.rasters.append((entry, raster)),
+            taken=partial(self._found.sources.setdefault, entry.file),
         )
 
     @property
@@ -846,7 +840,7 @@ class Scenario(Section):
     def placing(self, scene: Scene) -> Placing:
         """Where the sensor is put in a scene from mesh files, if no poses are given."""
         if self._placing is None:
-            self._placing = place(scene, self._carried()[0], landscape=bool(self._rasters))
+            self._placing = place(scene, self._carried()[0], landscape=bool(self._found.rasters))
         return self._placing
 
     def _discs(self, scene: Scene) -> tuple[Floats, list[str]]:
@@ -875,11 +869,7 @@ class Scenario(Section):
         return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
 
 
-def _check_free(
-    ends: dict[str, tuple[float, float]],
-    discs: Floats,
-    labels: list[str],
-) -> None:
+def _check_free(ends: dict[str, tuple[float, float]], discs: Floats, labels: list[str]) -> None:
     """Refuse a path that begins or ends in an obstacle, and name the obstacle."""
     for end, point in ends.items():
         inside = np.hypot(*(discs[:, :2] - point).T) < discs[:, 2]

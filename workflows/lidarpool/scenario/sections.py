@@ -345,8 +345,8 @@ class SensorSection(Section):
         ),
     ] = None
     columns: Annotated[
-        Annotated[int, Field(ge=1, le=100_000)] | None,
-        told("for an Ouster or a table of beams: azimuths in one turn", 512),
+        int | None,
+        told("for an Ouster or a table of beams: azimuths in one turn", 512, ge=1, le=100_000),
     ] = None
     rays_per_revolution: RaysPerRevolution = 1000
     layers: Layers = 40
@@ -519,10 +519,6 @@ class ImuSection(Section, Imu):
 
     mount: Annotated[InstrumentPose, told("its pose in the carrier's axes")] = InstrumentPose()
 
-    def imu(self) -> Imu:
-        """Return it as an IMU."""
-        return Imu(**declared(self, Imu) | {"mount": self.mount.pose()})
-
 
 class GnssSection(Section, Gnss):
     """GNSS receiver of the carrier."""
@@ -530,10 +526,6 @@ class GnssSection(Section, Gnss):
     mount: Annotated[InstrumentPose, told("pose of its antenna in the carrier's axes")] = (
         InstrumentPose()
     )
-
-    def gnss(self) -> Gnss:
-        """Return it as a receiver."""
-        return Gnss(**declared(self, Gnss) | {"mount": self.mount.pose()})
 
 
 class NavigationSection(Section, Navigation):
@@ -557,9 +549,10 @@ class NavigationSection(Section, Navigation):
 
     def navigation(self) -> Navigation:
         """Return them as instruments."""
+        imu, gnss = self.imu, self.gnss
         return Navigation(
-            imu=self.imu and self.imu.imu(),
-            gnss=self.gnss and self.gnss.gnss(),
+            imu=imu and Imu(**declared(imu, Imu) | {"mount": imu.mount.pose()}),
+            gnss=gnss and Gnss(**declared(gnss, Gnss) | {"mount": gnss.mount.pose()}),
             gravity_m_s2=self.gravity_m_s2,
             seed=self.seed,
         )
@@ -573,9 +566,7 @@ class Obstacle(Section):
 
     object: Annotated[Text | None, told("name of objects of the scene, with * and ?")] = None
     centre: Annotated[Pair | None, told("centre of a disc, x and y, metres")] = None
-    radius_m: Annotated[
-        Annotated[float, Field(gt=0, le=1e6)] | None, told("radius of the disc, metres")
-    ] = None
+    radius_m: Annotated[float | None, told("radius of the disc, metres", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Obstacle:
@@ -655,12 +646,11 @@ class _Workers:
     """Workers of a local cluster; they come first."""
 
     gpu: Annotated[
-        Annotated[int, Field(ge=1, le=10_000)] | None,
-        told("workers that cast rays; by default one for each GPU", 1),
+        int | None, told("workers that cast rays; by default one for each GPU", 1, ge=1, le=10_000)
     ] = None
     other: Annotated[
-        Annotated[int, Field(ge=1, le=10_000)] | None,
-        told("workers that plan paths; by default by the number of cores", 1),
+        int | None,
+        told("workers that plan paths; by default by the number of cores", 1, ge=1, le=10_000),
     ] = None
 
 
@@ -672,18 +662,14 @@ class PoolSection(Section, TaskOptions, _Workers):
     """
 
 
-def may_be_empty(section: type[Section]) -> Any:
-    """Treat a section with all fields commented out as one of defaults."""
-    return short(lambda v: v is None, lambda v: {}, section | None)
-
-
-def _scene_of(value: str | list[Any] | None) -> dict[str, Any]:
-    return {"preset" if value in ("seed", "none") else "files": value} if value else {}
+def may_be_empty(kind: Any) -> Any:
+    """Treat a section or mapping with all lines commented out as one of defaults."""
+    return short(lambda v: v is None, lambda v: {}, kind | None)
 
 
 # Short form of a scene: the name of a mesh file or preset, or a list of files.
 scene_in_short = short(
     lambda v: v is None or isinstance(v, (str, list)),
-    _scene_of,
+    lambda v: {"preset" if v in ("seed", "none") else "files": v} if v else {},
     Text | MeshEntries | SceneSection | None,
 )

@@ -143,10 +143,8 @@ def following(track: Track, standing: Standing) -> list[Track]:
     times = np.append(times, track.times_s[-1])
     moved = replace(track, start_s=float(times[0]), duration_s=None)
     places, turns = moved.poses(0, (times - times[0]) * 1e9)
-    places, ahead = (
-        places.copy(),
-        turns[:, :2, 0] / np.linalg.norm(turns[:, :2, 0], axis=1)[:, None],
-    )
+    places = places.copy()
+    ahead = turns[:, :2, 0] / np.linalg.norm(turns[:, :2, 0], axis=1)[:, None]
     left = np.column_stack([-ahead[:, 1], ahead[:, 0]])
     probes = [places[:, :2] + STEP_M * way for way in (0 * ahead, ahead, -ahead, left, -left)]
     origin = standing.origin
@@ -163,10 +161,7 @@ def following(track: Track, standing: Standing) -> list[Track]:
     runs = [slice(*ends) for ends in edges.reshape(-1, 2).tolist() if ends[1] - ends[0] > 1]
     return [
         replace(
-            track,
-            times_s=times[run],
-            positions=places[run],
-            quaternions=quaternions_of(axes[run]),
+            track, times_s=times[run], positions=places[run], quaternions=quaternions_of(axes[run])
         )
         for run in runs
     ]

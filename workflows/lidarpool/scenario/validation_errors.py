@@ -36,7 +36,7 @@ def validation_errors(error: ValidationError, model: type[BaseModel]) -> Iterato
 
 
 def _line(detail: ErrorDetails, model: type[BaseModel]) -> str:
-    place, kind, message = _dotted(detail["loc"]), detail["type"], detail["msg"]
+    place, kind, message = dotted(detail["loc"]), detail["type"], detail["msg"]
     if kind == "value_error":
         message = str(detail["ctx"]["error"])
         return f"{place}: {message}" if place else message
@@ -78,7 +78,7 @@ def models_in(annotation: Any) -> Iterator[type[BaseModel]]:
         yield from models_in(inner)
 
 
-def _dotted(place: Sequence[int | str]) -> str:
+def dotted(place: Sequence[int | str]) -> str:
     """Location as poses[0].position."""
     steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place)
     return "".join(steps).removeprefix(".")

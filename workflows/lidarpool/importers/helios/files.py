@@ -111,11 +111,9 @@ def flag(values: dict[str, str], name: str, default: bool) -> bool:
     return values[name].lower() in ("true", "1") if name in values else default
 
 
-def vector(element: Element | None) -> Floats:
-    """Return x, y and z of an element; zeros where there is none."""
-    if element is None:
-        return np.zeros(3)
-    return np.array([number(element, axis, 0.0) for axis in "xyz"])
+def vector(values: Element | dict[str, str] | None) -> Floats:
+    """Return x, y and z of an element or its attributes; zeros where there is none."""
+    return np.array([number({} if values is None else values, axis, 0.0) for axis in "xyz"])
 
 
 def rotation(element: Element | None) -> Floats:

@@ -50,9 +50,8 @@ class Part:
         used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
         found: dict[str, dict[str, str]] = {}
         named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
-        libraries = [self.file.parent / name for name in named] + [self.library] * bool(
-            self.library
-        )
+        libraries = [self.file.parent / name for name in named]
+        libraries += [self.library] if self.library else []
         for library in libraries:
             values: dict[str, str] = {}
             for words in (line.split() for line in _text(library).splitlines()):
@@ -136,14 +135,13 @@ class Surroundings:
             kind = step.get("type", "").lower()
             given = {param.get("key", ""): param for param in step.findall("param")}
             text = {key: param.get("value", "") for key, param in given.items()}
-            if kind in _UNREAD:
-                what = text.get("filepath") or text.get("efilepath", "")
-                self.unread.append(f"{name}, {kind} of {what}: no triangles, left out")
-                return
             mode = text.get("intersectionMode", "transmittive").lower()
+            why = "no triangles" if kind in _UNREAD else ""
             if kind == "detailedvoxels" and mode != "transmittive":
+                why = f"intersectionMode {mode}"
+            if why:
                 what = text.get("filepath") or text.get("efilepath", "")
-                self.unread.append(f"{name}, {kind} of {what}: intersectionMode {mode}, left out")
+                self.unread.append(f"{name}, {kind} of {what}: {why}, left out")
                 return
             if kind in _LOADERS:
                 files, up = _files(text, assets), text.get("up")
@@ -169,8 +167,7 @@ class Surroundings:
             raise LidarpoolError("no filter loads a file.")
         up = up if up in ("y", "z") else None
         for file in files:
-            placed = up, turn, float(scale), offset.copy(), falls
-            yield Part(file, *placed, library, material)
+            yield Part(file, up, turn, float(scale), offset.copy(), falls, library, material)
 
     @cached_property
     def _ground(self) -> Scene | None:

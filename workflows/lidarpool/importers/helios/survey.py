@@ -70,9 +70,8 @@ def import_survey(
         made = _Import(survey, [Path(folder) for folder in assets])
     except LidarpoolError as error:
         told = str(error)
-        raise LidarpoolError(told if told.startswith(str(survey)) else f"{survey}: {told}") from (
-            error
-        )
+        told = told if told.startswith(str(survey)) else f"{survey}: {told}"
+        raise LidarpoolError(told) from error
     out.parent.mkdir(parents=True, exist_ok=True)
     partial = Path(tempfile.mkdtemp(prefix=f".{out.name}.", dir=out.parent))
     try:

@@ -16,7 +16,7 @@ from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
 from ...scene.transform import rotation_about as about
 from ...sensor.trajectory import quaternions_of
-from .files import Assets, clean, flag, number, read
+from .files import Assets, clean, flag, number, read, vector
 
 _SPEED = 70.0  # metres a second, where nothing is said
 _BETWEEN_S = 0.001  # of legs, in which the carrier turns on the spot or goes to its next one
@@ -83,7 +83,7 @@ def read_legs(
         with prefixed(f"leg {index}"):
             platform = assets.settings(element.find("platformSettings"), home)
             scanner = assets.settings(element.find("scannerSettings"), home)
-            place = np.array([number(platform, axis, 0.0) for axis in "xyz"])
+            place = vector(platform)
             if flag(platform, "onGround", False) and "trajectory" not in platform:
                 place[2] = height(place[0], place[1])
             longest = number(element, "maxDuration_s", number(scanner, "maxDuration_s", -1))
