@@ -27,6 +27,7 @@ from lidarpool import Campaign, CampaignJob, LidarpoolError, Scene, Sensor, Surv
 from lidarpool.base.errors import explained
 from lidarpool.base.storage import Storage
 from lidarpool.export.dataset import DataSet
+from lidarpool.report import campaign_output
 from lidarpool.run.progress import Progress
 
 BASE = """
@@ -511,6 +512,26 @@ def test_nothing_behind_a_link_is_touched(client, tmp_path, unwritten, where):
     assert (run.done, run.failed) == (3, ()) and not (tmp_path / "ds" / "run").exists()
     unwritten.run(tmp_path / "whole", client=client)
     assert bytes_of(tmp_path / "ds") == bytes_of(tmp_path / "whole")
+
+
+@pytest.mark.parametrize("harm", ["jobs/*/cloud.ply", ".jobs/*.json"])
+def test_a_campaign_whose_only_job_was_harmed_goes_on(
+    client, tmp_path, unwritten, monkeypatch, harm
+):
+    for path in (tmp_path / "ds").glob(harm):
+        path.unlink()
+    for _ in range(2):  # what is to be done again is forgotten first, and nothing else is there
+        with monkeypatch.context() as patched, pytest.raises(LidarpoolError, match="no cluster"):
+            patched.setattr(campaign_output, "run_campaign", refuse)
+            unwritten.run(tmp_path / "ds", client=client, resume=True)
+    assert unwritten.run(tmp_path / "ds", client=client, resume=True).done == 3
+    (tmp_path / "ds" / "run").mkdir()  # a run that was killed as it removed itself
+    assert unwritten.run(tmp_path / "ds", client=client, resume=True).done == 3
+    assert not (tmp_path / "ds" / "run").exists()
+
+
+def refuse(*_: Any, **__: Any) -> None:
+    raise LidarpoolError("no cluster")
 
 
 def test_a_run_removes_its_own_files_only(client, tmp_path, unwritten):

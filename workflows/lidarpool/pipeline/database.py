@@ -112,8 +112,8 @@ class RunDatabase:
 
     @property
     def used(self) -> bool:
-        """Whether anything is committed."""
-        return bool(self.scans_done or self.trials or self.jobs)
+        """Whether anything is committed, or was."""
+        return bool(self.scans_done or self.trials or self.jobs) or "forgot" in self.meta
 
     @property
     def ordered(self) -> list[Receipt]:
@@ -240,7 +240,8 @@ class RunDatabase:
                 self.jobs[number] = int(failed)
 
     def forget_jobs(self, numbers: Iterable[int]) -> None:
-        """Let some jobs be done again."""
+        """Let some jobs be done again: there are files of them, also if there is nothing else."""
+        self.set(forgot="jobs")
         with self._transaction():
             for number in numbers:
                 self._sql.execute("DELETE FROM jobs WHERE number = ?", (number,))

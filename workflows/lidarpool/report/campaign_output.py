@@ -96,8 +96,8 @@ def make_dataset(
         )
     kept = out.below(RUN_FOLDER)
     with result_folder(making.out), ExitStack() as stack:
-        there = out.entries()
-        begin = not resume and (making.fresh or RUN_FOLDER not in there)
+        there, unfinished = out.entries(), FILE in kept.sizes()
+        begin = not resume and (making.fresh or not unfinished)
         if begin and INDEX_FILE in there and not making.overwrite:
             raise LidarpoolError(
                 f"{out} holds a finished data set, and one needs a folder of its own: give another "
@@ -106,10 +106,11 @@ def make_dataset(
         if begin and (making.fresh or making.overwrite):
             _remove_dataset(out, kept)
         made, wrong = None, dict[int, str]()
-        if resume and CAMPAIGN_FILE in there and RUN_FOLDER not in there:
+        if resume and CAMPAIGN_FILE in there and not unfinished:
             made = check_same(out, campaign)
             whole, wrong = _look(dataset, read_table(out), making.verify, campaign)
             if whole == campaign.count and not wrong and _is_indexed(out, whole):
+                kept.remove([], folder=True)  # of a run that was killed as it removed itself
                 tell(f"{out} is complete: nothing is left to do")
                 run = run_result(_shown(read_table(out), page), time.monotonic())
                 page.finish(run)

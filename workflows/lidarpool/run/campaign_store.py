@@ -45,7 +45,7 @@ class CampaignStore(KeptRun):
     @property
     def kept(self) -> str:
         """Jobs that have ended, in words; empty if none was begun."""
-        begun = self.db.jobs or jobs_of(self.place)
+        begun = self.db.used or jobs_of(self.place)
         return f"{len(self.db.jobs):,} of {self.count:,} jobs" if begun else ""
 
     @property
@@ -55,8 +55,9 @@ class CampaignStore(KeptRun):
 
     def forget(self, numbers: Iterable[int]) -> None:
         """Let some jobs be done again."""
-        self.db.forget_jobs(numbers)
-        self.resumed = len(self.db.jobs)
+        if forgotten := [*numbers]:
+            self.db.forget_jobs(forgotten)
+            self.resumed = len(self.db.jobs)
 
     def take_over(self, made: Mapping[str, Any], rows: Iterable[JobRow]) -> None:
         """Begin with the jobs of a finished data set, whose record is given."""
