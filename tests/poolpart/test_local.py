@@ -155,8 +155,9 @@ def test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers(tm
     assert len(output.splitlines()) == 1  # that of the driver: no worker has run the script
 
 
-def test_processes_of_the_user_are_started_as_ever(processes):
+def test_processes_of_the_user_are_started_as_ever(processes, monkeypatch):
     """Also one of the name that Dask gives to its workers; once they have started."""
+    monkeypatch.setattr(sys.modules["__main__"], "__file__", __file__, raising=False)  # a script
     for name in ("Process-1", "Dask Worker process (from Nanny)"):
         data = spawn.get_preparation_data(name)
         assert data["name"] == name and data.keys() & {"init_main_from_name", "init_main_from_path"}

@@ -77,7 +77,7 @@ def untouched(tmp_path: Path) -> Callable[[], bool]:
     return untouched
 
 
-KEPT = r"[\d,]+ of 360,000 scans are kept in out/run: continue with --resume \(.*\)\.$"
+KEPT = r"[\d,]+ of 360,000 scans are kept in \S+/out/run: continue with --resume \(.*\)\.$"
 
 
 def check_interrupted(run: Any, code: int) -> None:
@@ -260,7 +260,7 @@ def test_workers_follow_a_driver_that_was_killed(start, untouched):
 def test_ctrl_c_while_the_result_is_written(start, untouched, cluster):
     run = start(SHORT, "--scheduler", cluster, prelude=STAYS_WRITING).wait_for(WRITING)
     check_interrupted(run, run.signal(signal.SIGINT, group=True))
-    assert "stopped. 108 of 108 scans are kept in out/run" in run.said
+    assert re.search(r"stopped\. 108 of 108 scans are kept in \S+/out/run", run.said)
     assert untouched(kept=True)
 
 
