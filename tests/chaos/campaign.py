@@ -189,8 +189,8 @@ def judge(dataset: Path, reference: dict[str, bytes], tally: Tally) -> None:
     tally.differing += [
         name for name in {*found, *reference} if found.get(name) != reference.get(name)
     ]
-    left = [path.name for path in dataset.iterdir()]
-    tally.differing += [name for name in left if name == "run" or name.endswith("-dataset")]
+    left = [*(dataset / "run").rglob("*"), *dataset.glob("run"), *dataset.glob("*-dataset")]
+    tally.differing += [str(path.relative_to(dataset)) for path in left]
 
 
 def main(arguments: list[str] | None = None) -> int:

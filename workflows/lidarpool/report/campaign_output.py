@@ -95,6 +95,12 @@ def make_dataset(
             "fresh and overwrite remove what resume, retry_failed and verify go on with."
         )
     kept = out.below(RUN_FOLDER)
+    backend = making.backend or "auto"
+
+    def opened() -> CampaignStore:
+        whole = campaign.identity, campaign.count, backend, kept, making.parts
+        return CampaignStore(*whole, resume=resume)
+
     with result_folder(making.out), ExitStack() as stack:
         there, unfinished = out.entries(), FILE in kept.sizes()
         begin = not resume and (making.fresh or not unfinished)
@@ -110,19 +116,13 @@ def make_dataset(
             made = check_same(out, campaign)
             whole, wrong = _look(dataset, read_table(out), making.verify, campaign)
             if whole == campaign.count and not wrong and _is_indexed(out, whole):
-                kept.remove([], folder=True)  # of a run that was killed as it removed itself
+                if RUN_FOLDER in there:  # a killed run has not removed all of itself
+                    opened().remove()
                 tell(f"{out} is complete: nothing is left to do")
                 run = run_result(_shown(read_table(out), page), time.monotonic())
                 page.finish(run)
                 return run
-        store = CampaignStore(
-            campaign.identity,
-            campaign.count,
-            making.backend or "auto",
-            kept,
-            making.parts,
-            resume=resume,
-        )
+        store = opened()
         stack.enter_context(store.kept_on_error())
         _own_files(out, begun=made is not None or bool(store.kept))
         if made is not None:
