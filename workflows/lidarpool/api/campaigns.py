@@ -2,29 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from distributed import Client
 
 from ..base.arguments import checked
+from ..base.declared import declared
+from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
-from ..live.pages import page_of_campaign
-from ..pipeline import LIDAR
-from ..report.campaign_output import Making, make_dataset
-from ..run.bars import bars_here
-from ..run.campaign import CampaignRun
-from ..run.checks import slots_needed
-from ..run.connection import local_client
-from ..run.job import Job
+from ..live.pages import live_page
+from ..report.campaign_output import DataSetOutput
+from ..run.conductor import Conductor
+from ..run.options import RunOptions
 from ..run.progress import Progress
-from ..run.watch import Waiting
+from ..run.result import CampaignRun
+from ..run.screen import Screen
+from ..run.store import RUN_FOLDER
 from ..scenario import campaign as described
-
-logger = logging.getLogger(__name__)
+from ..scenario.sections import TaskOptions
 
 
 class Campaign(described.Campaign):  # noqa: D101 - as there
@@ -98,20 +95,23 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             another campaign or version; one or two lines say which and what to do.
         """
 
-        def cluster(_: Waiting, job: Job) -> AbstractContextManager[Client]:
-            if client is not None:
-                return nullcontext(client)
-            return local_client(
-                gpu_workers=gpu_workers,
-                lidar_slots=slots_needed(job)[LIDAR] + 1,
-                other_workers=None,
-                planning=False,
-            )
-
-        making = Making(
-            output_place(out), client is None, resume, fresh, retry_failed, verify, overwrite,
-            parts, backend, wait_s, patience_s,
-        )  # fmt: skip
-        progress = bars_here() if on_progress is None else nullcontext(on_progress)
-        with page_of_campaign(self, live) as page:
-            return make_dataset(self, making, cluster, progress, logger.info, page)
+        place = output_place(out)
+        options = RunOptions(
+            out=place,
+            folder=Storage.at(place).below(RUN_FOLDER),
+            client=client,
+            gpu_workers=gpu_workers,
+            **declared(self.pool, TaskOptions) | ({"backend": backend} if backend else {}),
+            parts=parts,
+            resume=resume,
+            fresh=fresh,
+            retry_failed=retry_failed,
+            verify=verify,
+            overwrite=overwrite,
+            live=live,
+            wait_s=wait_s,
+            patience_s=patience_s,
+        )
+        with live_page(self, live) as page:
+            output = DataSetOutput(place, self)
+            return Conductor(self, options, output, Screen(on_progress), page)()

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable
-from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..live.pages import page_of_run
-from ..pipeline import LIDAR, Frame
+from ..live.pages import live_page
+from ..pipeline import Frame
 from ..plan import Planning
-from ..run.bars import bars_here
-from ..run.checks import slots_needed
-from ..run.conductor import conducted
-from ..run.connection import local_client
-from ..run.job import Job
+from ..run.conductor import Conductor, Kept
+from ..run.jobs import OneJob
+from ..run.options import RunOptions
 from ..run.progress import Progress
-from ..run.store import RunStore
-from ..run.watch import Waiting
+from ..run.screen import Screen
+from ..scenario.job import Job
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.world import check_backend_here
 from .result import Result
-
-logger = logging.getLogger(__name__)
 
 
 @checked
@@ -128,40 +122,26 @@ def simulate(
     >>> print(len(result.cloud), "points")                            # doctest: +SKIP
     1613 points
     """
-    job = Job(
-        scene,
-        survey,
-        planning,
+    options = RunOptions(
+        client=client,
         backend=backend,
         queue_capacity=queue_capacity,
         collectors=collectors,
         batch_mb=batch_mb,
+        gpu_workers=gpu_workers,
+        other_workers=other_workers,
+        tls=tls,
         wait_s=wait_s,
         patience_s=patience_s,
+        folder=folder,
+        parts=parts,
+        resume=resume,
+        live=live,
     )
+    jobs = OneJob(Job(scene, survey, planning))
     if client is None:  # before anything is made in the folder
         check_backend_here(backend)
-    store = RunStore(job, folder, parts, resume=resume)
-
-    def cluster(_: Waiting) -> AbstractContextManager[Client]:
-        if client is not None:
-            return nullcontext(client)
-        return local_client(
-            gpu_workers=gpu_workers,
-            lidar_slots=slots_needed(job)[LIDAR],
-            other_workers=other_workers,
-            planning=planning is not None,
-            tls=tls,
-        )
-
-    with conducted(
-        store,
-        cluster,
-        own=client is None,
-        progress=bars_here() if on_progress is None else nullcontext(on_progress),
-        page=page_of_run(job, live and not store.complete),
-        tell=logger.info,
-        on_frame=on_frame or (lambda frame: None),
-    ) as (result, _):
-        store.db.close()
-        return Result(**vars(result))
+    with live_page(jobs, live) as page:
+        screen, on_frame = Screen(on_progress), on_frame or (lambda frame: None)
+        result = Conductor(jobs, options, Kept(), screen, page, on_frame)()
+    return Result(**vars(result))

@@ -176,7 +176,16 @@ def run(scenarios: tuple[str, ...], **given: Any) -> None:
 
 
 def _run(
-    paths: Sequence[Path], retry_failed: bool = False, number: int | None = None, **given: Any
+    paths: Sequence[Path],
+    out: Path | Storage,
+    *,
+    resumable: bool = True,
+    no_plan: bool = False,
+    number: int | None = None,
+    quiet: bool,
+    verbose: bool,
+    as_json: bool,
+    **given: Any,
 ) -> None:
     from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
 
@@ -185,26 +194,28 @@ def _run(
         start_fork_server()  # imports what workers need in the background
     try:
         with deferred_interrupts():  # an interrupted import cannot be repeated
+            from ..base.storage import Storage
             from ..run.cluster_file import ClusterFile
+            from ..run.store import RUN_FOLDER
             from ..scenario.campaign import Campaign, is_campaign
             from ..scenario.scenario import Scenario
-            from .run_command import RunOptions, run_scenario
+            from .run_command import Terminal, run_campaign, run_job, run_scenario
         if given.get("cluster") is not None:
             given["cluster"] = ClusterFile.load(given["cluster"])
-        told = RunOptions(**given)
+        terminal = Terminal(quiet, verbose, as_json)
+        given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER) if resumable else None}
         if len(paths) > 1 or (paths and is_campaign(paths[0])):
-            from .campaign_command import run_campaign, run_job
-
             several = len(paths) > 1
             campaign = Campaign.of_scenarios(paths) if several else Campaign.load(paths[0])
             if number is not None:
-                run_job(campaign, number, told)
+                run_job(campaign, number, terminal, **given)
             else:
-                run_campaign(campaign, told, retry_failed)
-        elif retry_failed or told.verify or number is not None:
+                run_campaign(campaign, terminal, **given)
+        elif given.get("retry_failed") or given.get("verify") or number is not None:
             raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
         else:
-            run_scenario(Scenario.load(paths[0]) if paths else Scenario(), told)
+            scenario = Scenario.load(paths[0]) if paths else Scenario()
+            run_scenario(scenario, terminal, no_plan=no_plan, **given)
     finally:
         stop_fork_server()
 

@@ -1,42 +1,50 @@
-"""The commands `run` and `demo` without their options: survey, planning, files."""
+"""The commands `run` and `demo` without their options: surveys, campaigns, and what is printed."""
 
 from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import click
 from distributed import Client
 
-from ..base.open3d_module import load_open3d
+from ..base.declared import declared
+from ..base.errors import LidarpoolError
 from ..base.storage import Storage
-from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
-from ..export.folder import local_result, result_folder
-from ..export.formats import Format
-from ..live.pages import page_of_run
-from ..pipeline import LIDAR, OTHER
-from ..pipeline.database import FILE
-from ..report.output import CLOUD, further_files, refuse_to_replace, write_result
+from ..export.dataset import DataSet
+from ..export.folder import local_result, output_place
+from ..export.jobs import Tally
+from ..live.pages import live_page
+from ..report.campaign_output import (
+    CAMPAIGN_FILE,
+    DataSetOutput,
+    check_same,
+    failures,
+    row_of,
+    verify,
+)
+from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
-from ..run.checks import slots_needed
-from ..run.cluster_file import ClusterFile
-from ..run.conductor import Page, conducted
-from ..run.connection import TlsFiles, connected, local_client, started_client
-from ..run.identity import identity_of
-from ..run.job import Job, make_job
-from ..run.result import RunResult
-from ..run.store import RUN_FOLDER, RunStore, drop_run
-from ..run.watch import Waiting
+from ..run.conductor import Conductor
+from ..run.jobs import OneJob
+from ..run.options import RunOptions
+from ..run.progress import Show
+from ..run.result import CampaignRun, RunResult
+from ..run.screen import Screen
+from ..run.store import RUN_FOLDER
+from ..scenario.advice import advice
+from ..scenario.build import Built, build
+from ..scenario.campaign import Campaign
+from ..scenario.job import Job, job_of
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
-from ..scenario.sections import PoolSection
+from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
@@ -44,127 +52,139 @@ from .worker_logs import WorkerLogs
 
 
 @dataclass(frozen=True)
-class RunOptions:
-    """How a scenario is to be run: the options of `lidarpool run`, where they are told of.
+class Terminal(Screen):
+    """Tells the user of a command."""
 
-    `resumable`: keep the run in the output folder; otherwise `resume` and `fresh` have no effect.
-    """
-
-    out: Path | Storage
-    scheduler: str | None = None
-    cluster: ClusterFile | None = None
-    files: TlsFiles | None = None
-    tls: bool = False
-    backend: str | None = None
-    no_plan: bool = False
-    resumable: bool = True
-    resume: bool = False
-    fresh: bool = False
-    verify: bool = False
     quiet: bool = False
     verbose: bool = False
     as_json: bool = False
-    live: bool = False
-    stay: bool = True
-    only: str | None = None
-    overwrite: bool = False
-    parts: str | None = None
-    wait_s: float = WAIT_S
-    patience_s: float = PATIENCE_S
 
-    @property
-    def here(self) -> bool:
-        """Whether it is to be run on a cluster of this machine, made for it."""
-        return self.scheduler is None and self.cluster is None
+    def tell(self, words: str) -> None:
+        """Print a note."""
+        if not self.quiet:
+            tell(f"note: {words}")
+
+    def status(self, words: str) -> AbstractContextManager[None]:
+        """Show what is going on while the body runs."""
+        return shown_status(words, self.quiet)
+
+    def progress(self) -> AbstractContextManager[Show]:
+        """Show bars or lines while the body runs."""
+        return shown_progress(self.quiet)
+
+    @contextmanager
+    def starting(
+        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
+    ) -> Iterator[Client]:
+        """Show a status until the cluster has started; its workers log as this process does."""
+        with ExitStack() as stack:
+            with self.status(words):
+                client = stack.enter_context(cluster)
+            if own:  # its workers share the terminal
+                set_logs(self.verbose)
+                client.register_plugin(WorkerLogs(self.verbose))
+            yield client
+
+
+def options_of(pool: PoolSection, backend: str | None, **given: Any) -> RunOptions:
+    """Options of a scenario's section `pool`, and those that were given."""
+    tasks = declared(pool, TaskOptions) | ({"backend": backend} if backend else {})
+    return RunOptions(gpu_workers=pool.gpu, other_workers=pool.other, **tasks, **given)
 
 
 def run_scenario(
-    scenario: Scenario,
-    options: RunOptions,
-    job: Job | None = None,
-    judge: Callable[[RunResult], str] = lambda result: "",
+    scenario: Scenario, terminal: Terminal, *, no_plan: bool, only: str | None, **given: Any
 ) -> None:
-    """Run a scenario, write the result and print a summary.
-
-    The `job` is by default that of the scenario; `judge` returns a note on its result.
+    """Run a scenario, write the result and print a summary; `given` as of `RunOptions`.
 
     LidarpoolError if the run fails; notes of the error say what was kept.
     """
-    set_logs(options.verbose)
-    if options.here:  # before reading the scene, which may take long
-        check_backend_here(options.backend or scenario.pool.backend)
-    with shown_status("reading the scene", options.quiet, logged=False):
-        job = job or make_job(
-            scenario,
-            options.backend,
-            options.no_plan,
-            wait_s=options.wait_s,
-            patience_s=options.patience_s,
-        )
-    if options.cluster is not None:
-        options.cluster.require(slots_needed(job))
-    if not options.quiet:
-        for note in scenario.advice(job.scene):
-            tell(f"note: {note}")
-    with ExitStack() as whole, page_of_run(job, options.live) as page:
-        result, report = _run(scenario, job, options, page, whole, judge)
-        if options.as_json:
+    set_logs(terminal.verbose)
+    options = options_of(scenario.pool, **given)
+    if options.own:  # before reading the scene, which may take long
+        check_backend_here(options.backend)
+    with shown_status("reading the scene", terminal.quiet, logged=False):
+        built = build(scenario, plans=not no_plan)
+        job = job_of(built)
+    _run_survey(built, job, options, terminal, only)
+
+
+def _run_survey(
+    built: Built,
+    job: Job,
+    options: RunOptions,
+    terminal: Terminal,
+    only: str | None,
+    judge: Callable[[RunResult], str] = lambda result: "",
+) -> None:
+    """Run a job, and write it as the result of a survey; `judge` returns a note on it."""
+    assert options.out is not None, "commands write"
+    for note in advice(built):
+        terminal.tell(note)
+    jobs = OneJob(job)
+    output = SurveyOutput(options.out, job, built.scenario, only == "cloud", judge)
+    with live_page(jobs, options.live) as page:
+        result, report = Conductor(jobs, options, output, terminal, page)()
+        if terminal.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
         else:
-            _tell(options.out, result, job, report)
+            _tell_result(options.out, result, job, report)
         if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
                 page.stay(folder / CLOUD)
 
 
-def _run(
-    scenario: Scenario,
-    job: Job,
-    options: RunOptions,
-    page: Page,
-    whole: ExitStack,
-    judge: Callable[[RunResult], str],
-) -> tuple[RunResult, dict[str, Any]]:
-    """Run what is not done yet, write the result, and return it with its report.
+def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **given: Any) -> None:
+    """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
+    set_logs(terminal.verbose)
+    if only:
+        raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
+    options = options_of(campaign.pool, **given)
+    assert options.out is not None, "commands write"
+    with live_page(campaign, options.live) as page:
+        output = DataSetOutput(options.out, campaign)
+        run = Conductor(campaign, options, output, terminal, page)()
+        _tell_campaign(options.out, run, as_json=terminal.as_json)
+        if options.live and options.stay:
+            page.stay()
+    if run.failed:
+        raise LidarpoolError(failures(run))
 
-    Once the result is in place, a note says so in any error or interrupt that ends `whole`.
+
+def run_job(
+    campaign: Campaign, number: int, terminal: Terminal, *, only: str | None, **given: Any
+) -> None:
+    """Run one job of a campaign again, and write it as the result of a survey.
+
+    Where the place is the data set of the campaign, the result is a folder in it, and its points
+    must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
+    other software, or its files there are damaged.
     """
-    formats = formats_of(scenario)
-    for one in formats:
-        one.check_installed()
-    load_open3d()  # what writes the cloud in the end
-    out = options.out
+    set_logs(terminal.verbose)
+    place, name = Storage.at(given["out"]), campaign.name(number)
+    dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
+    of_dataset = CAMPAIGN_FILE in place.entries()
+    if of_dataset:
+        given["backend"] = check_same(place, campaign)["backend"]
+        verify(place, number)
+        out = output_place(f"{given['out']}/job-{name}")
+        given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER)}
+    scenario = campaign.scenario(number)
+    built, job = build(scenario, plans=False), campaign.job(number, columns=dataset.columns)
 
-    def in_place() -> None:
-        whole.enter_context(_noting_complete(out))
-        store.remove()
+    def compare(result: RunResult) -> str:
+        row = row_of(place, number) if of_dataset else None
+        if row is None or row.error:
+            return ""
+        if Tally.of(result.points).sha256 != row.sha256:
+            raise LidarpoolError(
+                f"job {name} has other points than those in {place}: files that it is "
+                "made of have changed, such as images of a mesh."
+            )
+        return f"the points are those of job {name} in {place}, bit for bit"
 
-    with result_folder(out) as folder:
-        kept = Storage.at(out).below(RUN_FOLDER)
-        goes_on = options.resume and FILE in kept.sizes()
-        if not goes_on:
-            further, own = further_files(job.survey, formats), partial(identity_of, job)
-            refuse_to_replace(out, own, further, overwrite=options.overwrite)
-        store = _store(job, options, kept, goes_on)
-        with conducted(
-            store,
-            lambda waiting: cluster_of(scenario.pool, slots_needed(job), options, waiting),
-            own=options.here,
-            progress=shown_progress(options.quiet),
-            page=nullcontext(page),
-            tell=teller(options),
-            keep=any(one.in_pieces for one in formats),
-        ) as (result, workers):
-            page.finish(result)
-            if note := judge(result):
-                result = replace(result, notes=(*result.notes, note))
-            only_cloud = options.only == "cloud"
-            what = "the cloud" if only_cloud else "the cloud, the pictures and the report"
-            with shown_status(f"writing {what}", options.quiet):
-                report = write_result(
-                    folder, out, result, scenario, in_place, only_cloud, formats, workers
-                )
-    return result, report
+    options = options_of(scenario.pool, **given)
+    _run_survey(built, replace(job, number=0), options, terminal, only, compare)
 
 
 def no_hits(job: Job) -> str:
@@ -175,70 +195,9 @@ def no_hits(job: Job) -> str:
     return f"no ray hit anything: check poses, ranges and units; {where}; {seen}"
 
 
-def formats_of(scenario: Scenario) -> list[Format]:
-    """List the formats that a scenario exports the cloud to."""
-    return [Format(one.format, one.layout) for one in scenario.output.write if one.format != "ply"]
-
-
-@contextmanager
-def _noting_complete(out: Path | Storage) -> Iterator[None]:
-    """Add a note to an error or interrupt that the result is complete."""
-    try:
-        yield
-    except BaseException as error:
-        error.add_note(f"The result in {out} is complete.")
-        raise
-
-
-def _store(job: Job, options: RunOptions, place: Storage, goes_on: bool) -> RunStore:
-    """Store of the run, with what an earlier run has left if it is to be resumed."""
-    if not options.resumable:
-        return RunStore(job)
-    if options.fresh:
-        drop_run(place)
-    with shown_status("checking the points of the earlier run", options.quiet or not goes_on):
-        store = RunStore(job, place, options.parts, resume=options.resume)
-    if options.resume and not (store.kept or store.notes):
-        store.notes.append(f"there was nothing to resume in {options.out}")
-    return store
-
-
-def cluster_of(
-    pool: PoolSection, slots: Mapping[str, int], options: RunOptions, waiting: Waiting
-) -> AbstractContextManager[Client]:
-    """Client of the cluster that is to be started or connected to, for so many slots."""
-    if options.scheduler is not None:
-        return connected(options.scheduler, options.files, waiting)
-    if options.cluster is not None:
-        started = started_client(options.cluster, teller(options))
-        return _with_status(started, f"starting {options.cluster}", options)
-    local = local_client(
-        gpu_workers=pool.gpu, lidar_slots=slots[LIDAR], other_workers=pool.other,
-        planning=OTHER in slots, tls=options.tls,
-    )  # fmt: skip
-    return _with_status(local, "starting the workers", options)
-
-
-@contextmanager
-def _with_status(
-    cluster: AbstractContextManager[Client], starting: str, options: RunOptions
-) -> Iterator[Client]:
-    """Show a status until the cluster has started."""
-    with ExitStack() as stack:
-        with shown_status(starting, options.quiet):
-            client = stack.enter_context(cluster)
-            if options.here:  # its workers share the terminal
-                set_logs(options.verbose)
-                client.register_plugin(WorkerLogs(options.verbose))
-        yield client
-
-
-def teller(options: RunOptions) -> Callable[[str], None]:
-    """Return what prints a note, unless it is to be quiet."""
-    return lambda words: None if options.quiet else tell(f"note: {words}")
-
-
-def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:
+def _tell_result(
+    out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]
+) -> None:
     for note in report["notes"]:
         click.echo(f"note: {note}")
     if not result.hits:
@@ -260,3 +219,19 @@ def _tell(out: Path | Storage, result: RunResult, job: Job, report: dict[str, An
             possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
         click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
     click.echo(f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}")
+
+
+def _tell_campaign(out: Path | Storage, run: CampaignRun, *, as_json: bool) -> None:
+    if as_json:
+        names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
+        told = {"folder": str(out), "jobs": run.done, "failed": [row.name for row in run.failed]}
+        told |= {name: getattr(run, name) for name in names}
+        click.echo(json.dumps(told, indent=1, allow_nan=False))
+        return
+    for note in run.notes:
+        click.echo(f"note: {note}")
+    click.echo(
+        f"{counted(run.done, 'job')}, {counted(run.rays, 'ray')}, "
+        f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)"
+    )
+    click.echo(f"data set in {click.format_filename(str(out))}: see README.md there")

@@ -7,9 +7,9 @@ import json
 import re
 import zlib
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from functools import lru_cache
 from itertools import islice
 from pathlib import Path
@@ -24,7 +24,7 @@ from ..columns.cloud import CloudLike
 from .boxes import Boxes
 from .folder import local_folder
 from .formats import Format
-from .jobs import JobRow
+from .jobs import JobRow, Tally
 from .nuscenes import merge
 from .pieces import RANGE_PIECES, RANGE_POINTS, Entry, Pieces, Written, pieces_of
 from .sweeps import MIXED_UP, SWEEPS_FILE, Sweeps
@@ -37,6 +37,7 @@ DATA_SETS = {
 }  # fmt: skip
 INDEX_FILE = "dataset.json"  # a data set with this file is finished
 BOXES_FILE = "boxes.npz"
+_MANIFESTS = ".jobs"
 VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
 _AHEAD = 16  # jobs that are looked at ahead
@@ -88,11 +89,14 @@ class DataSet:
         kitti, nuscenes, mcap, parquet, images or folder.
     layout
         Of points in mcap: velodyne, autoware, ouster or images.
+    made_with
+        What the bytes of all jobs depend on, for JSON; each manifest says it.
     """
 
     place: Storage
     format: Literal["kitti", "nuscenes", "mcap", "parquet", "images", "folder"]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
+    made_with: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         if self.format not in DATA_SETS:
@@ -116,15 +120,16 @@ class DataSet:
 
     def write_job(
         self,
-        number: int,
-        name: str,
+        row: JobRow,
         cloud: CloudLike,
         sweeps: Sweeps,
         made_of: Sequence[Sequence[str]] = (),
         *,
         listing: Listing | None = None,
-    ) -> None:
+    ) -> JobRow:
         """Write the files of a job; whoever writes them again writes the same bytes.
+
+        Returns its row, with what is counted of the points.
 
         Points are read in order, a sweep at a time or, for Parquet, a million. Every file
         appears completely or not at all. `made_of` has names and hashes of the files that the
@@ -136,8 +141,11 @@ class DataSet:
             If a package or column is missing, the cloud is not of these sweeps, or the place
             cannot be written to.
         """
-        entry, one = Entry(number, name), self._of_jobs
+        number, name, one = row.number, row.name, self._of_jobs
+        entry = Entry(number, name)
         one.check_installed()
+        tally = Tally.of(cloud)
+        row = replace(row, points=tally.points, sha256=tally.sha256, classes=tally.classes)
         one.check_columns(cloud)
         place = listing or Listing.of(self.place)
         boxes: list[Boxes] = []
@@ -168,8 +176,12 @@ class DataSet:
             of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
             manifest |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
             manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
+            # Of its row, what every run gives.
+            row_ = asdict(replace(row, seconds=0.0))
+            manifest |= {"made_with": dict(self.made_with), "row": row_}
             manifest["crc"] = _crc(manifest)
             place.write(_manifest_file(name), json.dumps(manifest).encode())
+        return row
 
     def finish(self, jobs: Iterable[JobRow]) -> None:
         """Write the files that hold all jobs, from those that are done, in their order.
@@ -219,11 +231,7 @@ class DataSet:
         sizes = lru_cache(_LISTED)(lambda folder: self.place.below(folder).sizes())
 
         def look_at(job: JobRow) -> tuple[dict[str, Any], str]:
-            try:
-                manifest = json.loads(self.place.read(_manifest_file(job.name)))
-                if manifest.pop("crc") != _crc(manifest):
-                    raise ValueError("a bit has changed")
-            except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError):
+            if not (manifest := self._manifest(job.name)):
                 return {}, f"{_manifest_file(job.name)} is missing or damaged"
             for name, (size, crc) in manifest["files"].items():
                 folder, _, file = name.rpartition("/")
@@ -236,6 +244,27 @@ class DataSet:
         with ThreadPoolExecutor(_REQUESTS, "read") as pool:
             while some := [*islice(done, _AHEAD)]:
                 yield from zip(some, pool.map(look_at, some), strict=True)
+
+
+    def _manifest(self, name: str) -> dict[str, Any]:
+        """Read the manifest of a job; empty if it is missing or damaged."""
+        try:
+            manifest: dict[str, Any] = json.loads(self.place.read(_manifest_file(name)))
+            return manifest if manifest.pop("crc") == _crc(manifest) else {}
+        except (FileNotFoundError, ValueError, LookupError, TypeError, AttributeError):
+            return {}
+
+    def rows(self, known: Collection[str]) -> Iterator[tuple[JobRow, Mapping[str, Any]]]:
+        """Yield the rows of jobs that are there, but for known names, and what made them.
+
+        OSError if the place cannot be read.
+        """
+        names = (name.removesuffix(".json") for name in self.place.below(_MANIFESTS).sizes())
+        unknown = (name for name in names if name not in known)
+        with ThreadPoolExecutor(_REQUESTS, "read") as pool:
+            while some := [*islice(unknown, _AHEAD)]:
+                for manifest in filter(None, pool.map(self._manifest, some)):
+                    yield JobRow.of(manifest["row"]), manifest["made_with"]
 
 
 @dataclass(frozen=True)
@@ -256,7 +285,7 @@ class Listing(Storage):
 
 
 def _manifest_file(name: str) -> str:
-    return f".jobs/{name}.json"
+    return f"{_MANIFESTS}/{name}.json"
 
 
 def _crc(manifest: Mapping[str, Any]) -> int:

@@ -99,6 +99,12 @@ class JobRow:
         """Whether its points are in the data set."""
         return not self.error
 
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> JobRow:
+        """Make a row of what JSON gives of one."""
+        classes = {int(number): count for number, count in data.pop("classes").items()}
+        return cls(classes=classes, **data)
+
 
 class Tally:
     """What is counted of the points of a job, a piece at a time and in order.

@@ -1,4 +1,4 @@
-"""The data set of a campaign: conducts its run, and writes what all jobs share."""
+"""The data set of a campaign: what is there, what is wrong with it, and what all jobs share."""
 
 from __future__ import annotations
 
@@ -6,16 +6,14 @@ import json
 import re
 import tempfile
 import time
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from distributed import Client
-
 from ..base.errors import LidarpoolError, explained
+from ..base.fingerprint import fingerprint
 from ..base.software import difference, software
 from ..base.storage import Storage
 from ..base.words import counted
@@ -23,22 +21,21 @@ from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
 from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import read_index, sweeps
+from ..pipeline import LIDAR
 from ..pipeline.database import FILE
-from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
-from ..run.campaign_store import CampaignStore
-from ..run.identity import OF_CAMPAIGN
-from ..run.job import Job
-from ..run.progress import Show
-from ..run.store import RUN_FOLDER, drop_run, listed
-from ..run.watch import Waiting
-from ..scenario.campaign import Campaign, Described, hashes
+from ..run.conductor import Conductor, Output
+from ..run.job_points import listed
+from ..run.result import CampaignRun
+from ..run.store import RUN_FOLDER, RunStore, drop_run
+from ..run.writer import JobWriter
+from ..scenario.campaign import Campaign, hashes
 from .campaign_figures import CampaignInfo
 from .campaign_report import write_card
 from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
-# With what `_finish` writes, CAMPAIGN_FILE first.
+# With what `_write_shared` writes, CAMPAIGN_FILE first.
 _FINISHED = re.compile(
     OF_JOBS.pattern + r"|(campaign|dataset|report)\.json|README\.md|report\.html|pictures/\w+\.png|"
     r"jobs\.(csv|parquet)|splits/[^/]+\.txt"
@@ -47,160 +44,177 @@ _FINISHED = re.compile(
 _BESIDE = re.compile(r"(run|job-[^/]+)/.*|(.*/)?\.lidarpool-(tmp|writing)-.*")
 
 
-@dataclass(frozen=True)
-class Making:
-    """How a campaign is to be made into a data set.
+@dataclass(eq=False)
+class DataSetOutput(Output[CampaignRun]):
+    """The data set of a campaign in its folder or storage, `place`."""
 
-    `out` is its place; `own` says that the cluster is a local one for this run. `resume` continues
-    an unfinished run, `fresh` drops it, `retry_failed` does failed jobs again; `overwrite` replaces
-    a finished data set. Of the jobs that are done a resumed run compares sizes of files, and with
-    `verify` every byte.
-    """
+    place: Path | Storage
+    campaign: Campaign
 
-    out: Path | Storage
-    own: bool
-    resume: bool = False
-    fresh: bool = False
-    retry_failed: bool = False
-    verify: bool = False
-    overwrite: bool = False
-    parts: str | Path | None = None
-    backend: str | None = None
-    wait_s: float = 0.0
-    patience_s: float = 60.0
+    def __post_init__(self) -> None:
+        out = replace(Storage.at(self.place), durable=False)
+        self.dataset = DataSet(out, self.campaign.keep.format, self.campaign.keep.layout)
+        self.columns = self.dataset.columns
+        # Of a finished data set: its record, and what is wrong with jobs, {number: a clause}.
+        self._made: Mapping[str, Any] | None = None
+        self._wrong: dict[int, str] = {}
 
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Lock the place while the body runs."""
+        self.dataset.check_installed()
+        with result_folder(self.place):
+            yield
 
-def make_dataset(
-    campaign: Campaign,
-    making: Making,
-    cluster: Callable[[Waiting, Job], AbstractContextManager[Client]],
-    progress: AbstractContextManager[Show],
-    tell: Callable[[str], None],
-    page: CampaignPage,
-) -> CampaignRun:
-    """Do the jobs of a campaign that are not done, and write the data set.
+    # -- what is there -----------------------------------------------------------------------
 
-    `cluster` starts a cluster or connects to one, for jobs such as the one it is given. `page` is
-    told of all jobs.
-
-    LidarpoolError if the place holds something else, the cluster lacks something, or what all jobs
-    need fails; its notes say what was kept.
-    """
-    out = replace(Storage.at(making.out), durable=False)
-    dataset = DataSet(out, campaign.keep.format, campaign.keep.layout)
-    dataset.check_installed()
-    resume = making.resume or making.retry_failed or making.verify
-    if (making.fresh or making.overwrite) and resume:
-        raise LidarpoolError(
-            "fresh and overwrite remove what resume, retry_failed and verify go on with."
-        )
-    kept = out.below(RUN_FOLDER)
-    backend = making.backend or "auto"
-
-    def opened() -> CampaignStore:
-        whole = campaign.identity, campaign.count, backend, kept, making.parts
-        return CampaignStore(*whole, resume=resume)
-
-    with result_folder(making.out), ExitStack() as stack:
+    def begin(self, conductor: Conductor[CampaignRun]) -> CampaignRun | None:
+        """Refuse or remove a finished data set, or look at it; its sums if nothing is left."""
+        out, options = self.dataset.place, conductor.options
+        kept = out.below(RUN_FOLDER)
         there, unfinished = out.entries(), FILE in kept.sizes()
-        begin = not resume and (making.fresh or not unfinished)
-        if begin and INDEX_FILE in there and not making.overwrite:
-            raise LidarpoolError(
-                f"{out} holds a finished data set, and one needs a folder of its own: give another "
-                "with --out, or replace it with --overwrite (in Python overwrite=True)."
-            )
-        if begin and (making.fresh or making.overwrite):
-            _remove_dataset(out, kept)
-        made, wrong = None, dict[int, str]()
-        if resume and CAMPAIGN_FILE in there and not unfinished:
-            made = check_same(out, campaign)
-            whole, wrong = _look(dataset, read_table(out), making.verify, campaign)
-            if whole == campaign.count and not wrong and _is_indexed(out, whole):
-                if RUN_FOLDER in there:  # a killed run has not removed all of itself
-                    opened().remove()
-                tell(f"{out} is complete: nothing is left to do")
-                run = run_result(_shown(read_table(out), page), time.monotonic())
-                page.finish(run)
-                return run
-        store = opened()
-        stack.enter_context(store.kept_on_error())
-        _own_files(out, begun=made is not None or bool(store.kept))
-        if made is not None:
-            store.take_over(made, read_table(out))
-        else:
-            _, wrong = _look(dataset, store.rows(), making.verify, campaign)
+        anew = options.fresh or options.overwrite
+        if not conductor.resume and (anew or not unfinished):
+            if INDEX_FILE in there and not options.overwrite:
+                raise LidarpoolError(
+                    f"{out} holds a finished data set, and one needs a folder of its own: give "
+                    "another with --out, or replace it with --overwrite (in Python overwrite=True)."
+                )
+            if anew:
+                _remove_dataset(out, kept)
+        if not conductor.resume or CAMPAIGN_FILE not in there or unfinished:
+            return None
+        self._made = check_same(out, self.campaign)
+        whole, self._wrong = _look(self.dataset, read_table(out), options.verify, self.campaign)
+        if whole != self.campaign.count or self._wrong or not _is_indexed(out, whole):
+            return None
+        if RUN_FOLDER in there:  # a killed run has not removed all of itself
+            drop_run(kept)
+        conductor.screen.tell(f"{out} is complete: nothing is left to do")
+        for row in read_table(out):
+            conductor.page.ended(row)
+        run = CampaignRun.of(read_table(out), time.monotonic() - conductor.started)
+        conductor.page.finish(run)
+        return run
+
+    def look(self, conductor: Conductor[CampaignRun]) -> None:
+        """Compare what is there with what the store says is done; take over what it lacks."""
+        store, options, out = conductor.store, conductor.options, self.dataset.place
+        if self._made is not None:
+            rows = [row for row in read_table(out) if row.number < self.campaign.count]
+            store.cast_with(self._made["backend"], self._made["casting"])
+            store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
+        elif conductor.resume:
+            self._take_over(store)
+        _own_files(out, begun=bool(store.kept))
+        if self._made is None:
+            _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.kept:
-            campaign.check_files()
-        retried = (number for number, failed in store.db.jobs.items() if failed)
-        store.forget([*wrong, *(retried if making.retry_failed else ())])
-        if wrong:
-            store.notes.append(f"made again: {listed([*wrong.values()])}")
-        deque(_shown(store.rows(), page), maxlen=0)
-        if store.left:
-            run = run_campaign(
-                lambda waiting, job: stack.enter_context(cluster(waiting, job)),
-                campaign,
-                store,
-                dataset,
-                tell,
-                Waiting(making.wait_s, tell),
-                own=making.own,
-                progress=progress,
-                page=page,
-                backend=making.backend,
-                wait_s=making.wait_s,
-                patience_s=making.patience_s,
-            )
-        else:
-            run = run_result(store.rows(), time.monotonic(), store=store)
-        _finish(campaign, dataset, store, run)
+            self.campaign.check_files()
+        retried = store.db.failed() if options.retry_failed else ()
+        store.forget([*self._wrong, *retried])
+        if self._wrong:
+            store.notes.append(f"made again: {listed([*self._wrong.values()])}")
+        for row in store.rows():
+            conductor.page.ended(row)
+
+    def _take_over(self, store: RunStore) -> None:
+        """Take over jobs that are there and the database does not know, if it was lost."""
+        known = {row.name for row in store.rows()}
+        rows: list[JobRow] = []
+        with explained(f"{self.dataset.place} cannot be read"):
+            for row, made in self.dataset.rows(known):
+                if made.get("identity") != _identity(store):
+                    continue
+                if not store.backend:
+                    store.cast_with(made["backend"], made["casting"])
+                if made == _made_with(store):
+                    rows.append(row)
+        store.adopt(rows)
+
+    # -- jobs, and the end -------------------------------------------------------------------
+
+    def writer(self, conductor: Conductor[CampaignRun]) -> Callable[..., JobWriter]:
+        """Have jobs written into the data set."""
+        store, cluster = conductor.store, conductor.cluster
+        assert cluster is not None, "something is left"
+        dataset = replace(self.dataset, made_with=_made_with(store))
+        mark = store.db.meta["mark"]
+        probe = (f"{mark}-dataset", mark.encode())
+        with explained(f"{dataset.place} cannot be written"):
+            dataset.place.prepare()
+            dataset.place.write(*probe)
+        conductor.stack.callback(_remove_probe, dataset.place, probe[0])
+
+        def make(of_parts: tuple[str, bytes]) -> JobWriter:
+            probes = ((dataset.place, *probe), (store.storage, *of_parts))
+            sources = cluster.software["lidarpool"]
+            return JobWriter(cluster.client, cluster.partitions[LIDAR], dataset, probes, sources)
+
+        return make
+
+    def finish(self, conductor: Conductor[CampaignRun]) -> CampaignRun:
+        """Write what all jobs share, and remove the run unless jobs have failed."""
+        store, cast = conductor.store, conductor.run
+        seconds = time.monotonic() - conductor.started
+        run = CampaignRun.of(store.rows(), seconds, store.resumed)
+        stages = cast.stages if cast else ()
+        run = replace(run, stages=stages, notes=tuple(conductor.notes), sensors=store.sensors)
+        self._write_shared(store, run)
         if run.failed:
             store.save(now=True)
             store.db.close()
         else:
             store.remove()
-    page.finish(run)
-    return run
+        conductor.page.finish(run)
+        return run
+
+    def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
+        """Write what all jobs share, and last what says that the data set is complete."""
+        campaign, place = self.campaign, self.dataset.place
+        made = {"identity": dict(store.identity), "casting": store.casting}
+        made |= {"backend": store.backend, "sensors": run.sensors}
+        with explained(f"{place} cannot be written"):
+            place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
+        write_table(place, campaign.names, store.rows())
+        self.dataset.finish(store.rows())
+        info = CampaignInfo(
+            title=campaign.title,
+            license=campaign.license,
+            count=campaign.count,
+            seed=campaign.seed,
+            format=self.dataset.format,
+            names=campaign.names,
+            sensors=run.sensors,
+            versions=store.casting or software(),
+            seconds=run.seconds,
+            resumed=run.resumed,
+            notes=run.notes,
+            stages=run.stages,
+            file=campaign.command,
+            description=campaign.description,
+        )
+        with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
+            saved = sweeps(place.url)
+            if len(saved):
+                picture = Path(folder, "job.png")
+                draw_sweep(next(iter(saved))).save(picture)
+                info = replace(info, picture=picture)
+            write_card(place, info, store.rows())
 
 
-def _shown(rows: Iterable[JobRow], page: CampaignPage) -> Iterator[JobRow]:
-    for row in rows:
-        page.ended(row)
-        yield row
+def _identity(store: RunStore) -> str:
+    return fingerprint(dict(store.identity))
 
 
-def _finish(campaign: Campaign, dataset: DataSet, store: CampaignStore, run: CampaignRun) -> None:
-    """Write what all jobs share, and last what says that the data set is complete."""
-    place = dataset.place
-    made = {"identity": dict(store.identity), "casting": store.casting, "backend": store.backend}
-    made |= {"sensors": run.sensors}
-    with explained(f"{place} cannot be written"):
-        place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
-    write_table(place, campaign.names, store.rows())
-    dataset.finish(store.rows())
-    info = CampaignInfo(
-        title=campaign.title,
-        license=campaign.license,
-        count=campaign.count,
-        seed=campaign.seed,
-        format=dataset.format,
-        names=campaign.names,
-        sensors=run.sensors,
-        versions=store.casting or software(),
-        seconds=run.seconds,
-        resumed=run.resumed,
-        notes=run.notes,
-        stages=run.stages,
-        file=campaign.command,
-        description=campaign.description,
-    )
-    with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-        saved = sweeps(place.url)
-        if len(saved):
-            picture = Path(folder, "job.png")
-            draw_sweep(next(iter(saved))).save(picture)
-            info = replace(info, picture=picture)
-        write_card(place, info, store.rows())
+def _made_with(store: RunStore) -> dict[str, Any]:
+    """What the bytes of all jobs depend on, for their manifests."""
+    return {"identity": _identity(store), "backend": store.backend, "casting": store.casting}
+
+
+def _remove_probe(place: Storage, name: str) -> None:
+    with suppress(OSError):
+        place.remove([name])
 
 
 def _look(
@@ -280,20 +294,12 @@ def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
             "Install it, or make the job in a folder of its own with --out."
         )
     for name, value in campaign.identity.items():
-        if made["identity"].get(OF_CAMPAIGN + name) != value:
+        if made["identity"].get(name) != value:
             raise LidarpoolError(
                 f"{place} is of another campaign: its {name} differs. Make the job in a folder of "
                 "its own with --out."
             )
     return made
-
-
-def job_again(
-    campaign: Campaign, number: int, columns: tuple[str, ...], **options: Any
-) -> tuple[Described, Job]:
-    """Make a job of a campaign as it is for its data set."""
-    described = campaign.describe(number)
-    return described, described_job(described, columns, **options)
 
 
 def row_of(place: Storage, number: int) -> JobRow | None:
@@ -304,7 +310,7 @@ def row_of(place: Storage, number: int) -> JobRow | None:
 def _own_files(out: Storage, *, begun: bool) -> list[str]:
     """Name the files of a data set, which has begun or is empty.
 
-    LidarpoolError if there is a link, or a file that neither jobs nor `_finish` write.
+    LidarpoolError if there is a link, or a file that neither jobs nor `_write_shared` write.
     """
     files = [name for name in out.tree() if not _BESIDE.fullmatch(name)]
     own = _FINISHED if CAMPAIGN_FILE in files else OF_JOBS

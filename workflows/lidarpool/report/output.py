@@ -39,6 +39,67 @@ _SURVEY = ("scene", "survey")  # what tells one from another
 _FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
 
 
+@dataclass(eq=False)
+class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
+    """The result of a survey in its folder or storage, `place`; gives it with its report.
+
+    `judge` returns a note on the result; others as of `write_result`.
+    """
+
+    place: Path | Storage
+    job: Job
+    scenario: Scenario | None = None
+    only_cloud: bool = False
+    judge: Callable[[RunResult], str] = lambda result: ""
+
+    @property
+    def formats(self) -> list[Format]:
+        """Formats that the cloud is written in as well."""
+        return [one for one in self.job.outputs if one.format != "ply"]
+
+    @contextmanager
+    def held(self) -> Iterator[None]:
+        """Lock the folder while the body runs."""
+        for one in self.formats:
+            one.check_installed()
+        load_open3d()  # what writes the cloud in the end
+        with result_folder(self.place) as self._folder:
+            yield
+
+    def begin(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
+        """Refuse the result of another survey."""
+        if not conductor.goes_on:
+            further = further_files(self.job.survey, self.formats)
+            overwrite = conductor.options.overwrite
+            identity = partial(getattr, conductor.jobs, "identity")
+            refuse_to_replace(self.place, identity, further, overwrite=overwrite)
+
+    def finish(
+        self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]
+    ) -> tuple[RunResult, dict[str, Any]]:
+        """Write the result, and remove the run."""
+        result = conductor.result()
+        in_pieces = any(one.in_pieces for one in self.formats)
+        workers = conductor.lidar_workers() if in_pieces else None
+        if not in_pieces:
+            conductor.leave_cluster()
+        conductor.page.finish(result)
+        if note := self.judge(result):
+            result = replace(result, notes=(*result.notes, note))
+
+        def in_place() -> None:
+            conductor.result_is_in(self.place)
+            conductor.store.remove()
+
+        what = "the cloud" if self.only_cloud else "the cloud, the pictures and the report"
+        with conductor.screen.status(f"writing {what}"):
+            report = write_result(
+                self._folder, self.place, result, self.scenario, in_place, self.only_cloud,
+                self.formats, workers,
+            )  # fmt: skip
+        return result, report
+
+
 def further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
     """Name the files that a result has besides those that all have."""
     instruments = Instruments.of(survey)

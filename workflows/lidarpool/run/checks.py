@@ -29,7 +29,8 @@ from ..base.software import difference, software, software_there
 from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT, JobError
 from ..simulator.memory import MB, cast_bytes
 from ..simulator.world import AUTO_TAKES
-from .job import Job
+from ..scenario.job import Job
+from ..scenario.sections import TaskOptions
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2
@@ -39,47 +40,42 @@ class TooFewWorkersError(LidarpoolError):
     """A partition lacks workers or slots; more may join."""
 
 
-def slots_needed(job: Job) -> dict[str, int]:
-    """Slots that a run needs in each partition: {name: slots}."""
-    return {GPU: 1, LIDAR: 2 + job.collectors} | ({OTHER: 1} if job.planning else {})
+def slots_needed(tasks: TaskOptions, *, planning: bool, writing: bool = False) -> dict[str, int]:
+    """Slots that a run needs in each partition, {name: slots}; those that write jobs need one."""
+    return {GPU: 1, LIDAR: 2 + tasks.collectors + writing} | ({OTHER: 1} if planning else {})
 
 
 def find_workers(
     client: Client,
-    job: Job,
+    needed: Mapping[str, int],
     wanted: str,
     advice: str = AUTO_TAKES,
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
-    needed: Mapping[str, int] | None = None,
     left: int | None = None,
+    *,
+    writing: bool = False,
 ) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
     """Find all workers, the casting ones among them, their backend and their software.
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
     software that a resumed run was cast with. Workers that are missing or just died, or whose jobs
-    are in the queue, are waited for as long as `waiting` says. Slots `needed` are by default those
-    of the job. If scans are `left` to be cast, slots are wanted of partitions that grow with their
-    work.
+    are in the queue, are waited for as long as `waiting` says. If scans are `left` to be cast, slots
+    are wanted of partitions that grow with their work. `writing` says that jobs are written, too.
 
-    LidarpoolError if workers, slots, memory or the backend are missing, or versions differ.
+    LidarpoolError if workers, slots `needed` or the backend are missing, or versions differ.
     """
     if client.asynchronous:
         raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
     waiting = waiting or Waiting()
-    needed = needed or slots_needed(job)
     for name, slots in needed.items() if left is not None else ():
         Partition(name, client).want(max(slots, left or 0) if name == GPU else slots)
     while True:
         looked = time.monotonic()
         try:
-            pool = _survey_pool(client, needed, job)
+            pool = _survey_pool(client, needed, writing)
             casting = [worker for worker in pool if worker.resources.get(GPU)]
             backend = common_backend(client, wanted, casting, advice)
-            for worker in casting:
-                if worker.memory:
-                    each = worker.memory / max(1, worker.resources[GPU])
-                    check_memory(job, backend, each, f"the GPU worker at {worker.address}")
             casts = common_software(client, backend, casting, earlier or {})
             return pool, casting, backend, casts
         except TooFewWorkersError as error:
@@ -105,7 +101,7 @@ def want_nothing(client: Client, names: Iterable[str]) -> None:
                 Partition(name, client).want(0)
 
 
-def check_memory(job: Job, backend: str, room: float, worker: str) -> None:
+def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker: str) -> None:
     """Refuse scans and batches for which a worker has too little memory: `room`, bytes a slot.
 
     JobError: another job may fit.
@@ -118,16 +114,15 @@ def check_memory(job: Job, backend: str, room: float, worker: str) -> None:
             f"Casting one scan takes about {scan / MB:,.0f} MB, {limit}: take a smaller step_deg, "
             "fewer rays or columns, or give GPU workers a larger --memory-limit."
         )
-    if min(job.batch_mb * MB, all_scans) > room:
+    if min(tasks.batch_mb * MB, all_scans) > room:
         raise JobError(
-            f"batch_mb is {job.batch_mb:,}, {limit}: make it smaller, or give GPU workers a larger "
+            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give GPU workers a larger "
             "--memory-limit."
         )
 
 
-def _survey_pool(client: Client, needed: Mapping[str, int], job: Job) -> Pool:
-    """All workers of the cluster, after checking that they suffice for surveys such as a job."""
-    writing = ", and writing jobs of a campaign" if needed[LIDAR] > job.collectors + 2 else ""
+def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Pool:
+    """All workers of the cluster, after checking that they suffice."""
     workers = worker_identities(client)
     if not workers:
         raise TooFewWorkersError(
@@ -143,7 +138,8 @@ def _survey_pool(client: Client, needed: Mapping[str, int], job: Job) -> Pool:
         raise LidarpoolError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
-        LIDAR: f"{GENERATE}, {SORT} and {job.collectors} x {COLLECT}{writing}",
+        LIDAR: f"{GENERATE}, {SORT} and {needed[LIDAR] - 2 - writing} x {COLLECT}"
+        f"{', and writing jobs of a campaign' if writing else ''}",
         OTHER: "path planning; or leave it out with --no-plan",
     }
     try:

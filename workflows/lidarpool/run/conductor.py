@@ -1,93 +1,221 @@
-"""Conducts a run from its store to its result, for `lidarpool run` and for `simulate`."""
+"""Conducts a run from its place to its result: a survey or many, for commands and for Python."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import partial
-from pathlib import Path
+import time
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack, nullcontext
+from typing import Any, Generic, TypeVar
 
-from distributed import Client
-
-from poolpart import Partition
-
+from ..base.errors import LidarpoolError
+from ..base.storage import Storage
 from ..pipeline import LIDAR, Frame
+from ..pipeline.database import FILE
 from ..simulator.world import check_backend_here
-from .progress import Progress, Show
+from .checks import slots_needed
+from .cluster import Cluster, client_of
+from .job_points import JobPoints
+from .jobs import JobMaker, Jobs, Made, OneJob
+from .options import RunOptions
+from .page import Page
 from .ranges import LidarWorkers
-from .result import RunResult
-from .run import drive, make_result
-from .store import RunStore
+from .result import RunResult, result_of
+from .run import Run
+from .screen import Screen
+from .store import RunStore, drop_run
 from .watch import Waiting
+from .writer import JobWriter
+
+R = TypeVar("R")
 
 
-class Page:
-    """What a run tells its live page, see `lidarpool.live.run_page`; here of one without a page."""
+class Output(Generic[R]):
+    """Where what a run makes goes."""
 
-    def follow(self, store: RunStore) -> None:
-        """Show what is committed from now on."""
+    columns: tuple[str, ...] | None = None  # that clouds of a data set must have
 
-    def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
-        """Return a function that calls `show`, and updates the page."""
-        return show
+    def held(self) -> AbstractContextManager[object]:
+        """Lock the place while the body runs."""
+        return nullcontext()
 
-    def on_frame(self, frame: Frame, take: Callable[[Frame], None]) -> None:
-        """Call `take` with a frame, and show it."""
-        take(frame)
+    def begin(self, conductor: Conductor[R]) -> R | None:
+        """Refuse what must not be replaced; returns the result if nothing is left to do."""
+        return None
 
-    def finish(self, result: RunResult) -> None:
-        """Show the whole result; its parts may then be removed."""
+    def look(self, conductor: Conductor[R]) -> None:
+        """Compare what is there with what the store says is done."""
 
-    def stay(self, cloud: Path) -> None:
-        """Keep the page until its user ends it; points are read from the written `cloud`."""
+    def writer(self, conductor: Conductor[R]) -> Callable[[tuple[str, bytes]], JobWriter] | None:
+        """What has jobs written as soon as they are cast; None if the only job's parts stay."""
+        return None
+
+    def finish(self, conductor: Conductor[R]) -> R:
+        """Write what is to be written in the end, and return the result."""
+        raise NotImplementedError
 
 
-@contextmanager
-def conducted(
-    store: RunStore,
-    cluster: Callable[[Waiting], AbstractContextManager[Client]],
-    *,
-    own: bool,
-    progress: AbstractContextManager[Callable[[Progress], None]],
-    page: AbstractContextManager[Page],
-    tell: Callable[[str], None],
-    on_frame: Callable[[Frame], None] = lambda frame: None,
-    keep: bool = False,
-) -> Iterator[tuple[RunResult, LidarWorkers | None]]:
-    """Do what is left of a run; the body gets its result.
+class Kept(Output[RunResult]):
+    """Nothing is written: the points stay in the run's store."""
 
-    `cluster` starts a cluster or connects to one, if anything is left to do; it shares its time to
-    wait with the workers. `own` says that it is a local one for this run: then the backend must be
-    available here, and there is no page of partitions. With `keep` the cluster lasts as long as the
-    body, which also gets workers of LIDAR that write formats of many files, or None if nothing was
-    left to do.
+    def finish(self, conductor: Conductor[RunResult]) -> RunResult:
+        """Return the result of the only job."""
+        result = conductor.result()
+        conductor.page.finish(result)
+        conductor.store.db.close()
+        return result
 
-    An error or interrupt, also of the body, is noted with how to resume. LidarpoolError if the
-    cluster lacks something or a task fails.
+
+class Conductor(Generic[R]):
+    """Does what is left of a run, and has its output written.
+
+    Call it once. LidarpoolError if the place holds something else, the cluster lacks something, or
+    a task fails; its notes, and those of an interrupt, say what was kept.
     """
-    workers = None
-    with store.kept_on_error(), page as live, ExitStack() as stack:
-        live.follow(store)
-        if store.complete:
-            result = make_result(store)
-        else:
-            if own:
-                check_backend_here(store.backend or store.job.backend, store.advice)
-            waiting = Waiting(store.job.wait_s, tell)
-            client = stack.enter_context(cluster(waiting))
-            with progress as show:
-                result, on = drive(
-                    client,
-                    store,
-                    tell,
-                    waiting,
-                    own=own,
-                    on_frame=partial(live.on_frame, take=on_frame),
-                    watched=live.with_progress,
-                    show=show,
-                )
-            if keep:
-                workers = LidarWorkers(client, on.partitions[LIDAR], store.job.patience_s, tell)
-            else:
-                stack.close()
-        yield result, workers
+
+    def __init__(
+        self,
+        jobs: Jobs,
+        options: RunOptions,
+        output: Output[R],
+        screen: Screen,
+        page: Page,
+        on_frame: Callable[[Frame], None] = lambda frame: None,
+    ) -> None:
+        self.jobs, self.options, self.output = jobs, options, output
+        self.screen, self.page, self._on_frame = screen, page, on_frame
+        self.started = time.monotonic()
+        self.stack, self._cluster_stack = ExitStack(), ExitStack()
+        self.store: RunStore
+        self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
+        self.run: Run | None = None
+        self._first: Made | None = None  # job, of which slots and scans are wanted
+
+    def __call__(self) -> R:
+        """Do it."""
+        with self.stack:
+            self._hold_place()
+            if (result := self.output.begin(self)) is not None:
+                return result
+            self._open_store()
+            self._make_first_job()
+            self._reach_cluster()
+            self._cast_what_is_left()
+            return self.output.finish(self)
+
+    @property
+    def goes_on(self) -> bool:
+        """Whether this run goes on with an unfinished one."""
+        place = self.options.folder
+        return bool(self.resume and place is not None and FILE in Storage.at(place).sizes())
+
+    @property
+    def resume(self) -> bool:
+        """Whether it may go on with an earlier run."""
+        return self.options.resume or self.options.retry_failed or self.options.verify
+
+    def _hold_place(self) -> None:
+        if (self.options.fresh or self.options.overwrite) and self.resume:
+            raise LidarpoolError(
+                "fresh and overwrite remove what resume, retry_failed and verify go on with."
+            )
+        self.stack.enter_context(self.output.held())
+
+    def _open_store(self) -> None:
+        options = self.options
+        if options.fresh and options.folder is not None:
+            drop_run(Storage.at(options.folder))
+        checking = "checking the points of the earlier run"
+        with self.screen.status(checking) if self.goes_on else nullcontext():
+            place = options.folder, options.parts
+            self.store = RunStore(self.jobs, options.backend, *place, resume=self.resume)
+        if options.resume and self.store.only and not (self.store.kept or self.store.notes):
+            self.store.notes.append(f"there was nothing to resume in {options.out or place[0]}")
+        self.stack.enter_context(self.store.kept_on_error())
+        self.output.look(self)
+        self.stack.enter_context(self._cluster_stack)
+
+    def _make_first_job(self) -> None:
+        """Wait for a job that can be made, which stays the next to be taken."""
+        only = self.store.only
+        if only is not None and only.complete:
+            self.page.begun(only.job, only)
+            return
+        self._maker = JobMaker(self.jobs, self.store.left, self.output.columns)
+        self.stack.callback(self._maker.close)
+        while True:
+            try:
+                found = self._maker.take(wait=True)
+            except EOFError:
+                return
+            if isinstance(found, Made):
+                break
+            assert found is not None, "it was waited for"
+            self.store.end([found])
+            self.page.ended(found)
+        self._maker.put_back(found)
+        self._first = found
+
+    def _reach_cluster(self) -> None:
+        if self._first is None:
+            return
+        job, options, store = self._first.job, self.options, self.store
+        if options.own:
+            check_backend_here(store.backend or options.backend, store.advice)
+        writing = self.output.columns is not None
+        needed = slots_needed(options, planning=job.planning is not None, writing=writing)
+        if options.cluster is not None:
+            options.cluster.require(needed)
+        waiting = Waiting(options.wait_s, self.screen.tell)
+        client = self._cluster_stack.enter_context(
+            client_of(options, needed, waiting, self.screen)
+        )
+        jobs_left = self.jobs.count - store.db.ended_count
+        left = job.survey.scan_count * jobs_left - (store.only.resumed if store.only else 0)
+        self.cluster = Cluster(client, store, options, needed, left, waiting, self.screen)
+        self.page.follow(self.cluster.partitions)
+
+    def _cast_what_is_left(self) -> None:
+        if self.cluster is None:
+            return
+        on_frame = None if self.output.columns is not None else self._frame
+        writer = self.output.writer(self)
+        self.run = Run(self.cluster, self.store, self._maker, self.page, on_frame, writer)
+        with self.screen.progress() as show:
+            self.run.cast(show, self.screen.tell)
+
+    def _frame(self, frame: Frame) -> None:
+        self.page.on_frame(frame)
+        self._on_frame(frame)
+
+    # -- for outputs -------------------------------------------------------------------------
+
+    @property
+    def notes(self) -> Sequence[str]:
+        """Remarks for the user."""
+        return (*self.store.notes, *(self.run.notes if self.run else ()))
+
+    def result(self) -> RunResult:
+        """Return the result of the only job, which is committed."""
+        only = self.store.only
+        assert only is not None, "there is one"
+        return result_of(self.store, only, self.run, self.notes, time.monotonic() - self.started)
+
+    def lidar_workers(self) -> LidarWorkers | None:
+        """Return workers that write formats of many files; None if there is no cluster."""
+        if self.cluster is None:
+            return None
+        partition, patience_s = self.cluster.partitions[LIDAR], self.options.patience_s
+        return LidarWorkers(self.cluster.client, partition, patience_s, self.screen.tell)
+
+    def result_is_in(self, place: object) -> None:
+        """Have any later error or interrupt say that the result is complete."""
+
+        def note(_: object, error: BaseException | None, __: object) -> None:
+            if error is not None:
+                error.add_note(f"The result in {place} is complete.")
+
+        self.stack.push(note)
+
+    def leave_cluster(self) -> None:
+        """Stop or leave the cluster, which is not needed any more."""
+        self._cluster_stack.close()

@@ -1,20 +1,27 @@
-"""What a run gives, before anything is made of it."""
+"""What a run gives: the result of a survey, before anything is made of it, or the sums of many."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import TYPE_CHECKING
 
 from poolpart import TaskRecord
 
 from ..base.arrays import Floats32, Ints
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
+from ..export.jobs import JobRow
 from ..pipeline.task_book import StageTotals
-from ..plan import Plan, Planning, Trial
+from ..plan import Plan, Planning, Trial, best
 from ..scene.scene import Scene
 from ..sensor import Survey
+
+if TYPE_CHECKING:
+    from .job_points import JobPoints
+    from .run import Run
+    from .store import RunStore
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,3 +94,80 @@ class RunResult:
     def hit_counts(self) -> Ints:
         """Hits by `counters` of the scene, read when first asked for."""
         return self._hit_counts()
+
+
+def result_of(
+    store: RunStore, only: JobPoints, run: Run | None, notes: Sequence[str], seconds: float
+) -> RunResult:
+    """Make the result of the only job of a run, which is committed; `run` if it was cast now."""
+    job = only.job
+    trials = tuple(sorted(only.parts.trials, key=lambda trial: trial.trial))
+    kept, times = (run.kept, run.times) if run else (None, {})
+    return RunResult(
+        scene=job.scene,
+        survey=job.survey,
+        planning=job.planning,
+        points=only.points(),
+        plan=best(trials, job.planning) if job.planning else None,
+        trials=trials,
+        backend=store.backend,
+        rays=job.survey.ray_count,
+        hits=only.parts.hits,
+        stages=run.stages if run else (),
+        resumed=only.resumed,
+        notes=tuple(notes),
+        identity=store.identity,
+        _hit_counts=only.hit_counts,
+        sample_rays=only.sample_rays(),
+        seconds=seconds if run else 0.0,
+        survey_seconds=times.get("survey", 0.0),
+        planning_seconds=times.get("planning", 0.0),
+        replayed=kept.offered_again if kept else 0,
+    )
+
+
+@dataclass(frozen=True)
+class CampaignRun:
+    """What `Campaign.run` returns.
+
+    Parameters
+    ----------
+    failed
+        Jobs that have failed, with `number`, `name`, `values` and `error`; see `jobs.csv`.
+    done, points, rays
+        Jobs in the data set, their points, and the rays that were cast for them.
+    casting_seconds
+        Of all casting tasks together.
+    resumed
+        Jobs of an earlier run.
+    seconds
+        Wall time of this run.
+    stages
+        Tasks of each stage.
+    notes, sensors
+        Remarks for the user, and the sensors of the jobs that are done, {name: models and rates}.
+    """
+
+    failed: tuple[JobRow, ...]
+    done: int
+    points: int
+    rays: int
+    casting_seconds: float
+    resumed: int
+    seconds: float
+    stages: tuple[StageTotals, ...] = ()
+    notes: tuple[str, ...] = ()
+    sensors: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None) -> CampaignRun:
+        """Sum up the rows of a campaign, all of which are of an earlier run by default."""
+        failed, done, points, rays, casting = [], 0, 0, 0, 0.0
+        for row in rows:
+            if row.error:
+                failed.append(row)
+            else:
+                done, points, rays = done + 1, points + row.points, rays + row.rays
+                casting += row.seconds
+        known = done if resumed is None else resumed
+        return cls(tuple(failed), done, points, rays, casting, known, seconds)

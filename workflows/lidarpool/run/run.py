@@ -1,420 +1,384 @@
-"""A run on a cluster: steps the surveys and the planning in turn."""
+"""Jobs on a cluster: cast several at a time, committed, written, and planned beside."""
 
 from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, nullcontext, suppress
+from collections.abc import Callable, Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import replace
-from functools import partial
-from typing import Any, Protocol, TypeVar
 
-from distributed import Client
 from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
-from poolpart import Partition, PipeClosed, PipeFailed, PoolError
-
 from ..base.errors import LidarpoolError
-from ..base.storage import Storage
+from ..export.jobs import JobRow
+from ..export.sweeps import Sweeps
 from ..pipeline import (
     GPU,
     LIDAR,
     OTHER,
     CastingWorkers,
-    Crew,
     Frame,
+    JobError,
+    JobState,
     LongStages,
-    RigPlan,
-    SurveyDriver,
+    RunDriver,
 )
-from ..pipeline.task_book import TaskBook
-from ..plan import best
+from ..pipeline.task_book import StageTotals, TaskBook
+from ..scenario.job import Job
 from ..simulator.memory import MB, scans_that_fit
-from .checks import check_memory, find_workers, gpu_note, want_nothing
-from .job import Job
-from .progress import Show
-from .result import RunResult
+from .cluster import Cluster
+from .job_points import JobPoints
+from .jobs import JobMaker, Made
+from .page import JobNow, Page
+from .progress import Progress, Show
 from .store import RunStore
 from .trials import TrialPump
-from .watch import Waiting, Watch
-
-T = TypeVar("T")
-
-# Errors that Dask raises once the scheduler is gone.
-_CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
+from .watch import Watch
+from .writer import JobFiles, JobWriter, Written
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
-LOST_S = 0.5  # for a client to notice that its scheduler is gone
 LONGEST_PAUSE_S = 0.05  # while nothing moves
+SPARE = 32  # jobs under way beside two for each GPU slot
+ANNOUNCED = 16  # jobs whose scans stage 1 has yet to describe,
+ANNOUNCED_SCANS = 2_000  # unless these are so many
 
 
-class Kept(Protocol):
-    """What a run has kept of the workers that cast."""
+class Run:
+    """The jobs that are left of a run, on a cluster.
 
-    backend: str  # empty until known
-    casting: dict[str, str]  # their software, empty until known
-
-    @property
-    def advice(self) -> str:
-        """Advice if the backend is not available, for the end of a message."""
-
-    @property
-    def resumed(self) -> int:
-        """Scans of an earlier run."""
-
-
-class Surveys(Protocol):
-    """What a run casts, one survey or many."""
-
-    @property
-    def finished(self) -> bool:
-        """True once all is committed, handed out and written."""
-
-    @property
-    def progress(self) -> int:
-        """A number that grows when something is committed."""
-
-    def step(self) -> bool:
-        """Do what can be done now; returns whether there was anything to do."""
-
-
-class Cluster:
-    """A cluster that can run some jobs: checked, and ready for the crews of runs.
-
-    `job` is what it is checked for, and `kept` says what earlier runs cast with. `tell` is called
-    every few seconds with a message while the run waits, and `waiting` says how long to wait for
-    workers at the start. Slots `needed` are by default those of the job, and so many scans are
-    `left`. LidarpoolError if the cluster lacks something.
+    `maker` makes them; `writer` has them written into a data set, None if there is only one, whose
+    parts are kept. `on_frame` is called with its frames.
     """
 
     def __init__(
         self,
-        client: Client,
-        job: Job,
-        kept: Kept,
-        tell: Callable[[str], None],
-        waiting: Waiting,
-        needed: Mapping[str, int] | None = None,
-        left: int | None = None,
+        cluster: Cluster,
+        store: RunStore,
+        maker: JobMaker,
+        page: Page,
+        on_frame: Callable[[Frame], None] | None,
+        writer: Callable[[tuple[str, bytes]], JobWriter] | None,
     ) -> None:
-        self.client, self.job, self._tell, self._kept = client, job, tell, kept
-        # For errors about a lost cluster; a client that was never connected is refused below.
-        self.address: str = getattr(client.scheduler, "address", "")
-        try:
-            pool, casting, backend, software = find_workers(
-                client,
-                job,
-                kept.backend or job.backend,
-                kept.advice,
-                kept.casting if kept.resumed else {},
-                waiting,
-                needed,
-                left,
-            )
-            kept.backend, kept.casting = backend, software
-        except LidarpoolError:
-            want_nothing(client, (GPU, LIDAR, OTHER))
-            raise
-        except Exception as error:  # the kind depends on the request
-            if client.status != "running" or isinstance(error, CommClosedError):
-                raise self._told_lost() from error
-            raise
-        self._pool, self._casting = pool, casting
-        names = sorted({name for worker in pool for name in worker.partitions})
-        self.partitions = {name: Partition(name, client) for name in names}
-        note = gpu_note(pool, casting, backend)
-        self.notes: list[str] = [note] if note else []
-        self.callers_error: BaseException | None = None  # raised by a callback
-
-    def _told_lost(self) -> LidarpoolError:
-        return LidarpoolError(
-            f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
-            "the tasks of this run; it has ended without a result."
-        )
-
-    @contextmanager
-    def partitions_page(self) -> Iterator[None]:
-        """Show the page of partitions while the body runs, and print its address.
-
-        Does nothing if the scheduler serves no pages.
-        """
-        with suppress(PoolError):
-            self._tell(f"partitions page: {self._pool.page()}")
-        try:
-            yield
-        finally:
-            if self.client.status == "running":
-                with suppress(PoolError, *_CLUSTER_LOST):
-                    self._pool.leave_page()
-
-    def check(self, job: Job) -> None:
-        """Check that the workers have memory for another job; LidarpoolError if not."""
-        for worker in self._casting:
-            if worker.memory:
-                each = worker.memory / max(1, worker.resources[GPU])
-                check_memory(job, self._kept.backend, each, f"the GPU worker at {worker.address}")
-
-    def crew(self, storage: Storage, mark: str) -> Crew:
-        """Make the crew of a run, which keeps parts in `storage`."""
-        job, run = self.job, uuid.uuid4().hex[:8]
-        software = self._kept.casting
-        return Crew(
-            CastingWorkers(self.client, self.partitions[GPU], run, self._kept.backend, software),
-            LongStages(
-                self.client,
-                self.partitions[LIDAR],
-                run,
-                software["lidarpool"],
-                storage,
-                mark,
-                queue_capacity=job.queue_capacity,
-                collectors=job.collectors,
-                patience_s=job.patience_s,
-            ),
-        )
-
-    def driver(
-        self, crew: Crew, store: RunStore, on_frame: Callable[[Frame], None], job: str = "0",
-        folder: str = "", in_all: int = 0,
-    ) -> SurveyDriver:  # fmt: skip
-        """Make the driver of a survey; `folder` is that of its parts in the crew's storage."""
-        given = store.job
-        backend = self._kept.backend
-        fit = scans_that_fit(
-            given.scene, given.survey, self.job.batch_mb * MB, on_device=backend == "cuda"
-        )
-        return SurveyDriver(
-            crew.seat(job, RigPlan(given.scene, given.survey, backend), folder),
-            given.survey,
-            store.db,
+        self._cluster, self._store, self._maker, self._page = cluster, store, maker, page
+        self._on_frame, options, run = on_frame, cluster.options, uuid.uuid4().hex[:8]
+        stages = LongStages(
+            cluster.client,
+            cluster.partitions[LIDAR],
+            run,
+            cluster.software["lidarpool"],
             store.storage,
-            store.points_of_scan,
-            partial(self.call, on_frame),
-            store.on_parts,
-            fit,
-            in_all,
+            store.db.meta["mark"],
+            queue_capacity=options.queue_capacity,
+            collectors=options.collectors,
+            patience_s=options.patience_s,
         )
+        workers = CastingWorkers(
+            cluster.client, cluster.partitions[GPU], run, cluster.backend, cluster.software
+        )
+        self._driver = RunDriver(workers, stages, store.db, store.storage)
+        self._writer = writer and writer(self._driver.probe)
+        self._trials: TrialPump | None = None
+        self._made: dict[int, tuple[JobPoints, Sweeps | None]] = {}  # {number: job under way}
+        self._all_made = False
+        self._scans_begun = self._jobs_begun = 0
+        self._remover = ThreadPoolExecutor(1, "remove")
+        self.kept: JobState | None = None  # the job whose parts are kept, once it is committed
+        self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
+        self.notes: list[str] = []
+        self.stages: tuple[StageTotals, ...] = ()
 
-    def call(self, callback: Callable[[T], None], argument: T) -> None:
-        """Call a callback of the caller; its OSError must not look like the cluster's."""
-        try:
-            callback(argument)
-        except BaseException as error:
-            self.callers_error = error
-            raise
+    # -- jobs come and go --------------------------------------------------------------------
 
-    def run(
-        self,
-        crew: Crew,
-        surveys: Callable[[], Surveys],
-        trials: TrialPump | None,
-        save: Callable[[], None],
-        on_progress: Callable[[Surveys, float], None],
-    ) -> dict[str, float]:
-        """Run to the end; on any error, everything has been stopped.
+    @property
+    def finished(self) -> bool:
+        """True once all jobs have ended."""
+        return self._all_made and not self._made
 
-        `surveys` is called once the stages are starting. `save` is called once a second, and
-        `on_progress` ten times, with the seconds so far.
+    def step(self) -> bool:
+        """Do what can be done now; returns whether there was anything to do.
 
-        Returns
-        -------
-        Seconds that the survey and the trials took: {"survey": …, "planning": …}.
+        LidarpoolError if something fails that all jobs need.
         """
-        try:
-            if trials is not None:  # first: no slot of OTHER waits for the survey
-                trials.step()
-                self.partitions[OTHER].want(0)  # from now on its trials wait for workers
-            crew.open()
-            times = self._loop(crew, surveys(), trials, save, on_progress)
-            self.stages = TaskBook()
-            for record in crew.finish():
-                self.stages.add(record)
-            if trials is not None:
-                trials.finish()
-            want_nothing(self.client, self.partitions)
-            self.notes += crew.notes
-            return times
-        except BaseException as error:
-            # A client that loses its scheduler cancels all futures, so tasks look cancelled.
-            # After some seconds it gives up and closes, and any call of it makes any error.
-            lost = _is_lost(self.client, error)
-            reason = str(error) or type(error).__name__
-            _stop(
-                self.client, [crew, *([trials] if trials else [])], f"the run was stopped: {reason}"
-            )
-            want_nothing(self.client, self.partitions)
-            if error is self.callers_error:
-                raise
-            if isinstance(error, PoolError) and not lost:
-                raise LidarpoolError(str(error)) from error
-            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
-                raise self._told_lost() from error
-            raise
+        rows: list[JobRow] = []
+        moved = self._admit(rows)
+        moved |= self._driver.step()
+        for state, error in self._driver.take_ended():
+            moved = True
+            if error is not None:
+                self._fail(state.number, error, rows)
+            elif self._writer is None:
+                self.kept = state
+                del self._made[state.number]
+            else:
+                self._writer.waiting.append(self._files_of(state))
+        for_all: LidarpoolError | None = None
+        for files, made in self._written():
+            moved = True
+            if isinstance(made, JobError):
+                self._fail(files.row.number, made, rows)
+            elif isinstance(made, LidarpoolError):
+                for_all = made
+            else:
+                rows.append(made)
+        self._commit(rows)
+        if for_all is not None:
+            raise for_all
+        return moved
 
-    def _loop(
-        self,
-        crew: Crew,
-        surveys: Surveys,
-        trials: TrialPump | None,
-        save: Callable[[], None],
-        on_progress: Callable[[Surveys, float], None],
-    ) -> dict[str, float]:
-        """Step everything until all have finished; returns the time of each, in seconds."""
-        started, pause_s = time.monotonic(), 0.0
-        watch = Watch(
-            self.client,
-            [GPU, OTHER] if trials else [GPU],
-            lasting=[LIDAR],
-            patience_s=self.job.patience_s,
-            tell=self._tell,
+    def _admit(self, rows: list[JobRow]) -> bool:
+        """Take on jobs that are ready, if there is room for them."""
+        moved = False
+        while not self._all_made and self._has_room:
+            try:
+                found = self._maker.take()
+            except EOFError:
+                self._all_made = True
+                break
+            if found is None:
+                break
+            moved = True
+            if isinstance(found, JobRow):
+                rows.append(found)
+                continue
+            self._made[found.job.number] = self._store.points_of(found.job), found.sweeps
+            try:
+                self._cluster.check(found.job)
+                self._begin(found)
+            except JobError as error:  # too large for the workers, or it cannot be pickled
+                self._fail(found.job.number, error, rows)
+        return moved
+
+    @property
+    def _has_room(self) -> bool:
+        announced = self._driver.announced
+        few = len(announced) < ANNOUNCED and sum(announced) < ANNOUNCED_SCANS
+        return few and len(self._made) < SPARE + 2 * self._driver.slot_count
+
+    def _begin(self, made: Made) -> None:
+        job, (points, _) = made.job, self._made[made.job.number]
+        cluster, jobs = self._cluster, self._store.jobs
+        on_frame = self._on_frame
+        if self._writer is None:
+            self._page.begun(job, points)
+            if job.planning is not None:
+                self._plan(job, points)
+        # Of a campaign's job many follow, so that its batches need not be divided among all.
+        left = jobs.count - self._store.db.ended_count
+        self._driver.begin(
+            job.number,
+            job.scene,
+            job.survey,
+            fit=scans_that_fit(
+                job.scene,
+                job.survey,
+                cluster.options.batch_mb * MB,
+                on_device=cluster.backend == "cuda",
+            ),
+            in_all=job.survey.scan_count * left,
+            on_frame=None if on_frame is None else lambda frame: cluster.call(on_frame, frame),
+            read=points.points_of_scan,
+            on_parts=self._page.on_parts if self._writer is None else None,
         )
-        times: dict[str, float] = {}
+        self._jobs_begun += 1
+        self._scans_begun += job.survey.scan_count
+        to_come = max(0, left - len(self._made))
+        self._driver.later = to_come * self._scans_begun // self._jobs_begun
+
+    def _plan(self, job: Job, points: JobPoints) -> None:
+        assert job.planning is not None
+        partition, sources = self._cluster.partitions[OTHER], self._cluster.software["lidarpool"]
+        done = points.parts.trials
+        self._trials = TrialPump(self._cluster.client, partition, job.planning, sources, done)
+        self._trials.step()  # first: no slot of OTHER waits for the survey
+        partition.want(0)  # from now on its trials wait for workers
+
+    def _files_of(self, state: JobState) -> JobFiles:
+        """What a job that is committed is written from."""
+        points, sweeps = self._made[state.number]
+        job = points.job
+        assert sweeps is not None, "of a data set"
+        row = JobRow(
+            number=job.number,
+            name=job.name,
+            split=job.split,
+            values=dict(job.values),
+            scans=job.survey.scan_count,
+            sweeps=len(sweeps),
+            rays=job.survey.ray_count,
+            hits=points.parts.hits,
+            seconds=state.seconds,
+        )
+        return JobFiles(row, points.points(), sweeps, job.made_of)
+
+    def _written(self) -> Iterable[tuple[JobFiles, Written]]:
+        if self._writer is None:
+            return ()
+        # A stage whose worker has died comes first.
+        slots = 0 if self._driver.lacks_slot else self._cluster.spare
+        return self._writer.step(slots)
+
+    def _fail(self, number: int, error: LidarpoolError, rows: list[JobRow]) -> None:
+        """Note that a job has failed; if there is only one, so has the run."""
+        if self._writer is None:
+            raise error
+        rows.append(self._store.jobs.row(number, str(error)))
+
+    def _commit(self, rows: Sequence[JobRow]) -> None:
+        """Commit that jobs have ended, and remove what is left of them."""
+        if not rows:
+            return
+        left = [(row, *self._made.pop(row.number, (None, None))) for row in rows]
+        self._store.name_sensors(
+            (carried.name or "lidar", f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz")
+            for row, points, _ in left
+            if row.done and points is not None
+            for carried in points.job.survey.carried
+            for sensor in [carried.sensor]
+        )
+        self._store.end(rows)
+        for row in rows:
+            self._page.ended(row)
+        self._remover.submit(self._remove, [(row, points) for row, points, _ in left if points])
+
+    def _remove(self, ended: Sequence[tuple[JobRow, JobPoints]]) -> None:
+        for row, points in ended:
+            with suppress(LidarpoolError, OSError):  # what is left does no harm
+                if row.done:
+                    self._page.look(row, points)
+            with suppress(LidarpoolError, OSError):
+                self._store.storage.remove([part.name for part in points.parts.ordered])
+
+    def under_way(self) -> list[JobNow]:
+        """List the jobs that are being cast, and then those that are being written."""
+        writing = {row.number: row for row in self._writer.jobs} if self._writer else {}
+        jobs = [
+            JobNow(
+                name=points.job.name,
+                values=points.job.values,
+                stored=points.parts.scans_done,
+                scans=points.job.survey.scan_count,
+                points=points.parts.point_count,
+                seconds=self._driver.seconds_of(number),
+                writing=number in writing,
+            )
+            for number, (points, _) in [*self._made.items()]
+        ]
+        return sorted(jobs, key=lambda job: job.writing)
+
+    # -- to the end --------------------------------------------------------------------------
+
+    def cast(self, show: Show, tell: Callable[[str], None]) -> None:
+        """Do all jobs; on any error, everything has been stopped."""
+        cluster, driver = self._cluster, self._driver
+        try:
+            with cluster.partitions_page(), cluster.stopping(self._stop):
+                driver.open()
+                self._loop(show, tell)
+                stages = TaskBook()
+                for record in driver.finish():
+                    stages.add(record)
+                if self._trials is not None:
+                    self._trials.finish()
+        finally:
+            if self._writer is not None:
+                self._writer.close()
+            self._remover.shutdown()
+        self._save()
+        self._store.save(now=True)
+        self._store.tidy()
+        others = [one.book for one in (self._writer, self._trials) if one is not None]
+        books = [driver.book, *others, stages]
+        self.stages = tuple(totals for book in books for totals in book.stages.values())
+        self.notes += [*cluster.notes, *driver.notes]
+        if self._writer is not None and self._writer.hidden:
+            place = self._writer.dataset.place
+            self.notes.append(f"no worker of {LIDAR} sees {place}: the driver wrote the data set")
+
+    def _loop(self, show: Show, tell: Callable[[str], None]) -> None:
+        """Step everything until all have finished."""
+        driver, started, pause_s = self._driver, time.monotonic(), 0.0
+        self._admit_first()
+        watch = Watch(
+            self._cluster.client,
+            [GPU, OTHER] if self._trials else [GPU],
+            lasting=[LIDAR],
+            patience_s=self._cluster.options.patience_s,
+            tell=tell,
+        )
         told = saved = float("-inf")
-        while not (crew.ended and (trials is None or "planning" in times)):
+        while not (driver.ended and (self._trials is None or "planning" in self.times)):
             moved = False
-            if not crew.closed:
-                crew.look(surveys.progress)
-                moved = surveys.step()
-                if surveys.finished:
-                    crew.close()
-                    times["survey"] = time.monotonic() - started
+            if not driver.closed:
+                moved = self.step()
+                if self.finished:
+                    driver.close()
+                    self.times["survey"] = time.monotonic() - started
                     watch.forget([GPU, LIDAR])
-            if trials is not None and "planning" not in times:
-                moved |= trials.step()
-                if trials.finished:
-                    times["planning"] = time.monotonic() - started
+            if self._trials is not None and "planning" not in self.times:
+                moved |= self._trials.step()
+                if self._trials.finished:
+                    self.times["planning"] = time.monotonic() - started
                     watch.forget([OTHER])
             now = time.monotonic()
             if now - saved >= SAVE_EVERY_S:
                 saved = now
-                save()
+                self._save()
             watch.look(now)
-            if now - told >= PROGRESS_EVERY_S or surveys.finished:
+            if now - told >= PROGRESS_EVERY_S or self.finished:
                 told = now
-                on_progress(surveys, now - started)
+                self._tell_progress(show, now - started)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            (time.sleep if crew.ended else crew.wait)(pause_s)
+            (time.sleep if driver.ended else driver.wait)(pause_s)
         self.notes += watch.notes
-        return times
 
+    def _admit_first(self) -> None:
+        rows: list[JobRow] = []
+        self._admit(rows)
+        self._commit(rows)
 
-def drive(
-    client: Client,
-    store: RunStore,
-    tell: Callable[[str], None],
-    waiting: Waiting,
-    *,
-    own: bool,
-    on_frame: Callable[[Frame], None],
-    watched: Callable[[Show, Mapping[str, Partition]], Show],
-    show: Show,
-) -> tuple[RunResult, Cluster]:
-    """Run one job on a cluster to the end; on any error, everything has been stopped.
+    def _save(self) -> None:
+        if self._trials is not None:
+            done = len(self._store.db.job(0, 0).trials)
+            self._store.db.add_trials(0, self._trials.trials[done:])
+        self._store.save()
 
-    With `own` there is no page of partitions. `watched` wraps what shows the progress, for a live
-    page. LidarpoolError if the cluster lacks something.
-    """
-    started, job = time.monotonic(), store.job
-    left = job.survey.scan_count - store.resumed
-    cluster = Cluster(client, job, store, tell, waiting, left=left)
-    show = watched(show, cluster.partitions)
-    trials = None
-    if job.planning is not None:
-        software = store.casting["lidarpool"]
-        partition = cluster.partitions[OTHER]
-        trials = TrialPump(client, partition, job.planning, software, store.db.trials)
-    crew = cluster.crew(store.storage, store.db.meta["mark"])
-    drivers: list[SurveyDriver] = []
+    def _tell_progress(self, show: Show, seconds: float) -> None:
+        waits_for = LIDAR if self._driver.waiting else ""
+        now = self._progress(seconds, waits_for)
+        self._cluster.call(show, now)
+        self._cluster.call(lambda progress: self._page.on_progress(progress, self.under_way), now)
 
-    def surveys() -> SurveyDriver:
-        drivers.append(cluster.driver(crew, store, on_frame))
-        return drivers[0]
+    def _progress(self, seconds: float, waits_for: str) -> Progress:
+        if self._writer is not None:
+            jobs, done = self._store.jobs.count, self._store.db.ended_count
+            return Progress(seconds=seconds, waits_for=waits_for, jobs=jobs, jobs_done=done)
+        points = self._store.only
+        assert points is not None, "of a single job"
+        progress = replace(points.progress(), seconds=seconds, waits_for=waits_for)
+        if self._trials is not None:
+            progress = replace(progress, trials_done=len(self._trials.trials))
+        if (state := self._driver.state_of(points.job.number)) is None:
+            return progress
+        cast = min(points.resumed + state.cast, progress.scans)
+        replayed = state.offered_again
+        return replace(progress, generated=state.generated, cast=cast, replayed=replayed)
 
-    def save() -> None:
-        for trial in trials.trials[len(store.db.trials) :] if trials else ():
-            store.db.add_trial(trial)
-        store.save()
-
-    def on_progress(_: Surveys, seconds: float) -> None:
-        survey = drivers[0]
-        progress = replace(
-            store.progress(),
-            generated=survey.generated,
-            cast=min(store.resumed + survey.cast, job.survey.scan_count),
-            trials_done=len(trials.trials) if trials else 0,
-            seconds=seconds,
-            replayed=survey.offered_again,
-            waits_for=LIDAR if crew.stages.waiting else "",
-        )
-        cluster.call(show, progress)
-
-    with nullcontext() if own else cluster.partitions_page():
-        times = cluster.run(crew, surveys, trials, save, on_progress)
-    save()
-    store.save(now=True)
-    store.tidy()
-    books = [drivers[0].book, cluster.stages, *([trials.book] if trials else [])]
-    result = make_result(
-        store,
-        books,
-        [*cluster.notes, *drivers[0].notes],
-        seconds=time.monotonic() - started,
-        survey_seconds=times["survey"],
-        planning_seconds=times.get("planning", 0.0),
-        replayed=drivers[0].offered_again,
-    )
-    return result, cluster
-
-
-def make_result(
-    store: RunStore, books: Sequence[TaskBook] = (), notes: Iterable[str] = (), **figures: Any
-) -> RunResult:
-    """Make the result once all is committed; `figures` are other fields of `RunResult`."""
-    job = store.job
-    trials = tuple(sorted(store.db.trials, key=lambda trial: trial.trial))
-    return RunResult(
-        scene=job.scene,
-        survey=job.survey,
-        planning=job.planning,
-        points=store.points(),
-        plan=best(trials, job.planning) if job.planning else None,
-        trials=trials,
-        backend=store.backend,
-        rays=job.survey.ray_count,
-        hits=store.db.hits,
-        stages=tuple(totals for book in books for totals in book.stages.values()),
-        resumed=store.resumed,
-        notes=(*store.notes, *notes),
-        identity=store.identity,
-        _hit_counts=store.hit_counts,
-        sample_rays=store.sample_rays(),
-        **figures,
-    )
-
-
-def _is_lost(client: Client, error: BaseException) -> bool:
-    """Whether the scheduler is gone: a call may fail a moment before the client knows."""
-    until = time.monotonic() + LOST_S
-    while (
-        client.status == "running" and isinstance(error, _CLUSTER_LOST) and time.monotonic() < until
-    ):
-        time.sleep(0.01)
-    return client.status != "running"
-
-
-def _stop(client: Client, pumps: Sequence[Crew | TrialPump], reason: str) -> None:
-    """Stop everything, as far as the cluster can be reached."""
-    if client.status != "running":  # Dask would try for half a minute to reach it
-        return
-    for pump in pumps:
-        for step in (lambda pump=pump: pump.stop(reason), pump.finish):
-            try:
-                # Report the first error.
-                with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
-                    step()
-            except Exception:
-                if client.status == "running":
-                    raise
+    def _stop(self, reason: str) -> None:
+        """Stop everything, as far as the cluster can be reached."""
+        client = self._cluster.client
+        for pump in (self._driver, self._trials):
+            for step in (lambda pump=pump: pump.stop(reason), lambda pump=pump: pump.finish()):
+                # Dask would try for half a minute to reach a cluster that is gone.
+                if pump is None or client.status != "running":
+                    continue
+                try:
+                    # Report the first error.
+                    with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                        step()
+                except Exception:
+                    if client.status == "running":
+                        raise

@@ -2,59 +2,59 @@
 
 from __future__ import annotations
 
-import errno
 import json
-import os
 import secrets
 import shutil
 import tempfile
 import weakref
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import replace
-from functools import partial
+from dataclasses import asdict, replace
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from ..base.arguments import checked
-from ..base.arrays import Floats32, Ints
 from ..base.errors import LidarpoolError, explained
+from ..base.fingerprint import fingerprint
+from ..base.software import software
 from ..base.storage import Storage
-from ..columns.cloud import Cloud
-from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
-from ..export.sweeps import Sweeps
-from ..pipeline.database import FILE, RunDatabase, parts_folder, read_place
+from ..columns.parts import mark_name, own_files, scans_of
+from ..export.jobs import JobRow
+from ..pipeline.database import (
+    FILE,
+    DamagedError,
+    RunDatabase,
+    mark_of_folder,
+    parts_folder,
+    read_place,
+)
 from ..pipeline.failures import storing
-from ..pipeline.messages import Receipt, samples_of_scan, summary_type
+from ..scenario.job import Job
 from ..simulator.world import AUTO_TAKES
 from .identity import difference, identity_of
-from .job import Job
-from .progress import Progress
+from .job_points import JobPoints
+from .jobs import Jobs, OneJob
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
-JOBS = "jobs"  # that of what a campaign keeps of each of its jobs
 RUN_FOLDER = "run"  # the run's folder in the output folder, until the result is complete
-SAMPLE_RAYS = 400  # of the pictures
-CHECKERS = 4  # threads that check parts; each holds one in memory, twice
-NAMED = 3  # parts, scans or files that a message names
+SENSORS_TOLD = 8  # kinds of a sensor that are named
 
 # On the command line, and in Python.
 _RESUME = "--resume (in Python resume=True)"
 _DROP = "--fresh (in Python remove_run)"
 
 
-class KeptRun:
-    """What a run keeps, of one survey or many: its database, and where parts go.
+class RunStore:
+    """What a run keeps of its jobs, one or many: a database, and the folder of their parts.
+
+    The file in the folder of the parts that says whose they are has what the database begins with,
+    and each part has its receipt: where the database is missing or damaged, it is made again.
 
     Parameters
     ----------
-    identity
-        What must be the same for a run to go on, see `identity_of`.
-    scan_count
-        Scans that the database itself is about.
+    jobs
+        What the run does; what their results depend on must be the same for a run to go on.
     backend
         The one that is asked for.
     place
@@ -67,15 +67,14 @@ class KeptRun:
         Whether to continue an existing run; otherwise there must be none.
 
     LidarpoolError if it holds an unfinished run and that is not to be resumed, or cannot be: it is
-    damaged, of another run, in use, or cast with another backend than is asked for; or if there are
-    `parts` without a `place`, whose database says which parts there are.
+    of other jobs, in use, or cast with another backend than is asked for; or if there are `parts`
+    without a `place`, whose database says which parts there are.
     """
 
     def __init__(
         self,
-        identity: dict[str, str],
-        scan_count: int,
-        backend: str,
+        jobs: Jobs,
+        backend: str = "auto",
         place: str | Path | Storage | None = None,
         parts: str | Path | Storage | None = None,
         *,
@@ -86,11 +85,11 @@ class KeptRun:
                 "parts are given a place, and nothing would know of them afterwards: give a "
                 "folder for the run as well."
             )
-        self._scan_count, self._wanted = scan_count, backend
+        self.jobs, self._wanted = jobs, backend
         self.lasting = place is not None
         self.notes: list[str] = []  # remarks for the user
         self._gone = False
-        self.identity = here = identity
+        self.identity = here = software() | dict(jobs.identity)
         self._remote = None
         kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
         self.place = self._folder = kept  # that of the run, and that of its database
@@ -103,8 +102,9 @@ class KeptRun:
         advice = "make the one that it lies in first, or give another"
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
+        self._points: dict[int, JobPoints] = {}  # {number: of a job that is under way}
         try:
-            self.db = self._open(here, parts)
+            self.db = self._open(here, parts, resume)
             try:
                 self._claim(here, resume)
             except BaseException:
@@ -113,60 +113,93 @@ class KeptRun:
         except BaseException:
             self._folder.remove([], folder=True)
             raise
-        self.resumed = self.db.scans_done  # scans whose points are of an earlier run
+        self.resumed = self.db.ended_count  # jobs of an earlier run
 
-    def _open(self, here: dict[str, str], parts: str | Path | Storage | None) -> RunDatabase:
+    def _open(
+        self, here: Mapping[str, str], parts: str | Path | Storage | None, resume: bool
+    ) -> RunDatabase:
         """Open the database, or a new one if nothing is committed in it."""
-        path, count = _database(self._folder), self._scan_count
+        path = _database(self._folder)
         durable = self.lasting and self._remote is None
         mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
-        jobs_of(self.place)  # an error if one is a link
         try:
             if self._remote:
                 fetch_database(self._remote.storage, path)
             if path.exists():
-                db = RunDatabase(path, count, durable=durable)
-                if self._is_used(db):
+                db = RunDatabase(path, durable=durable)
+                if db.used:
                     return db
                 db.close()
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
+        except DamagedError:
+            if not resume:
+                raise
+            path.unlink()
         except LidarpoolError as error:  # the copy of a database is nobody's business
             raise LidarpoolError(str(error).replace(self._folder.url, self.place.url)) from error
-        if self.lasting:
+        new = self._marked(parts) if resume and not mark else None
+        if new is not None:
+            self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
+        elif self.lasting:
             _remove(self.place, _parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
         self._folder.prepare()
-        mark = secrets.token_hex(8)
-        shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
-        new = {"mark": mark, "identity": json.dumps(here), "parts": shared}
+        if new is None:
+            mark = secrets.token_hex(8)
+            shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
+            new = {"mark": mark, "identity": json.dumps(here), "parts": shared}
         try:
-            return RunDatabase(path, count, durable=durable, **new)
+            return RunDatabase(path, durable=durable, **new)
         except LidarpoolError:
             if path.exists() and not path.stat().st_size:  # the disk is full
                 path.unlink()
                 path.with_name(f"{FILE}-journal").unlink(missing_ok=True)  # SQLite 3.37 leaves it
             raise
 
-    def _is_used(self, db: RunDatabase) -> bool:
-        """Whether an earlier run has left something, of one survey or many."""
-        return db.used or bool(jobs_of(self.place))
+    def _marked(self, parts: str | Path | Storage | None) -> dict[str, str] | None:
+        """What the database of this run began with, as the folder of its parts says it."""
+        places = [self.place.below(PARTS)]
+        if parts is not None:
+            shared = Storage.at(parts)
+            names = [name for name in shared.entries() if mark_of_folder(name)]
+            places = [shared.below(name) for name in names]
+        for place in places:
+            for name in place.sizes():
+                with suppress(ValueError, LookupError, TypeError, OSError):
+                    told = json.loads(place.read(name)) if name.endswith("-mark") else {}
+                    if told.pop("place") == self.place.url and name == mark_name(told["mark"]):
+                        return {key: str(value) for key, value in told.items()}
+        return None
 
-    def _claim(self, here: dict[str, str], resume: bool) -> None:
-        """Find the parts, check them if there are any, and mark their folder as this run's."""
+    def _claim(self, here: Mapping[str, str], resume: bool) -> None:
+        """Find the parts, and mark their folder as this run's."""
         self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
-            sizes = self.storage.sizes()  # also an error if the place cannot be opened
-        if self._is_used(self.db):
-            self._go_on(here, resume, sizes)
+            self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
+        self._strays: dict[int, list[str]] = {}  # {number: parts that an earlier run has left}
+        for name in self._sizes if resume else ():
+            if (scans := scans_of(self.db.meta["mark"], name)) is not None:
+                self._strays.setdefault(scans[0], []).append(name)
+        if isinstance(self.jobs, OneJob):
+            self.points_of(self.jobs.only)
+        if self.db.used:
+            self._go_on(here, resume)
         if self._remote:
             self._remote.claim(self.db)
-        name = mark_name(self.db.meta["mark"])
-        if name not in sizes:
+        if mark_name(self.db.meta["mark"]) not in self._sizes:
             with storing(self.storage):
                 self.storage.prepare()
-                self.storage.write(name, b"")
+                self._write_mark()
+        for points in self._points.values():
+            points.check(self._sizes, self._strays.pop(0, ()))
 
-    def _go_on(self, here: dict[str, str], resume: bool, sizes: dict[str, int]) -> None:
+    def _write_mark(self) -> None:
+        kept = ("mark", "identity", "parts", "backend", "casting")
+        told = {name: self.db.meta[name] for name in kept if name in self.db.meta}
+        told["place"] = self.place.url
+        self.storage.write(mark_name(told["mark"]), json.dumps(told).encode())
+
+    def _go_on(self, here: Mapping[str, str], resume: bool) -> None:
         """Check that this run may continue the existing one."""
         if other := difference(here, json.loads(self.db.meta["identity"])):
             raise LidarpoolError(
@@ -175,7 +208,7 @@ class KeptRun:
             )
         if not resume:
             raise LidarpoolError(
-                f"{self.place} holds an unfinished run, {self.kept or 'a job'}: continue it with "
+                f"{self.place} holds an unfinished run, {self.kept}: continue it with "
                 f"{_RESUME}, or drop it with {_DROP}."
             )
         if self._wanted not in ("auto", self.backend):
@@ -183,47 +216,6 @@ class KeptRun:
                 f"Backend {self._wanted!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
-        self._drop(sizes)
-
-    def _drop(self, sizes: dict[str, int]) -> None:
-        """Have the scans of missing and damaged parts cast again."""
-        lost: dict[str, list[Receipt]] = {"missing": [], "damaged": []}
-        pool = ThreadPoolExecutor(min(CHECKERS, os.cpu_count() or 1), "check")
-        try:
-            states = pool.map(lambda part: self._state(part, sizes), self.db.ordered)
-            for part, state in zip(self.db.ordered, states, strict=True):
-                if state:
-                    lost[state].append(part)
-        finally:
-            pool.shutdown(cancel_futures=True)
-        for what, parts in lost.items():
-            if parts:
-                self.db.drop(parts)
-                names, scans = listed([p.name for p in parts]), listed([*map(_span, parts)])
-                verb = "was" if len(parts) == 1 else "were"
-                self.notes.append(
-                    f"cast again: {scans}; {names} {verb} {what} in {self.storage.url}"
-                )
-
-    def _state(self, part: Receipt, sizes: dict[str, int]) -> str:
-        """Say whether a part is not what its receipt says, to the checksum of each column."""
-        if part.name not in sizes:
-            return "missing"
-        if sizes[part.name] != part.size:
-            return "damaged"
-        try:
-            found = unpack(self.storage.read(part.name))
-        except LidarpoolError:
-            return "damaged"
-        except OSError as error:
-            if error.errno in (errno.EIO, errno.ENOENT):  # a bad disk; just removed
-                return "damaged"
-            raise LidarpoolError(
-                f"The part {self.storage.path(part.name)} cannot be read: "
-                f"{error.strerror or error}."
-            ) from error
-        as_said = (found.first, found.stop, len(found)) == (part.first, part.stop, part.rows)
-        return "" if as_said else "damaged"
 
     # -- reading ---------------------------------------------------------------------------
 
@@ -232,36 +224,110 @@ class KeptRun:
         """Backend of the scans; empty until known."""
         return self.db.meta.get("backend", "")
 
-    @backend.setter
-    def backend(self, name: str) -> None:
-        if name != self.backend:
-            self.db.set(backend=name)
-
     @property
     def casting(self) -> dict[str, str]:
         """Software of the workers that cast the scans, see `software`; empty until known."""
         found: dict[str, str] = json.loads(self.db.meta.get("casting", "{}"))
         return found
 
-    @casting.setter
-    def casting(self, software: dict[str, str]) -> None:
-        if software != self.casting:
-            self.db.set(casting=json.dumps(software))
+    def cast_with(self, backend: str, casting: Mapping[str, str]) -> None:
+        """Keep with which backend and software all scans are cast."""
+        if backend != self.backend or casting != self.casting:
+            self.db.set(backend=backend, casting=json.dumps(casting))
+            with storing(self.storage):
+                self._write_mark()
 
     @property
     def kept(self) -> str:
         """What is committed, in words; empty for nothing."""
-        raise NotImplementedError
+        if self.only is not None:
+            return self.only.kept
+        return f"{self.db.ended_count:,} of {self.jobs.count:,} jobs" if self.db.used else ""
+
+    @property
+    def only(self) -> JobPoints | None:
+        """What is kept of the only job, of a survey; None for a campaign."""
+        return self.points_of(self.jobs.only) if isinstance(self.jobs, OneJob) else None
+
+    @property
+    def left(self) -> Iterator[int]:
+        """Numbers of the jobs that have not ended."""
+        return (number for number in range(self.jobs.count) if not self.db.ended(number))
 
     @property
     def advice(self) -> str:
         """Advice if the backend is not available, for the end of a message."""
-        if not self.resumed:
+        if not self.kept:
             return AUTO_TAKES
         return (
             f"The scans in {self.place} were cast with it: continue where it is to be had, or "
             f"drop them with {_DROP}."
         )
+
+    def rows(self) -> Iterator[JobRow]:
+        """Yield the rows of the jobs that have ended, by number."""
+        for row in self.db.job_rows():
+            yield JobRow.of(row)
+
+    @property
+    def sensors(self) -> dict[str, str]:
+        """Sensors of the jobs that are done, {name: models and rates}."""
+        found: dict[str, str] = json.loads(self.db.meta.get("sensors", "{}"))
+        return found
+
+    # -- jobs --------------------------------------------------------------------------------
+
+    def points_of(self, job: Job) -> JobPoints:
+        """What is kept of a job that is under way; parts of an earlier run are checked first."""
+        if (found := self._points.get(job.number)) is not None:
+            return found
+        points = self._points[job.number] = JobPoints(self, job)
+        if isinstance(self.jobs, OneJob):
+            return points  # is checked once the run itself is known to be the same
+        strays = self._strays.pop(job.number, ())
+        if job.number in self.db.begun or strays:
+            if self.db.identity_of_job(job.number) == fingerprint(identity_of(job)):
+                points.check(self._sizes, strays)
+            else:  # files that it is made of have changed
+                self.db.restart(job.number)
+                self.storage.remove(strays)
+        return points
+
+    def identify(self, points: JobPoints) -> None:
+        """Keep what a job is made of, of which parts are committed and others are not yet."""
+        if not isinstance(self.jobs, OneJob) and not points.identified:
+            points.identified = True
+            self.db.identify_job(points.job.number, fingerprint(identity_of(points.job)))
+
+    def end(self, rows: Sequence[JobRow]) -> None:
+        """Commit that jobs have ended."""
+        self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
+        for row in rows:
+            self._points.pop(row.number, None)
+
+    def forget(self, numbers: Iterable[int]) -> None:
+        """Let some jobs be done again."""
+        if forgotten := [*numbers]:
+            self.db.forget_jobs(forgotten)
+            self.resumed = self.db.ended_count
+
+    def adopt(self, rows: Iterable[JobRow], **made: str) -> None:
+        """Take over jobs that are done in the data set, and what it was `made` with."""
+        if made:
+            self.db.set(**made)
+        self.end([row for row in rows if not self.db.ended(row.number)])
+        self.resumed = self.db.ended_count
+
+    def name_sensors(self, sensors: Iterable[tuple[str, str]]) -> None:
+        """Keep names of sensors with model and rate, for the card of the data set."""
+        kept = self.sensors
+        for name, words in sensors:
+            told = kept.setdefault(name, words).split("; ")
+            if words not in told and len(told) <= SENSORS_TOLD:
+                more = words if len(told) < SENSORS_TOLD else "and others"
+                kept[name] = "; ".join([*told, more])
+        if kept != self.sensors:
+            self.db.set(sensors=json.dumps(kept))
 
     # -- the end -----------------------------------------------------------------------------
 
@@ -275,9 +341,10 @@ class KeptRun:
             self._remote.save(self.db, now=now)
 
     def tidy(self) -> None:
-        """Remove parts that are not in the result, of dead or superseded collectors."""
+        """Remove parts that are in no job under way, of dead or superseded collectors."""
         mark = self.db.meta["mark"]
-        ours = {mark_name(mark), *(part.name for part in self.db.parts.values())}
+        of_jobs = [part.name for p in self._points.values() for part in p.parts.ordered]
+        ours = {mark_name(mark), *of_jobs}
         with suppress(OSError, LidarpoolError):
             self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
 
@@ -310,108 +377,10 @@ class KeptRun:
     def close(self) -> None:
         """Close the database of an unfinished run; remove one that has committed nothing."""
         self.db.close()
-        if not self._is_used(self.db):
+        if not self.db.used:
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
-
-
-class RunStore(KeptRun):
-    """Database and parts of one job; `backend` is by default the job's, others as of `KeptRun`."""
-
-    def __init__(
-        self,
-        job: Job,
-        place: str | Path | Storage | None = None,
-        parts: str | Path | Storage | None = None,
-        *,
-        resume: bool = False,
-        backend: str = "",
-    ) -> None:
-        self.job = job
-        self.on_parts: Callable[[list[Receipt]], None] = lambda parts: None  # called with new ones
-        count, wanted = job.survey.scan_count, backend or job.backend
-        super().__init__(identity_of(job), count, wanted, place, parts, resume=resume)
-
-    @property
-    def kept(self) -> str:
-        """Committed scans and trials in words; empty for none."""
-        if self.db.scans_done:
-            return f"{self.db.scans_done:,} of {self.job.survey.scan_count:,} scans"
-        if self.db.trials:
-            return f"{len(self.db.trials):,} of {self.job.trials:,} planning trials"
-        return ""
-
-    @property
-    def complete(self) -> bool:
-        """Whether everything for a result is committed."""
-        return self.db.complete and len(self.db.trials) == self.job.trials
-
-    def progress(self) -> Progress:
-        """Progress of a resumed run at its start."""
-        db = self.db
-        return Progress(
-            scans=self.job.survey.scan_count,
-            generated=db.frames,
-            cast=db.scans_done,
-            framed=db.frames,
-            collected=db.scans_done,
-            points=db.point_count,
-            trials=self.job.trials,
-            trials_done=len(db.trials),
-            seconds=0.0,
-        )
-
-    def points(self) -> StoredCloud:
-        """Points committed so far."""
-        parts, job = self.db.ordered, self.job
-        world = job.survey.coordinates == "world"
-        return StoredCloud(
-            self.storage,
-            [part.name for part in parts],
-            [part.first for part in parts],
-            [part.rows for part in parts],
-            job.survey.stored_columns,
-            self.db.cells,
-            job.survey.precision_m,
-            job.scene.origin if world else np.zeros(3),
-            keeper=self,
-            sweeps=partial(Sweeps.of, job.survey, job.scene),
-        )
-
-    def points_of_scan(self, scan: int) -> Cloud:
-        """Points of a committed scan."""
-        part = self.db.part_of(scan)
-        columns = read_part(self.storage, part.name)
-        ends = np.cumsum(columns.counts)
-        at = scan - part.first
-        rows = slice(int(ends[at] - columns.counts[at]), int(ends[at]))
-        return self.points().cloud_of(columns, rows)
-
-    def hit_counts(self) -> Ints:
-        """Hits by counters of the scene, see `Scene.counters`."""
-        counts = np.zeros(self.job.scene.counters, np.int64)
-        for part in self.db.ordered:
-            triangles, hits = read_tally(self.storage, part.name)
-            counts[triangles] += hits
-        return counts
-
-    def sample_rays(self) -> Floats32:
-        """Return the ends of some rays, (k, 2, 3), metres, local coordinates."""
-        survey = self.job.survey
-        samples = samples_of_scan(survey.scan_count)
-        kind = summary_type(samples)
-        every = max(1, samples * survey.scan_count // SAMPLE_RAYS)
-        rays = [np.empty((0, 2, 3), np.float32)]
-        wanted = dict.fromkeys(range(0, survey.scan_count, every))
-        for first, data in self.db.summaries_of(list(wanted)):
-            for scan, summary in enumerate(np.frombuffer(data, kind), first):
-                ends = summary["samples"][~np.isnan(summary["samples"][:, 0])]
-                if scan in wanted and len(ends):
-                    start = np.asarray(survey.pose(scan).position, np.float32)
-                    starts = np.broadcast_to(start, ends.shape)
-                    rays.append(np.stack([starts, ends], axis=1))
-        return np.concatenate(rays)
 
 
 def _database(folder: Storage) -> Path:
@@ -424,12 +393,6 @@ def _parts_of(place: Storage, parts: str) -> Storage:
     """Where the parts of a run are: below the run's place, or in a place that was named."""
     named, _, name = parts.rpartition("/")
     return Storage.at(named or "/").below(name) if parts else place.below(PARTS)
-
-
-def jobs_of(place: Storage) -> dict[str, Storage]:
-    """Where a campaign keeps its jobs, as far as there is something of them: {name: place}."""
-    jobs = place.below(JOBS)
-    return {name: jobs.below(name) for name in jobs.entries()}
 
 
 @checked
@@ -473,20 +436,5 @@ def _remove(place: Storage, parts: Storage, mark: str | None) -> None:
     """
     with explained(f"The run in {place} cannot be removed"):
         own = own_files(parts, mark)  # an error if they are behind a link
-        for job in jobs_of(place).values():
-            drop_run(job)
-        place.below(JOBS).remove([], folder=True)
         parts.remove(own, folder=True)
         place.remove([FILE, f"{FILE}-journal", OWNER], folder=True)
-
-
-def _span(part: Receipt) -> str:
-    """Describe the scans of a part."""
-    last = part.stop - 1
-    return f"scan {last}" if part.first == last else f"scans {part.first} to {last}"
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return the first names, and how many more there are."""
-    more = len(names) - NAMED
-    return ", ".join(names[:NAMED]) + (f" and {more:,} more" if more > 0 else "")

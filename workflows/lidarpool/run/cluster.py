@@ -1,0 +1,173 @@
+"""A cluster that can run some jobs: checked, and watched for its loss."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
+from typing import TypeVar
+
+from distributed import Client
+from distributed.client import FutureCancelledError
+from distributed.comm.core import CommClosedError
+
+from poolpart import Partition, PipeClosed, PipeFailed, PoolError
+
+from ..base.errors import LidarpoolError
+from ..pipeline import GPU, LIDAR, OTHER
+from ..scenario.job import Job
+from .checks import check_memory, find_workers, gpu_note, want_nothing
+from .connection import connected, local_client, started_client
+from .options import RunOptions
+from .screen import Screen
+from .store import RunStore
+from .watch import Waiting
+
+T = TypeVar("T")
+
+LOST_S = 0.5  # for a client to notice that its scheduler is gone
+
+# Errors that Dask raises once the scheduler is gone.
+_CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
+
+
+def client_of(
+    options: RunOptions, needed: Mapping[str, int], waiting: Waiting, screen: Screen
+) -> AbstractContextManager[Client]:
+    """Client of the cluster that is there, or started, for so many slots of each partition."""
+    if options.client is not None:
+        return nullcontext(options.client)
+    if options.scheduler is not None:
+        return connected(options.scheduler, options.files, waiting)
+    if options.cluster is not None:
+        started = started_client(options.cluster, screen.tell)
+        return screen.starting(started, f"starting {options.cluster}")
+    local = local_client(
+        gpu_workers=options.gpu_workers, lidar_slots=needed[LIDAR],
+        other_workers=options.other_workers, planning=OTHER in needed, tls=options.tls,
+    )  # fmt: skip
+    return screen.starting(local, "starting the workers", own=True)
+
+
+class Cluster:
+    """A cluster that was checked for some jobs, which need slots of partitions.
+
+    `store` says what earlier runs cast with, and `left` how many scans are to be cast.
+    LidarpoolError if it lacks something.
+    """
+
+    def __init__(
+        self,
+        client: Client,
+        store: RunStore,
+        options: RunOptions,
+        needed: Mapping[str, int],
+        left: int,
+        waiting: Waiting,
+        screen: Screen,
+    ) -> None:
+        self.client, self.options, self._screen = client, options, screen
+        # For errors about a lost cluster; a client that was never connected is refused below.
+        self.address: str = getattr(client.scheduler, "address", "")
+        try:
+            pool, casting, backend, software = find_workers(
+                client,
+                needed,
+                store.backend or options.backend,
+                store.advice,
+                store.casting if store.kept else {},
+                waiting,
+                left,
+                writing=store.only is None,
+            )
+            store.cast_with(backend, software)
+        except LidarpoolError:
+            want_nothing(client, (GPU, LIDAR, OTHER))
+            raise
+        except Exception as error:  # the kind depends on the request
+            if client.status != "running" or isinstance(error, CommClosedError):
+                raise self._told_lost() from error
+            raise
+        self.backend, self.software = backend, software
+        self._pool, self._casting = pool, casting
+        names = sorted({name for worker in pool for name in worker.partitions})
+        self.partitions = {name: Partition(name, client) for name in names}
+        # Slots of LIDAR that the long stages leave, as they are at the start.
+        self.spare = max(1, self.partitions[LIDAR].slots - 2 - options.collectors)
+        note = gpu_note(pool, casting, backend)
+        self.notes: list[str] = [note] if note else []
+        self._callers_error: BaseException | None = None
+
+    def _told_lost(self) -> LidarpoolError:
+        return LidarpoolError(
+            f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
+            "the tasks of this run; it has ended without a result."
+        )
+
+    def check(self, job: Job) -> None:
+        """Check that the workers have memory for a job; JobError if not."""
+        for worker in self._casting:
+            if worker.memory:
+                each = worker.memory / max(1, worker.resources[GPU])
+                name = f"the GPU worker at {worker.address}"
+                check_memory(job, self.options, self.backend, each, name)
+
+    def call(self, callback: Callable[[T], None], argument: T) -> None:
+        """Call a callback of the caller; its OSError must not look like the cluster's."""
+        try:
+            callback(argument)
+        except BaseException as error:
+            self._callers_error = error
+            raise
+
+    @contextmanager
+    def partitions_page(self) -> Iterator[None]:
+        """Show the page of partitions while the body runs, and print its address.
+
+        Does nothing if the scheduler serves no pages, or the cluster is the run's own.
+        """
+        if self.options.own:
+            yield
+            return
+        with suppress(PoolError):
+            self._screen.tell(f"partitions page: {self._pool.page()}")
+        try:
+            yield
+        finally:
+            if self.client.status == "running":
+                with suppress(PoolError, *_CLUSTER_LOST):
+                    self._pool.leave_page()
+
+    @contextmanager
+    def stopping(self, stop: Callable[[str], None]) -> Iterator[None]:
+        """On any error of the body, call `stop` with the reason, and say if the cluster was lost.
+
+        In the end its partitions may shrink.
+        """
+        try:
+            yield
+        except BaseException as error:
+            # A client that loses its scheduler cancels all futures, so tasks look cancelled.
+            # After some seconds it gives up and closes, and any call of it makes any error.
+            lost = self._is_lost(error)
+            stop(f"the run was stopped: {str(error) or type(error).__name__}")
+            if error is self._callers_error:
+                raise
+            if isinstance(error, PoolError) and not lost:
+                raise LidarpoolError(str(error)) from error
+            if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
+                raise self._told_lost() from error
+            raise
+        finally:
+            want_nothing(self.client, self.partitions)
+
+    def _is_lost(self, error: BaseException) -> bool:
+        """Whether the scheduler is gone: a call may fail a moment before the client knows."""
+        until = time.monotonic() + LOST_S
+        while (
+            self.client.status == "running"
+            and isinstance(error, _CLUSTER_LOST)
+            and time.monotonic() < until
+        ):
+            time.sleep(0.01)
+        return self.client.status != "running"
