@@ -23,7 +23,6 @@ from ..report.campaign_output import (
     Making,
     check_same,
     failures,
-    job_again,
     make_dataset,
     row_of,
     verify,
@@ -33,6 +32,7 @@ from ..run.checks import slots_needed
 from ..run.job import Job
 from ..run.result import RunResult
 from ..run.watch import Waiting
+from ..scenario.build import build
 from ..scenario.campaign import Campaign
 from ..scenario.scenario import Scenario
 from .logs import set_logs
@@ -45,7 +45,7 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
     set_logs(options.verbose)
     if options.only:
         raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
-    pool = (campaign.describe(0).scenario or Scenario()).pool
+    pool = (campaign.scenario(0) or Scenario()).pool
 
     def cluster(waiting: Waiting, job: Job) -> AbstractContextManager[Client]:
         slots = slots_needed(job)
@@ -105,17 +105,11 @@ def run_job(campaign: Campaign, number: int, options: RunOptions) -> None:
     if of_dataset:
         backend = check_same(place, campaign)["backend"]
         verify(place, number)
-        name = campaign.describe(number).name
+        name = campaign.name(number)
         options = replace(options, out=output_place(f"{options.out}/job-{name}"), backend=backend)
-    described, job = job_again(
-        campaign,
-        number,
-        dataset.columns,
-        backend=options.backend,
-        wait_s=options.wait_s,
-        patience_s=options.patience_s,
-    )
-    assert described.scenario is not None, "of a file"
+    scenario = campaign.scenario(number)
+    assert scenario is not None, "of a file"
+    built = build(scenario, plans=False, columns=dataset.columns)
 
     def compare(result: RunResult) -> str:
         row = row_of(place, number) if of_dataset else None
@@ -123,9 +117,9 @@ def run_job(campaign: Campaign, number: int, options: RunOptions) -> None:
             return ""
         if Tally.of(result.points).sha256 != row.sha256:
             raise LidarpoolError(
-                f"job {described.name} has other points than those in {place}: files that it is "
-                "made of have changed, such as images of a mesh."
+                f"job {campaign.name(number)} has other points than those in {place}: files that "
+                "it is made of have changed, such as images of a mesh."
             )
-        return f"the points are those of job {described.name} in {place}, bit for bit"
+        return f"the points are those of job {campaign.name(number)} in {place}, bit for bit"
 
-    run_scenario(described.scenario, options, job, compare)
+    run_scenario(scenario, options, built, compare)

@@ -30,10 +30,13 @@ from ..run.cluster_file import ClusterFile
 from ..run.conductor import Page, conducted
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
-from ..run.job import Job, make_job
+from ..run.job import Job, with_options
 from ..run.result import RunResult
 from ..run.store import RUN_FOLDER, RunStore, drop_run
 from ..run.watch import Waiting
+from ..scenario.advice import advice
+from ..scenario.build import Built, build
+from ..scenario.job import job_of
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection
@@ -81,12 +84,12 @@ class RunOptions:
 def run_scenario(
     scenario: Scenario,
     options: RunOptions,
-    job: Job | None = None,
+    built: Built | None = None,
     judge: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
-    The `job` is by default that of the scenario; `judge` returns a note on its result.
+    `built` is by default what the scenario describes; `judge` returns a note on its result.
 
     LidarpoolError if the run fails; notes of the error say what was kept.
     """
@@ -94,17 +97,13 @@ def run_scenario(
     if options.here:  # before reading the scene, which may take long
         check_backend_here(options.backend or scenario.pool.backend)
     with shown_status("reading the scene", options.quiet, logged=False):
-        job = job or make_job(
-            scenario,
-            options.backend,
-            options.no_plan,
-            wait_s=options.wait_s,
-            patience_s=options.patience_s,
-        )
+        built = built or build(scenario, plans=not options.no_plan)
+        waits = {"wait_s": options.wait_s, "patience_s": options.patience_s}
+        job = with_options(job_of(built), scenario.pool, options.backend, **waits)
     if options.cluster is not None:
         options.cluster.require(slots_needed(job))
     if not options.quiet:
-        for note in scenario.advice(job.scene):
+        for note in advice(built):
             tell(f"note: {note}")
     with ExitStack() as whole, page_of_run(job, options.live) as page:
         result, report = _run(scenario, job, options, page, whole, judge)

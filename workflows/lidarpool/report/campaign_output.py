@@ -24,14 +24,14 @@ from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import read_index, sweeps
 from ..pipeline.database import FILE
-from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
+from ..run.campaign import CampaignPage, CampaignRun, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.identity import OF_CAMPAIGN
 from ..run.job import Job
 from ..run.progress import Show
 from ..run.store import RUN_FOLDER, drop_run, listed
 from ..run.watch import Waiting
-from ..scenario.campaign import Campaign, Described, hashes
+from ..scenario.campaign import Campaign, hashes
 from .campaign_figures import CampaignInfo
 from .campaign_report import write_card
 from .sweep_picture import draw_sweep
@@ -286,14 +286,6 @@ def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
                 "its own with --out."
             )
     return made
-
-
-def job_again(
-    campaign: Campaign, number: int, columns: tuple[str, ...], **options: Any
-) -> tuple[Described, Job]:
-    """Make a job of a campaign as it is for its data set."""
-    described = campaign.describe(number)
-    return described, described_job(described, columns, **options)
 
 
 def row_of(place: Storage, number: int) -> JobRow | None:

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Future as Done
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import AbstractContextManager, ExitStack, nullcontext, suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from queue import Empty, Full, Queue
 from threading import Event, Thread
 from typing import Any
@@ -31,15 +31,15 @@ from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet, Listing
 from ..export.jobs import JobRow, Tally, Value
 from ..export.sweeps import Sweeps
-from ..export.table import check_whole
 from ..pipeline import EXPORT, INTERSECT, LIDAR, Crew, JobError, SurveyDriver
 from ..pipeline.failures import raise_if_failed, was_killed
 from ..pipeline.task_book import StageTotals, TaskBook
-from ..scenario.campaign import Campaign, Described, hashes
-from ..scenario.scenario import KeptScenes
+from ..scenario.campaign import Campaign
+from ..scenario.scenario import Scenario
+from ..scenario.static_scene import SceneCache
 from .campaign_store import CampaignStore
 from .checks import slots_needed
-from .job import Job, make_job
+from .job import Job, with_options
 from .progress import Progress, Show
 from .run import Cluster, Surveys
 from .store import RunStore
@@ -57,18 +57,16 @@ STOP_S = 10.0  # for a job that is being made when the run ends
 class Entry:
     """A job on its way into the data set."""
 
-    described: Described
     job: Job
     store: RunStore
     sweeps: Sweeps
-    made_of: Sequence[Sequence[str]]
     driver: SurveyDriver | None = None
     casting: float = 0.0  # seconds of its tasks
 
     @property
     def name(self) -> str:
         """Its name in files."""
-        return self.described.name
+        return self.job.name
 
 
 @dataclass(frozen=True)
@@ -147,34 +145,9 @@ class CampaignRun:
     sensors: Mapping[str, str]
 
 
-def failed_row(number: int, error: object, described: Described | None) -> JobRow:
+def failed_row(job: Job, error: object) -> JobRow:
     """Return the row of a job that has failed."""
-    name = described.name if described else f"{number:04}"
-    split = described.split if described else ""
-    return JobRow(number, name, split, dict(described.values) if described else {}, str(error))
-
-
-def described_job(
-    described: Described, columns: tuple[str, ...], kept: KeptScenes | None = None, **options: Any
-) -> Job:
-    """Make a described job, with the columns that its data set needs, and without planning."""
-    if described.scenario is not None:
-        job = make_job(described.scenario, options.pop("backend", None), True, kept=kept, **options)
-    else:
-        assert described.made is not None, "either of both"
-        backend = options.pop("backend", None) or "auto"
-        job = Job(described.made.scene, described.made.survey, backend=backend, **options)
-    if job.survey.navigation is not None:
-        raise LidarpoolError(
-            "navigation is for single surveys, since a data set has no place for its files: leave "
-            "it out of the campaign's base."
-        )
-    check_whole(columns, job.survey.keep_every)
-    there = {column.name for column in job.survey.stored_columns}
-    if missing := [name for name in columns if name not in there]:
-        survey = replace(job.survey, columns=(*job.survey.columns, *missing))
-        job = replace(job, survey=survey)
-    return job
+    return JobRow(job.number, job.name, job.split, job.values, str(error))
 
 
 class _Maker:
@@ -184,7 +157,7 @@ class _Maker:
         self, campaign: Campaign, store: CampaignStore, columns: tuple[str, ...], **options: Any
     ) -> None:
         self._campaign, self._store, self._columns = campaign, store, columns
-        self._options, self._scenes = options, KeptScenes()
+        self._options, self._scenes = options, SceneCache()
         self._ready: Queue[Entry | JobRow | BaseException | None] = Queue(READY)
         self._stopped = Event()
         self._put_back: deque[Entry] = deque()
@@ -223,22 +196,25 @@ class _Maker:
             self._put(error)
 
     def _made(self, number: int) -> Entry | JobRow:
-        described = None
+        campaign, described = self._campaign, dict[str, Value]()
         try:
-            described = self._campaign.describe(number)
-            made_of = hashes(described.scenario.files) if described.scenario else []
-            job = described_job(described, self._columns, self._scenes, **self._options)
+            scenario = campaign.scenario(number) or Scenario()
+            made = campaign.job(number, self._scenes, self._columns)
+            described = dict(made.values)
+            job = with_options(made, scenario.pool, **self._options)
             sweeps = Sweeps.of(job.survey, job.scene)
         except MemoryError:
             raise
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
             told = str(error) if isinstance(error, LidarpoolError) else repr(error)
-            return failed_row(number, told, described)
+            with suppress(LidarpoolError):
+                described = campaign.values(number)
+            return JobRow(number, campaign.name(number), campaign.split(number), described, told)
         try:
-            return Entry(described, job, self._store.store_of(described.name, job), sweeps, made_of)
+            return Entry(job, self._store.store_of(job.name, job), sweeps)
         except JobError as error:  # any other is of the place, which all jobs need
-            return failed_row(number, error, described)
+            return failed_row(job, error)
 
     def _put(self, found: Entry | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():
@@ -375,16 +351,16 @@ class _Writer:
             self._write_here(entry)
 
     def _submitted(self, entry: Entry) -> Future:
-        number, name = entry.described.number, entry.name
+        number, name = entry.job.number, entry.name
         future: Future = self.partition.submit(
             call_alike, self.sources, write_job, self.dataset, self.probes, number, name,
-            entry.store.points(), entry.sweeps, entry.made_of, priority=5,
+            entry.store.points(), entry.sweeps, entry.job.made_of, priority=5,
         )  # fmt: skip
         return future
 
     def _write_here(self, entry: Entry) -> None:
-        number, name = entry.described.number, entry.name
-        what = (entry.store.points(), entry.sweeps, entry.made_of)
+        number, name = entry.job.number, entry.name
+        what = (entry.store.points(), entry.sweeps, entry.job.made_of)
         written = self._thread.submit(_written, self.dataset, number, name, *what)
         self.here[written] = entry
 
@@ -533,12 +509,12 @@ class CampaignDriver(Surveys):
 
     def _end(self, entry: Entry, made: Mapping[str, Any]) -> None:
         """Commit a job that is written."""
-        described, survey, db = entry.described, entry.job.survey, entry.store.db
+        job, survey, db = entry.job, entry.job.survey, entry.store.db
         row = JobRow(
-            number=described.number,
-            name=described.name,
-            split=described.split,
-            values=dict(described.values),
+            number=job.number,
+            name=job.name,
+            split=job.split,
+            values=job.values,
             scans=survey.scan_count,
             sweeps=len(entry.sweeps),
             rays=survey.ray_count,
@@ -556,8 +532,7 @@ class CampaignDriver(Surveys):
 
     def _fail(self, entry: Entry, error: LidarpoolError) -> None:
         """Commit that a job has failed."""
-        described = entry.described
-        self._commit(failed_row(described.number, error, described))
+        self._commit(failed_row(entry.job, error))
         self._drop(entry)
 
     def _commit(self, row: JobRow) -> None:
@@ -596,7 +571,7 @@ def _under_way(entry: Entry) -> UnderWay:
     driver, db = entry.driver, entry.store.db
     return UnderWay(
         name=entry.name,
-        values=entry.described.values,
+        values=entry.job.values,
         stored=db.scans_done,
         scans=entry.job.survey.scan_count,
         points=db.point_count,
@@ -648,8 +623,7 @@ def run_campaign(
                 cluster = Cluster(client, first.job, store, tell, waiting, needed, left)
                 break
             except JobError as error:  # it is too large for the workers; others may not be
-                described = first.described
-                row = failed_row(described.number, error, described)
+                row = failed_row(first.job, error)
                 store.end(row)
                 page.ended(row)
                 maker.take()  # that one
