@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .report.comparison import Comparison, compare
     from .run.campaign import CampaignRun
     from .run.store import remove_run
-    from .scenario.campaign import CampaignJob
+    from .scenario.job import Job
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
@@ -52,7 +52,6 @@ __all__ = [
     "Actor",
     "Beams",
     "Campaign",
-    "CampaignJob",
     "CampaignRun",
     "Cloud",
     "Column",
@@ -61,6 +60,7 @@ __all__ = [
     "Gnss",
     "Imu",
     "Instance",
+    "Job",
     "LidarpoolError",
     "Material",
     "Mesh",
@@ -110,7 +110,7 @@ _MODULES = {
     "report.comparison": ("Comparison", "compare"),
     "run.campaign": ("CampaignRun",),
     "run.store": ("remove_run",),
-    "scenario.campaign": ("CampaignJob",),
+    "scenario.job": ("Job",),
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from ..base.storage import Storage
     from ..run.connection import TlsFiles
     from ..run.job import Job
-    from ..scenario.campaign import Campaign, Described
+    from ..scenario.campaign import Campaign
     from ..scenario.scenario import Scenario
 
 _LOOKED_AT = 5  # jobs of a campaign
@@ -61,8 +61,11 @@ def check(
     """  # noqa: D301 - click wants the character, not its name
     from ..run.cluster_file import ClusterFile
     from ..run.connection import connected
-    from ..run.job import make_job
+    from ..run.job import with_options
+    from ..scenario.advice import advice
+    from ..scenario.build import build
     from ..scenario.campaign import Campaign, is_campaign
+    from ..scenario.job import job_of
     from ..scenario.scenario import Scenario
     from .forecast import forecast
     from .run_command import formats_of
@@ -70,12 +73,13 @@ def check(
 
     def look(read: Scenario, plans: bool) -> tuple[Job, dict[str, Any]]:
         with shown_status("reading the scene", as_json, logged=False):
-            job = make_job(read, backend, not plans)
+            built = build(read, plans=plans)
+            job = with_options(job_of(built), read.pool, backend)
         running = nullcontext() if scheduler is None else connected(scheduler, files)
         with running as client, shown_status("casting some rays", as_json):
             found = forecast(job, read.pool, out, client, formats_of(read), file)
-        found["notes"] += read.advice(job.scene)
-        found["sources"] = read.sources
+        found["notes"] += advice(built)
+        found["sources"] = dict(built.found.sources)
         return job, found
 
     try:
@@ -91,10 +95,11 @@ def check(
             found = _look_at_jobs(campaign, look)
             lines = _of_campaign(campaign, found)
         else:
-            described = Campaign.load(scenario).describe(number)
-            assert described.scenario is not None, "of a file"
-            job, found = look(described.scenario, False)
-            found["job"] = _figures(described, found)
+            campaign = Campaign.load(scenario)
+            read = campaign.scenario(number)
+            assert read is not None, "of a file"
+            job, found = look(read, False)
+            found["job"] = _figures(campaign, number, found)
             lines = told(job, found)
     except LidarpoolError as error:
         if as_json:
@@ -127,13 +132,13 @@ def _look_at_jobs(
     jobs, notes, reasons = [], [], []
     for number in dict.fromkeys(last * i // (_LOOKED_AT - 1) for i in range(_LOOKED_AT)):
         try:
-            described = campaign.describe(number)
-            assert described.scenario is not None, "of a file"
-            _, found = look(described.scenario, False)
+            read = campaign.scenario(number)
+            assert read is not None, "of a file"
+            _, found = look(read, False)
         except LidarpoolError as error:
             reasons.append(str(error))
             continue
-        jobs.append(_figures(described, found))
+        jobs.append(_figures(campaign, number, found))
         notes += found["notes"]
         reasons += found["reasons"]
     return {
@@ -149,11 +154,14 @@ def _look_at_jobs(
     }
 
 
-def _figures(described: Described, found: dict[str, Any]) -> dict[str, Any]:
+def _figures(campaign: Campaign, number: int, found: dict[str, Any]) -> dict[str, Any]:
     """Return a job of a campaign and its figures, as plain data."""
-    names = ("objects", "triangles", "scans", "rays", "estimate")
-    job = {name: getattr(described, name) for name in ("number", "name", "split")}
-    return job | {"values": dict(described.values)} | {name: found[name] for name in names}
+    return {
+        "number": number,
+        "name": campaign.name(number),
+        "split": campaign.split(number),
+        "values": campaign.values(number),
+    } | {name: found[name] for name in ("objects", "triangles", "scans", "rays", "estimate")}
 
 
 def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:

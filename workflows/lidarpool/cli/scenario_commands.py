@@ -45,6 +45,8 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
       lidarpool init
       lidarpool init surveys/hall --mesh hall.stl --unit mm
     """  # noqa: D301 - click wants the character, not its name
+    from ..scenario.advice import advice
+    from ..scenario.build import build
     from ..scenario.scenario import Scenario
     from ..scenario.schema import SCHEMA_FILE, scenario_schema, schema_text
     from ..scenario.template import SCENARIO_FILE, scenario_template
@@ -57,8 +59,8 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
     if meshes and not target.exists():
         there = [e | {"file": str(p.absolute())} for e, p in zip(entries, meshes, strict=True)]
         read = Scenario.from_data({"scene": {"files": there}}, source=str(target))
-        scene = read.build_scene()
-        placing, notes = read.placing(scene), read.advice(scene)
+        built = build(read)
+        placing, notes = built.placing, advice(built)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         with target.open("x", encoding="utf-8", newline="\n") as file:

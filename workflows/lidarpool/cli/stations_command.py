@@ -96,6 +96,8 @@ def stations(
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     from ..plan.stations import STATIONS_MOST, plan_stations
     from ..report.station_picture import draw_stations
+    from ..scenario.advice import advice
+    from ..scenario.build import build
     from ..scenario.scenario import Scenario
     from ..sensor.models import full_name, load_sensor
     from .terminal import shown_status
@@ -108,19 +110,19 @@ def stations(
     sensor = load_sensor(model)
     read = Scenario.load(scene)
     with shown_status("reading the scene", as_json, logged=False):
-        built = read.build_scene()
+        built = build(read, plans=False)
     with shown_status("looking from all places", as_json, logged=False):
         plan = plan_stations(
-            built, sensor, count=count, coverage=coverage,
+            built.scene, sensor, count=count, coverage=coverage,
             height_m=height, spacing_m=spacing, slant_deg=slant,
         )  # fmt: skip
     with shown_status("drawing the picture", as_json, logged=False):
-        page = draw_stations(built, plan)
+        page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / SCENARIO_FILE
     file.write_text(_scenario(read, scene.parent, folder, model, plan), "utf-8", newline="\n")
     page.save(folder / PICTURE_FILE)
-    notes = read.advice(built)
+    notes = advice(built)
     reached = float(plan.coverage[-1])
     if coverage is not None and reached < coverage:
         notes.append(
@@ -130,9 +132,9 @@ def stations(
     if count is not None and len(plan.stations) < count:
         notes.append(f"{len(plan.stations)} of {count} stations already see all that can be seen")
     if as_json:
-        click.echo(json.dumps(_figures(plan, built.names, sensor.model, notes), indent=1))
+        click.echo(json.dumps(_figures(plan, built.scene.names, sensor.model, notes), indent=1))
         return
-    for line in _told(plan, built.names):
+    for line in _told(plan, built.scene.names):
         click.echo(line)
     for note in notes:
         click.echo(f"note: {note}")

@@ -5,29 +5,32 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import cache, cached_property
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, Protocol
+from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 from pydantic import Field, ValidationError
 
-from ..base.arguments import checked, checked_fields, shown
+from ..base.arguments import checked, shown
 from ..base.declared import Seed, declared
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
 from ..base.words import counted
 from ..base.yamlfile import read_yaml
-from ..scene.scene import Scene
-from ..sensor import Noise, Survey
-from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits, Value, file_of
+from ..export.jobs import Value
+from ..export.table import check_whole
+from .build import build
+from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits, file_of
 from .draws import Draw
-from .paths import FieldPath, find_field, held, opened, put
+from .job import Job, job_of
+from .paths import FieldPath, find_field, held, put
 from .scenario import Scenario
+from .static_scene import SceneCache
 from .tables import Row, read_rows
 from .validation_errors import validation_errors
 
@@ -39,73 +42,6 @@ _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # 
 _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
 
 
-@dataclass(frozen=True)
-@checked_fields
-class CampaignJob:
-    """A job that a function of Python makes for a `Campaign`.
-
-    Parameters
-    ----------
-    scene, survey
-        As for `simulate`: poses in the scene's local coordinates.
-    values
-        What is of its own: {name: number, text, or True and False}; None for an empty cell. All
-        jobs of a campaign have the same names, the columns of its table.
-
-    Raises
-    ------
-    LidarpoolError
-        If something is of another type.
-    """
-
-    scene: Scene
-    survey: Survey
-    values: Mapping[str, Value | None] = field(default_factory=dict)
-
-
-@dataclass(frozen=True)
-class Described:
-    """A job of a campaign.
-
-    Parameters
-    ----------
-    number
-        From 0.
-    name
-        Of its files: its number with zeros before it; of a given scenario, that of its file.
-    values
-        What differs from job to job: {name: value}; of a sample, how many rows. A name is missing
-        where the value is none.
-    split
-        Name of its split; empty without splits.
-    scenario
-        What it is, if a file describes it,
-    made
-        or what a function made.
-    """
-
-    number: int
-    name: str
-    values: Mapping[str, Value]
-    split: str = ""
-    scenario: Scenario | None = None
-    made: CampaignJob | None = None
-
-
-class _Jobs(Protocol):
-    """Where the jobs of a campaign come from."""
-
-    files: set[Path]  # that they may be made of
-
-    @property
-    def names(self) -> tuple[str, ...]: ...
-    @property
-    def choices(self) -> Mapping[str, str]: ...
-    @property
-    def identity(self) -> dict[str, str]: ...
-    def job(self, number: int) -> Described: ...
-
-
 class Campaign:
     """Many jobs (surveys) from one description, into one data set.
 
@@ -115,9 +51,9 @@ class Campaign:
     Parameters
     ----------
     make
-        ``make(number, rng)`` returns the `CampaignJob` of a number from 0 on. `rng` is a
-        ``numpy.random.Generator`` that depends on the seed and the number alone: a job is the same
-        however often, in whatever order and wherever it is made.
+        ``make(number, rng)`` returns the `Job` of a number from 0 on, with its scene, survey and
+        values. `rng` is a ``numpy.random.Generator`` that depends on the seed and the number alone:
+        a job is the same however often, in whatever order and wherever it is made.
     count
         How many jobs.
     seed
@@ -148,12 +84,12 @@ class Campaign:
     title: str
     command: str = ""  # what follows ``lidarpool run``; empty for a function
     description: str = ""  # the file's text, where there is one
-    files: set[Path]  # that its jobs may be made of; some may be missing
+    files: Set[Path]  # that its jobs may be made of; some may be missing
 
     @checked
     def __init__(
         self,
-        make: Callable[[int, np.random.Generator], CampaignJob],
+        make: Callable[[int, np.random.Generator], Job],
         count: Annotated[int, Field(ge=1, le=COUNT_MOST)],
         *,
         seed: Seed = 0,
@@ -170,7 +106,7 @@ class Campaign:
         self.count, self.seed, self.license = head.count, head.seed, head.license
         self.title, self.splits = head.title, dict(head.splits)
         self.keep, self.files = Keep(**declared(head.keep, Keep)), jobs.files
-        self._jobs, self._split = jobs, Splits(head.splits, head.seed)
+        self._jobs, self._splits = jobs, Splits(head.splits, head.seed)
 
     @classmethod
     @checked
@@ -236,24 +172,61 @@ class Campaign:
         """
         return self._jobs.choices
 
-    @checked
-    def describe(self, number: int) -> Described:
-        """Return a job; the same number gives the same job.
+    def values(self, number: int) -> dict[str, Value]:
+        """Return what differs from job to job: {name: value}; of a sample, how many rows.
+
+        A name is missing where the value is none. Of a function, its job is made to be asked.
+        """
+        return self._jobs.values(self._known(number))
+
+    def name(self, number: int) -> str:
+        """Return the name of a job in files: of a given scenario that of its file, else 0017."""
+        return self._jobs.name(self._known(number))
+
+    def split(self, number: int) -> str:
+        """Return the name of a job's split; empty without splits."""
+        return self._splits(self._known(number))
+
+    def scenario(self, number: int) -> Scenario | None:
+        """Return what a job is built of; None if a function makes it.
+
+        LidarpoolError if its values do not fit together; the message names it and them.
+        """
+        return self._jobs.scenario(self._known(number))
+
+    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
+        """Make a job; the same number gives the same job. Jobs plan no paths.
+
+        Parameters
+        ----------
+        number
+            From 0.
+        cache
+            Static scenes of other jobs, which this one may share.
+        columns
+            Names of columns that the data set needs.
 
         Raises
         ------
         LidarpoolError
-            If there is no such job, or its values do not fit together; the message names it and
-            them.
+            If there is no such job, or it cannot be made; the message says why.
         """
+        number = self._known(number)
+        own = {"number": number, "name": self.name(number), "split": self.split(number)}
+        job = self._jobs.job(number, cache, columns, own)
+        if job.survey.navigation is not None:
+            raise LidarpoolError(
+                "navigation is for single surveys, since a data set has no place for its files: "
+                "leave it out of the campaign's base."
+            )
+        return job
+
+    def _known(self, number: int) -> int:
         if not 0 <= number < self.count:
             raise LidarpoolError(
                 f"there is no job {number}: the campaign has jobs 0 to {self.count - 1}."
             )
-        number = int(number)  # of NumPy, perhaps
-        found = self._jobs.job(number)
-        name = found.name or f"{number:04}"  # however many there are
-        return replace(found, name=name, split=self._split(number))
+        return int(number)  # of NumPy, perhaps
 
     def check_files(self) -> None:
         """Check that all files are there that jobs may be made of, or raise LidarpoolError."""
@@ -272,7 +245,7 @@ class Campaign:
         """
         shared = {"seed": self.seed, "keep": self.keep}
         own = {name: fingerprint(value) for name, value in shared.items()}
-        return own | {"splits": fingerprint(dict(self.splits))} | self._jobs.identity
+        return own | {"splits": fingerprint(dict(self.splits)), **self._jobs.identity}
 
 
 def is_campaign(path: str | Path) -> bool:
@@ -307,38 +280,73 @@ def _head(**given: Any) -> CampaignSection:
     return _valid({"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}, "")
 
 
-class _Made:
+class _Jobs:
+    """Where the jobs of a campaign come from."""
+
+    count: int
+    names: tuple[str, ...] = ()
+    choices: Mapping[str, str] = MappingProxyType({})
+    files: Set[Path] = frozenset()  # that they may be made of
+    identity: Mapping[str, str]
+
+    def name(self, number: int) -> str:
+        return f"{number:04}"  # however many there are
+
+    def values(self, number: int) -> dict[str, Value]:
+        return {}
+
+    def scenario(self, number: int) -> Scenario | None:
+        return None
+
+    def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
+        scenario = self.scenario(number)
+        assert scenario is not None, "of a file"
+        made_of = hashes(scenario.files)
+        built = build(scenario, plans=False, cache=cache, columns=columns)
+        return job_of(built, values=self.values(number), made_of=made_of, **own)
+
+
+class _Made(_Jobs):
     """Jobs that a function makes."""
 
     def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
-        self._make, self._count, self._seed = make, count, seed
-        self.files = set[Path]()
-
-    choices: Mapping[str, str] = MappingProxyType({})
+        self._make, self.count, self._seed = make, count, seed
 
     @cached_property
-    def names(self) -> tuple[str, ...]:
-        for number in range(self._count):
+    def names(self) -> tuple[str, ...]:  # type: ignore[override]  # found out when it is asked for
+        for number in range(self.count):
             with suppress(LidarpoolError):  # one that fails must not end the others
                 return tuple(self._made(number).values)
         return ()
 
     @property
-    def identity(self) -> dict[str, str]:
+    def identity(self) -> dict[str, str]:  # type: ignore[override]
         return {"make": fingerprint(self._make)}
 
-    def job(self, number: int) -> Described:
+    def values(self, number: int) -> dict[str, Value]:
+        return self._values(number, self._made(number).values)
+
+    def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         made = self._made(number)
-        if extra := [name for name in made.values if name not in self.names]:
+        survey, seed = made.survey, _noise_seed(self._seed, number)
+        check_whole(columns, survey.keep_every)
+        survey = replace(
+            survey,
+            noise=_seeded(survey.noise, seed),
+            sensors=[replace(one, noise=_seeded(one.noise, seed)) for one in survey.sensors],
+            columns=(*survey.columns, *columns),
+        )
+        return Job(made.scene, survey, values=self._values(number, made.values), **own)
+
+    def _values(self, number: int, given: Mapping[str, Any]) -> dict[str, Value]:
+        if extra := [name for name in given if name not in self.names]:
             raise LidarpoolError(
                 f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
                 "the same names, with None where there is no value."
             )
-        values = {name: _plain(number, name, value) for name, value in made.values.items()}
-        made = replace(made, survey=_seeded(made.survey, _noise_seed(self._seed, number)))
-        return Described(number, "", _without_none(values), made=made)
+        return _without_none({n: _plain(number, n, value) for n, value in given.items()})
 
-    def _made(self, number: int) -> CampaignJob:
+    def _made(self, number: int) -> Job:
         try:
             made = self._make(number, Draw(self._seed, number, "make").generator())
         except LidarpoolError as error:
@@ -347,10 +355,10 @@ class _Made:
             # One job's failure must not end the others.
             told = f"job {number}: the function raised {type(error).__name__}: {error}"
             raise LidarpoolError(told) from error
-        if not isinstance(made, CampaignJob):
+        if not isinstance(made, Job):
             raise LidarpoolError(
                 f"job {number}: the function returned {shown(made)}; it must return a "
-                "CampaignJob(scene, survey)."
+                "Job(scene, survey)."
             )
         return made
 
@@ -365,37 +373,31 @@ def _plain(number: int, name: Any, value: Any) -> Value | None:
     return value
 
 
-class _Given:
+class _Given(_Jobs):
     """Scenario and mesh files as they are."""
-
-    choices: Mapping[str, str] = MappingProxyType({})
-    names: tuple[str, ...] = ()
 
     def __init__(self, paths: Sequence[Path]) -> None:
         if not paths:
             raise LidarpoolError("a campaign needs a scenario at least: name one or more files.")
         self.paths, self.count = paths, len(paths)
-        mistakes = Mistakes()
-        self.files = set[Path]()
-        self._prints: list[str] = []
+        mistakes, files, prints = Mistakes(), set[Path](), []
         for path in paths:
             with mistakes.noted():
                 if is_campaign(path):
                     told = f"{path} is a campaign, with jobs of its own: run it by itself."
                     raise LidarpoolError(told)
                 read = Scenario.load(path)
-                self._prints.append(_print(read))
-                self.files.update(read.files)
+                prints.append(_print(read))
+                files.update(read.files)
         mistakes.tell()
+        self.files, self.identity = files, {"scenarios": fingerprint(prints)}
         self._names = _unique([path.stem for path in paths])
 
-    @property
-    def identity(self) -> dict[str, str]:
-        return {"scenarios": fingerprint(self._prints)}
+    def name(self, number: int) -> str:
+        return self._names[number]
 
-    def job(self, number: int) -> Described:
-        scenario = Scenario.load(self.paths[number])
-        return Described(number, self._names[number], {}, scenario=scenario)
+    def scenario(self, number: int) -> Scenario:
+        return Scenario.load(self.paths[number])
 
 
 def _unique(stems: Iterable[str]) -> list[str]:
@@ -413,7 +415,7 @@ def _unique(stems: Iterable[str]) -> list[str]:
     return out
 
 
-class _Varied:
+class _Varied(_Jobs):
     """Jobs of a campaign file: a base with other values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
@@ -457,41 +459,58 @@ class _Varied:
         self.choices = dict.fromkeys(several, f"{listed}, each of {len(self._bases):,}")
         self.choices |= {text: choice.words for text, choice in section.vary.items()}
 
-    @property
-    def identity(self) -> dict[str, str]:
+        self._last: tuple[int, _Drawn] | None = None
+
+    @cached_property
+    def identity(self) -> dict[str, str]:  # type: ignore[override]
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
             "tables": fingerprint(repr([base.tables for base in self._bases])),
         }
 
-    def job(self, number: int) -> Described:
+    def values(self, number: int) -> dict[str, Value]:
+        return _without_none(self._drawn(number).told)
+
+    def scenario(self, number: int) -> Scenario:
+        drawn, seed = self._drawn(number), _noise_seed(self._seed, number)
         base = self._bases[number % len(self._bases)]
-        told: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
-        values: dict[str, Any] = {}
-        rows: dict[str, list[Any]] = {}
+        try:
+            return base.scenario_of(drawn.values, drawn.rows, f"{self._source}: job {number}", seed)
+        except LidarpoolError as error:
+            shown = ", ".join(f"{n}: {value}" for n, value in self.values(number).items())
+            raise LidarpoolError(
+                f"{error}\nIts values are {shown or 'those of the base'}."
+            ) from error
+
+    def _drawn(self, number: int) -> _Drawn:
+        """Draw what a job has of its own; the last is kept, as several things ask for it."""
+        if self._last is not None and self._last[0] == number:
+            return self._last[1]
+        base = self._bases[number % len(self._bases)]
+        drawn = _Drawn({"base": base.name} if len(self._bases) > 1 else {}, {}, {})
         for text, choice in self._vary.items():
             draw = Draw(self._seed, number, text)
             if choice.sample is not None:
                 chosen = draw.integer(*choice.sample.count)
                 table = base.tables[text]
-                rows[text] = [table[i].entry for i in draw.subset(len(table), chosen)]
-                told[text] = chosen
+                drawn.rows[text] = [table[i].entry for i in draw.subset(len(table), chosen)]
+                drawn.told[text] = chosen
             elif choice.each is not None:
                 turn = number // self._strides[text] % len(choice.listed)
-                values[text], told[text] = choice.option(turn)
+                drawn.values[text], drawn.told[text] = choice.option(turn)
             else:
-                values[text], told[text] = choice.drawn(draw)
-        found = _without_none(told)
-        try:
-            seed = _noise_seed(self._seed, number)
-            scenario = base.scenario_of(values, rows, f"{self._source}: job {number}", seed)
-        except LidarpoolError as error:
-            shown = ", ".join(f"{name}: {value}" for name, value in found.items())
-            raise LidarpoolError(
-                f"{error}\nIts values are {shown or 'those of the base'}."
-            ) from error
-        return Described(number, "", found, scenario=scenario)
+                drawn.values[text], drawn.told[text] = choice.drawn(draw)
+        self._last = number, drawn
+        return drawn
+
+
+class _Drawn(NamedTuple):
+    """What a job has of its own."""
+
+    told: dict[str, Value | None]  # for the table of jobs
+    values: dict[str, Any]  # {path: value}
+    rows: dict[str, list[Any]]  # {path: entries that are added}
 
 
 class _Base:
@@ -598,32 +617,26 @@ class _Base:
     ) -> Scenario:
         """Return the scenario with other values, and with entries added to lists."""
         made: Any = self.scenario
-        with prefixed(source):
-            for text, value in values.items():
-                made = put(made, self._fields[text].steps, value)
-            for text, entries in rows.items():
-                steps = self._fields[text].steps
-                made = put(made, steps, [*(held(made, steps) or ()), *entries])
+        for text, value in values.items():
+            made = put(made, self._fields[text].steps, value)
+        for text, entries in rows.items():
+            steps = self._fields[text].steps
+            made = put(made, steps, [*(held(made, steps) or ()), *entries])
+        changed = {self._fields[text].keys[0] for text in (*values, *rows)}
         if noise_seed and _NOISE not in values and not held(made, self._noise.steps):
             made = put(made, self._noise.steps, noise_seed)
-        return Scenario.from_data(opened(made), source=source, folder=self._folder)
+            changed.add(self._noise.keys[0])
+        sections = {str(name): made[name] for name in changed}
+        return self.scenario.with_sections(sections, source=source)
 
 
 def _noise_seed(seed: int, number: int) -> int:
     return Draw(seed, number, _NOISE).bits(63) or 1
 
 
-def _seeded(survey: Survey, seed: int) -> Survey:
-    """Give the noise of a survey a seed where it has none."""
-
-    def seeded(noise: Noise) -> Noise:
-        return noise if noise.seed else replace(noise, seed=seed)
-
-    sensors = [
-        replace(one, noise=None if one.noise is None else seeded(one.noise))
-        for one in survey.sensors
-    ]
-    return replace(survey, noise=seeded(survey.noise), sensors=sensors)
+def _seeded(noise: Any, seed: int) -> Any:
+    """Give noise a seed where there is noise without one."""
+    return noise if noise is None or noise.seed else replace(noise, seed=seed)
 
 
 def _without_none(values: Mapping[str, Value | None]) -> dict[str, Value]:

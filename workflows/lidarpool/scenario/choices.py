@@ -17,13 +17,13 @@ from pydantic import BeforeValidator, Field, Strict, model_validator
 from ..base.arguments import checked_fields
 from ..base.arguments import shown as given
 from ..base.declared import Seed, Text, TextOrTexts, is_text, short, told
+from ..export.jobs import Value
 from ..export.table import FORMATS, LAYOUTS
 from .draws import SHARE_LEAST, SIGMAS, Draw
 from .sections import Section, may_be_empty
 
 COUNT_MOST = 10_000_000
 KEPT = ("kitti", "nuscenes", "mcap", "parquet", "images", "folder")
-Value = bool | int | float | str  # in the table of jobs
 
 _SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
 

@@ -17,6 +17,7 @@ import yaml
 
 from ...base.arrays import Floats
 from ...base.errors import LidarpoolError, prefixed
+from ...scenario.build import build
 from ...scenario.scenario import Scenario
 from ...scene.transform import rotation_about
 from ...sensor import Pose
@@ -78,7 +79,7 @@ def import_survey(
         for name, text in made.files(out).items():
             (partial / name).write_text(text, encoding="utf-8", newline="\n")
         scenario = Scenario.load(partial / SCENARIO_FILE)
-        scenario.survey(scenario.build_scene())  # with whatever is wrong about it
+        build(scenario)  # with whatever is wrong about it
         partial.chmod(0o755)  # temporary folders are their owner's alone
         partial.rename(out)
     except LidarpoolError as error:

@@ -1,0 +1,111 @@
+"""Notes on likely mistakes in a scenario that can be built."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from ..base.words import counted
+from ..columns.table import VELOCITY
+from ..scene.meshfile import CITYJSON, UNITLESS, wrote_it
+from ..sensor.materials import MaterialTable
+from .build import Built
+from .placing import inside_note
+from .scenario import Scenario
+
+# Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
+# to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
+# millimetres.
+LARGE_M, LARGE_STL_M, LARGE_OBJECT_M, LARGE_STATED_M, SMALL_M = 500.0, 20.0, 10.0, 100.0, 0.2
+
+_LOOKED_FROM = 8  # positions, if poses or a trajectory are given
+
+
+def advice(built: Built) -> list[str]:
+    """Return notes on likely mistakes, such as a size that suggests another unit.
+
+    Also on objects that were left out, on files whose axes were guessed, on where the sensor is,
+    and on settings without effect.
+    """
+    notes, remarks = built.found.notes, built.found.remarks
+    axes = remarks[:1]
+    if remarks[1:]:
+        axes = [f"{axes[0]}; {counted(len(remarks) - 1, 'more file')}, too"]
+    likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
+    return [*notes, *axes, *likely, *_without_effect(built.scenario)]
+
+
+def _of_size(built: Built) -> str:
+    scenario, placing = built.scenario, built.placing
+    files = [entry.file for entry in scenario.scene.files if entry.unit is None]
+    files = [file for file in files if not file.lower().endswith(CITYJSON)]  # towns are large
+    unitless = [f for f in files if f.lower().endswith(UNITLESS) and not wrote_it(scenario.path(f))]
+    side = float(np.ptp(built.scene.bounds, axis=0).max())
+    parts = any(file.lower().endswith(".stl") for file in unitless)
+    least, large = SMALL_M, LARGE_STL_M if parts else LARGE_M
+    if around := placing is not None and placing.around:
+        least, large = 0.0, LARGE_OBJECT_M if unitless else LARGE_STATED_M
+    if not (unitless or (around and files)) or least <= side <= large:
+        return ""
+    unit = "mm" if side > large else "km"
+    said = "states no unit" if unitless else "is in metres by its format"
+    return (
+        f"{(unitless or files)[0]} {said}, and in metres the scene is {side:,.5g} m long. If "
+        f"that is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR "
+        f"--mesh FILE --unit {unit} writes such a scenario)"
+    )
+
+
+def _of_poses(built: Built) -> str:
+    if built.placing is not None:
+        return built.placing.note
+    if built.scenario.scene.has_seed:
+        return ""
+    survey = built.survey
+    if built.scenario.trajectory is not None:
+        at, _ = survey.path.poses(0, np.linspace(0, survey.path.duration_ns, _LOOKED_FROM))
+    else:
+        step = -(-len(survey.poses) // _LOOKED_FROM)
+        at = np.array([pose.position for pose in survey.poses[::step]])
+    return inside_note(built.scene, at, survey.carried[0])
+
+
+def _of_colours(built: Built) -> str:
+    scene = built.scene
+    if not built.scenario.coloured:
+        return ""
+    if not scene.coloured:
+        return (
+            "a column or reflectance: texture needs colours, but nothing in the scene has any, "
+            "so that all is grey"
+        )
+    names = scene.all_names
+    table = MaterialTable.of(built.survey.materials, names, voxels=scene.has_voxels)
+    textured = table.scale > 0
+    if not len(grey := np.flatnonzero(textured & ~scene.has_colours)):
+        return ""
+    shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)
+    return (
+        f"{len(grey):,} of {counted(int(textured.sum()), 'object')} with reflectance: texture "
+        f"have no colours and are grey: {shown}"
+    )
+
+
+def _without_effect(scenario: Scenario) -> Iterator[str]:
+    """Tell of settings that another one keeps from having an effect."""
+    written = {entry.format for entry in scenario.output.write}
+    if scenario.cloud.waveform_samples and not {"las", "laz"} & written:
+        yield (
+            "cloud.waveform_samples: only LAS and LAZ files hold waveforms, and none is "
+            "written: add output: {write: [las]}"
+        )
+    if scenario.weather.fog_lidar_ratio_sr is not None and scenario.weather.visibility_km is None:
+        yield "weather.fog_lidar_ratio_sr without weather.visibility_km is no fog"
+    if scenario.noise.stray_light and not any(entry.retro for entry in scenario.materials):
+        yield "noise.stray_light needs materials with retro: true, and there are none"
+    way, imu = scenario.trajectory, scenario.navigation and scenario.navigation.imu
+    if imu and way and way.interpolation == "linear" and len(way.points) != 2:
+        yield "navigation.imu has jumps at linear poses: give trajectory.interpolation: smooth"
+    if scenario.noise.velocity_m_s and VELOCITY not in scenario.cloud.columns:
+        yield f"noise.velocity_m_s is that of the column {VELOCITY}: add it to cloud.columns"
