@@ -94,7 +94,6 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             If the cluster lacks something, or `out` holds something else, or the unfinished run of
             another campaign or version; one or two lines say which and what to do.
         """
-
         place = output_place(out)
         options = RunOptions(
             out=place,

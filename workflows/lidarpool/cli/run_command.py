@@ -195,9 +195,7 @@ def no_hits(job: Job) -> str:
     return f"no ray hit anything: check poses, ranges and units; {where}; {seen}"
 
 
-def _tell_result(
-    out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]
-) -> None:
+def _tell_result(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:
     for note in report["notes"]:
         click.echo(f"note: {note}")
     if not result.hits:

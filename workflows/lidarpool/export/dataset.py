@@ -245,7 +245,6 @@ class DataSet:
             while some := [*islice(done, _AHEAD)]:
                 yield from zip(some, pool.map(look_at, some), strict=True)
 
-
     def _manifest(self, name: str) -> dict[str, Any]:
         """Read the manifest of a job; empty if it is missing or damaged."""
         try:

@@ -27,10 +27,10 @@ from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
 from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT, JobError
-from ..simulator.memory import MB, cast_bytes
-from ..simulator.world import AUTO_TAKES
 from ..scenario.job import Job
 from ..scenario.sections import TaskOptions
+from ..simulator.memory import MB, cast_bytes
+from ..simulator.world import AUTO_TAKES
 from .watch import Waiting, queued
 
 LOOK_EVERY_S = 0.2

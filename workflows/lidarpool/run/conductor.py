@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack, nullcontext
-from typing import Any, Generic, TypeVar
+from typing import Generic, TypeVar
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
@@ -14,8 +14,7 @@ from ..pipeline.database import FILE
 from ..simulator.world import check_backend_here
 from .checks import slots_needed
 from .cluster import Cluster, client_of
-from .job_points import JobPoints
-from .jobs import JobMaker, Jobs, Made, OneJob
+from .jobs import JobMaker, Jobs, Made
 from .options import RunOptions
 from .page import Page
 from .ranges import LidarWorkers
@@ -166,9 +165,7 @@ class Conductor(Generic[R]):
         if options.cluster is not None:
             options.cluster.require(needed)
         waiting = Waiting(options.wait_s, self.screen.tell)
-        client = self._cluster_stack.enter_context(
-            client_of(options, needed, waiting, self.screen)
-        )
+        client = self._cluster_stack.enter_context(client_of(options, needed, waiting, self.screen))
         jobs_left = self.jobs.count - store.db.ended_count
         left = job.survey.scan_count * jobs_left - (store.only.resumed if store.only else 0)
         self.cluster = Cluster(client, store, options, needed, left, waiting, self.screen)

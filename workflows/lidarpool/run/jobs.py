@@ -13,7 +13,7 @@ from threading import Event, Thread
 from typing import NamedTuple, Protocol
 
 from ..base.errors import LidarpoolError
-from ..export.jobs import JobRow
+from ..export.jobs import JobRow, Value
 from ..export.sweeps import Sweeps
 from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
@@ -38,13 +38,17 @@ class Jobs(Protocol):
     def identity(self) -> Mapping[str, str]:
         """Hashes of what all results depend on."""
 
-    def job(
-        self, number: int, cache: SceneCache | None = None, columns: tuple[str, ...] = ()
-    ) -> Job:
+    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Make a job; LidarpoolError if it cannot be made."""
 
-    def row(self, number: int, error: str) -> JobRow:
-        """Row of a job that has failed, perhaps because it cannot be made."""
+    def values(self, number: int) -> Mapping[str, Value]:
+        """Values of a job; LidarpoolError if it cannot be made."""
+
+    def name(self, number: int) -> str:
+        """Name of a job in files."""
+
+    def split(self, number: int) -> str:
+        """Name of its split."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,15 +65,29 @@ class OneJob:
         """Fingerprints of scene, survey and planning."""
         return identity_of(self.only)
 
-    def job(
-        self, number: int, cache: SceneCache | None = None, columns: tuple[str, ...] = ()
-    ) -> Job:
+    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Return it."""
         return self.only
 
-    def row(self, number: int, error: str) -> JobRow:
-        """Row of it, failed."""
-        return JobRow(number, self.only.name, error=error)
+    def values(self, number: int) -> Mapping[str, Value]:
+        """None."""
+        return {}
+
+    def name(self, number: int) -> str:
+        """Its name."""
+        return self.only.name
+
+    def split(self, number: int) -> str:
+        """None."""
+        return ""
+
+
+def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
+    """Row of a job that has failed, perhaps because it cannot be made."""
+    values: Mapping[str, Value] = {}
+    with suppress(Exception):  # which is what has failed
+        values = jobs.values(number)
+    return JobRow(number, jobs.name(number), jobs.split(number), dict(values), str(error))
 
 
 class Made(NamedTuple):
@@ -85,7 +103,7 @@ class JobMaker:
     The data set wants clouds to have these `columns`, None where there is no data set.
     """
 
-    def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: tuple[str, ...] | None) -> None:
+    def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str] | None) -> None:
         self._jobs, self._numbers, self._columns = jobs, numbers, columns
         self._cache = SceneCache()
         self._ready: Queue[Made | JobRow | BaseException | None] = Queue(READY)
@@ -137,7 +155,7 @@ class JobMaker:
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
             told = str(error) if isinstance(error, LidarpoolError) else repr(error)
-            return self._jobs.row(number, told)
+            return failed_row(self._jobs, number, told)
 
     def _put(self, found: Made | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():

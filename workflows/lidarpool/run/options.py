@@ -12,7 +12,7 @@ from pydantic import Field
 from ..base.arguments import checked_fields
 from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..scenario.sections import PoolSection, TaskOptions
+from ..scenario.sections import TaskOptions
 from .cluster_file import ClusterFile
 from .connection import TlsFiles
 

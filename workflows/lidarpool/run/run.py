@@ -31,7 +31,7 @@ from ..scenario.job import Job
 from ..simulator.memory import MB, scans_that_fit
 from .cluster import Cluster
 from .job_points import JobPoints
-from .jobs import JobMaker, Made
+from .jobs import JobMaker, Made, failed_row
 from .page import JobNow, Page
 from .progress import Progress, Show
 from .store import RunStore
@@ -225,7 +225,7 @@ class Run:
         """Note that a job has failed; if there is only one, so has the run."""
         if self._writer is None:
             raise error
-        rows.append(self._store.jobs.row(number, str(error)))
+        rows.append(failed_row(self._store.jobs, number, error))
 
     def _commit(self, rows: Sequence[JobRow]) -> None:
         """Commit that jobs have ended, and remove what is left of them."""

@@ -30,6 +30,7 @@ from .draws import Draw
 from .job import Job, job_of
 from .paths import FieldPath, find_field, held, put
 from .scenario import Scenario
+from .sections import PoolSection
 from .static_scene import SceneCache
 from .tables import Row, read_rows
 from .validation_errors import validation_errors
@@ -193,6 +194,12 @@ class Campaign:
         LidarpoolError if its values do not fit together; the message names it and them.
         """
         return self._jobs.scenario(self._known(number))
+
+    @property
+    def pool(self) -> PoolSection:
+        """How a cluster runs the jobs, as the first of them says."""
+        scenario = self.scenario(0)
+        return PoolSection() if scenario is None else scenario.pool
 
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Make a job; the same number gives the same job. Jobs plan no paths.
