@@ -12,7 +12,7 @@ from distributed import Client
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
-from ..live.pages import page_of_campaign
+from ..live.pages import page_of
 from ..pipeline import LIDAR
 from ..report.campaign_output import Making, make_dataset
 from ..run.bars import bars_here
@@ -113,5 +113,5 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             parts, backend, wait_s, patience_s,
         )  # fmt: skip
         progress = bars_here() if on_progress is None else nullcontext(on_progress)
-        with page_of_campaign(self, live) as page:
+        with page_of(live, self.count, self.names, self.title or "campaign") as page:
             return make_dataset(self, making, cluster, progress, logger.info, page)

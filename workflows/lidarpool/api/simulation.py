@@ -11,7 +11,7 @@ from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..live.pages import page_of_run
+from ..live.pages import page_of
 from ..pipeline import LIDAR, Frame
 from ..plan import Planning
 from ..run.bars import bars_here
@@ -159,7 +159,7 @@ def simulate(
         cluster,
         own=client is None,
         progress=bars_here() if on_progress is None else nullcontext(on_progress),
-        page=page_of_run(job, live and not store.complete),
+        page=page_of(live and not store.complete),
         tell=logger.info,
         on_frame=on_frame or (lambda frame: None),
     ) as (result, _):

@@ -16,7 +16,7 @@ from ..base.words import counted
 from ..export.dataset import DataSet
 from ..export.folder import output_place
 from ..export.jobs import Tally
-from ..live.pages import page_of_campaign
+from ..live.pages import page_of
 from ..pipeline import LIDAR
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
@@ -58,7 +58,8 @@ def run_campaign(campaign: Campaign, options: RunOptions, retry_failed: bool) ->
         options.out, options.here, options.resume, options.fresh, retry_failed, options.verify,
         options.overwrite, options.parts, options.backend, options.wait_s, options.patience_s,
     )  # fmt: skip
-    with page_of_campaign(campaign, options.live) as page:
+    shown = campaign.count, campaign.names, campaign.title or "campaign"
+    with page_of(options.live, *shown) as page:
         progress = shown_progress(options.quiet)
         run = make_dataset(campaign, making, cluster, progress, teller(options), page)
         _tell(run, options)

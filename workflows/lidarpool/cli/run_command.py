@@ -20,17 +20,18 @@ from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..base.words import counted
 from ..export.folder import local_result, result_folder
 from ..export.formats import Format
-from ..live.pages import page_of_run
+from ..live.pages import page_of
 from ..pipeline import LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..report.output import CLOUD, further_files, refuse_to_replace, write_result
 from ..report.report import summary
 from ..run.checks import slots_needed
 from ..run.cluster_file import ClusterFile
-from ..run.conductor import Page, conducted
+from ..run.conductor import conducted
 from ..run.connection import TlsFiles, connected, local_client, started_client
 from ..run.identity import identity_of
 from ..run.job import Job, make_job
+from ..run.page import Page
 from ..run.result import RunResult
 from ..run.store import RUN_FOLDER, RunStore, drop_run
 from ..run.watch import Waiting
@@ -106,7 +107,7 @@ def run_scenario(
     if not options.quiet:
         for note in scenario.advice(job.scene):
             tell(f"note: {note}")
-    with ExitStack() as whole, page_of_run(job, options.live) as page:
+    with ExitStack() as whole, page_of(options.live) as page:
         result, report = _run(scenario, job, options, page, whole, judge)
         if options.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
@@ -155,7 +156,7 @@ def _run(
             tell=teller(options),
             keep=any(one.in_pieces for one in formats),
         ) as (result, workers):
-            page.finish(result)
+            page.finish(result.seconds, result)
             if note := judge(result):
                 result = replace(result, notes=(*result.notes, note))
             only_cloud = options.only == "cloud"

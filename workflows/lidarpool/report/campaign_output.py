@@ -24,10 +24,11 @@ from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import read_index, sweeps
 from ..pipeline.database import FILE
-from ..run.campaign import CampaignPage, CampaignRun, described_job, run_campaign, run_result
+from ..run.campaign import CampaignRun, described_job, run_campaign, run_result
 from ..run.campaign_store import CampaignStore
 from ..run.identity import OF_CAMPAIGN
 from ..run.job import Job
+from ..run.page import Page
 from ..run.progress import Show
 from ..run.store import RUN_FOLDER, drop_run, listed
 from ..run.watch import Waiting
@@ -76,7 +77,7 @@ def make_dataset(
     cluster: Callable[[Waiting, Job], AbstractContextManager[Client]],
     progress: AbstractContextManager[Show],
     tell: Callable[[str], None],
-    page: CampaignPage,
+    page: Page,
 ) -> CampaignRun:
     """Do the jobs of a campaign that are not done, and write the data set.
 
@@ -120,7 +121,7 @@ def make_dataset(
                     opened().remove()
                 tell(f"{out} is complete: nothing is left to do")
                 run = run_result(_shown(read_table(out), page), time.monotonic())
-                page.finish(run)
+                page.finish(run.seconds)
                 return run
         store = opened()
         stack.enter_context(store.kept_on_error())
@@ -159,11 +160,11 @@ def make_dataset(
             store.db.close()
         else:
             store.remove()
-    page.finish(run)
+    page.finish(run.seconds)
     return run
 
 
-def _shown(rows: Iterable[JobRow], page: CampaignPage) -> Iterator[JobRow]:
+def _shown(rows: Iterable[JobRow], page: Page) -> Iterator[JobRow]:
     for row in rows:
         page.ended(row)
         yield row

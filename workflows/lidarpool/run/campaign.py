@@ -29,7 +29,7 @@ from ..base.storage import Storage
 from ..columns.cloud import CloudLike
 from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet, Listing
-from ..export.jobs import JobRow, Tally, Value
+from ..export.jobs import JobRow, Tally
 from ..export.sweeps import Sweeps
 from ..export.table import check_whole
 from ..pipeline import EXPORT, INTERSECT, LIDAR, Crew, JobError, SurveyDriver
@@ -40,6 +40,7 @@ from ..scenario.scenario import KeptScenes
 from .campaign_store import CampaignStore
 from .checks import slots_needed
 from .job import Job, make_job
+from .page import JobNow, Page
 from .progress import Progress, Show
 from .run import Cluster, Surveys
 from .store import RunStore
@@ -69,48 +70,6 @@ class Entry:
     def name(self) -> str:
         """Its name in files."""
         return self.described.name
-
-
-@dataclass(frozen=True)
-class UnderWay:
-    """A job that is being cast or written, at one moment.
-
-    `stored` of its `scans` are in storage, with `points`; `seconds` is the casting time so far.
-    """
-
-    name: str
-    values: Mapping[str, Value]
-    stored: int
-    scans: int
-    points: int
-    seconds: float
-    writing: bool
-
-
-class CampaignPage:
-    """What a campaign tells its live page, see `lidarpool.live.campaign_page`; here of no page.
-
-    Methods are called in the run's thread and must return at once, `look` in a thread that removes
-    what is left of ended jobs.
-    """
-
-    def ended(self, row: JobRow) -> None:
-        """Show a job that has ended, in this run or an earlier one."""
-
-    def follow(self, partitions: Mapping[str, Partition]) -> None:
-        """Show what goes on from now on, on these partitions."""
-
-    def on_progress(self, progress: Progress, under_way: Callable[[], Sequence[UnderWay]]) -> None:
-        """Show the progress; KeyboardInterrupt if a user of the page has stopped the run."""
-
-    def look(self, row: JobRow, store: RunStore) -> None:
-        """Read points of a job that is done, before its parts are removed, if they are shown."""
-
-    def finish(self, run: CampaignRun) -> None:
-        """Show that the data set is complete."""
-
-    def stay(self) -> None:
-        """Keep the page until its user ends it."""
 
 
 @dataclass(frozen=True)
@@ -404,7 +363,7 @@ class CampaignDriver(Surveys):
         store: CampaignStore,
         maker: _Maker,
         writer: _Writer,
-        page: CampaignPage,
+        page: Page,
     ) -> None:
         self._cluster, self._crew, self._store = cluster, crew, store
         self._maker, self._writer, self._page = maker, writer, page
@@ -429,7 +388,7 @@ class CampaignDriver(Surveys):
         under_way = sum(e.driver.progress for e in self._under_way if e.driver is not None)
         return self._committed + under_way
 
-    def under_way(self) -> list[UnderWay]:
+    def under_way(self) -> list[JobNow]:
         """List the jobs that are cast, then those that are written."""
         writer = self._writer
         written = (*writer.writing.values(), *writer.here.values(), *writer.waiting)
@@ -592,9 +551,9 @@ def _casting_seconds(driver: SurveyDriver) -> float:
     return totals.seconds if totals else 0.0
 
 
-def _under_way(entry: Entry) -> UnderWay:
+def _under_way(entry: Entry) -> JobNow:
     driver, db = entry.driver, entry.store.db
-    return UnderWay(
+    return JobNow(
         name=entry.name,
         values=entry.described.values,
         stored=db.scans_done,
@@ -615,7 +574,7 @@ def run_campaign(
     *,
     own: bool,
     progress: AbstractContextManager[Show],
-    page: CampaignPage,
+    page: Page,
     backend: str | None,
     wait_s: float,
     patience_s: float,
@@ -681,7 +640,7 @@ def run_campaign(
     return run_result(store.rows(), started, stages, notes, store)
 
 
-def _first(maker: _Maker, store: CampaignStore, page: CampaignPage) -> Entry | None:
+def _first(maker: _Maker, store: CampaignStore, page: Page) -> Entry | None:
     """Wait for a job that can be made, which stays the next to be taken; None without any."""
     try:
         while not isinstance(found := maker.take(wait=True), Entry):

@@ -2,44 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
-from functools import partial
-from pathlib import Path
 
 from distributed import Client
 
-from poolpart import Partition
-
 from ..pipeline import LIDAR, Frame
 from ..simulator.world import check_backend_here
-from .progress import Progress, Show
+from .page import Page
+from .progress import Progress
 from .ranges import LidarWorkers
 from .result import RunResult
 from .run import drive, make_result
 from .store import RunStore
 from .watch import Waiting
-
-
-class Page:
-    """What a run tells its live page, see `lidarpool.live.run_page`; here of one without a page."""
-
-    def follow(self, store: RunStore) -> None:
-        """Show what is committed from now on."""
-
-    def with_progress(self, show: Show, partitions: Mapping[str, Partition]) -> Show:
-        """Return a function that calls `show`, and updates the page."""
-        return show
-
-    def on_frame(self, frame: Frame, take: Callable[[Frame], None]) -> None:
-        """Call `take` with a frame, and show it."""
-        take(frame)
-
-    def finish(self, result: RunResult) -> None:
-        """Show the whole result; its parts may then be removed."""
-
-    def stay(self, cloud: Path) -> None:
-        """Keep the page until its user ends it; points are read from the written `cloud`."""
 
 
 @contextmanager
@@ -67,7 +43,7 @@ def conducted(
     """
     workers = None
     with store.kept_on_error(), page as live, ExitStack() as stack:
-        live.follow(store)
+        live.begun(store)
         if store.complete:
             result = make_result(store)
         else:
@@ -82,8 +58,8 @@ def conducted(
                     tell,
                     waiting,
                     own=own,
-                    on_frame=partial(live.on_frame, take=on_frame),
-                    watched=live.with_progress,
+                    on_frame=on_frame,
+                    page=live,
                     show=show,
                 )
             if keep:

@@ -34,6 +34,7 @@ from ..plan import best
 from ..simulator.memory import MB, scans_that_fit
 from .checks import check_memory, find_workers, gpu_note, want_nothing
 from .job import Job
+from .page import Page
 from .progress import Show
 from .result import RunResult
 from .store import RunStore
@@ -309,18 +310,19 @@ def drive(
     *,
     own: bool,
     on_frame: Callable[[Frame], None],
-    watched: Callable[[Show, Mapping[str, Partition]], Show],
+    page: Page,
     show: Show,
 ) -> tuple[RunResult, Cluster]:
     """Run one job on a cluster to the end; on any error, everything has been stopped.
 
-    With `own` there is no page of partitions. `watched` wraps what shows the progress, for a live
-    page. LidarpoolError if the cluster lacks something.
+    With `own` there is no page of partitions. `page` is told what is done, once it knows the job.
+    LidarpoolError if the cluster lacks something.
     """
     started, job = time.monotonic(), store.job
     left = job.survey.scan_count - store.resumed
     cluster = Cluster(client, job, store, tell, waiting, left=left)
-    show = watched(show, cluster.partitions)
+    store.on_parts = page.on_parts
+    page.follow(cluster.partitions)
     trials = None
     if job.planning is not None:
         software = store.casting["lidarpool"]
@@ -329,8 +331,12 @@ def drive(
     crew = cluster.crew(store.storage, store.db.meta["mark"])
     drivers: list[SurveyDriver] = []
 
+    def take(frame: Frame) -> None:
+        page.on_frame(frame)
+        on_frame(frame)
+
     def surveys() -> SurveyDriver:
-        drivers.append(cluster.driver(crew, store, on_frame))
+        drivers.append(cluster.driver(crew, store, take))
         return drivers[0]
 
     def save() -> None:
@@ -350,6 +356,7 @@ def drive(
             waits_for=LIDAR if crew.stages.waiting else "",
         )
         cluster.call(show, progress)
+        cluster.call(lambda progress: page.on_progress(progress, list), progress)
 
     with nullcontext() if own else cluster.partitions_page():
         times = cluster.run(crew, surveys, trials, save, on_progress)
