@@ -21,10 +21,10 @@ from typing import Any
 from distributed import Client
 
 from lidarpool import Planning, Scene, Sensor, Survey
-from lidarpool.live.run_page import live_run
-from lidarpool.run.conductor import Page
+from lidarpool.live.live_page import live_page
 from lidarpool.run.job import Job
 from lidarpool.run.local import local_cluster
+from lidarpool.run.page import Page
 from lidarpool.run.result import RunResult
 from lidarpool.run.run import drive
 from lidarpool.run.store import RunStore
@@ -48,11 +48,11 @@ def plain(client: Client, work: Job) -> float:
 
 def watched(client: Client, work: Job) -> tuple[float, int]:
     """Seconds of a survey with a page that somebody looks at, and bytes that were sent."""
-    with live_run(work, port=0, browser=False) as live, looking(live.page.url) as taken:
+    with live_page(port=0, browser=False) as live, looking(live.page.url) as taken:
         store = RunStore(work)
-        live.follow(store)
+        live.begun(store)
         result = driven(client, store, live)
-        live.finish(result)
+        live.finish(result.seconds, result)
     return result.survey_seconds, sum(taken)
 
 
@@ -64,8 +64,8 @@ def driven(client: Client, store: RunStore, page: Page) -> RunResult:
         print,
         Waiting(),
         own=True,
-        on_frame=lambda frame: page.on_frame(frame, lambda _: None),
-        watched=page.with_progress,
+        on_frame=lambda frame: None,
+        page=page,
         show=lambda progress: None,
     )
     return result

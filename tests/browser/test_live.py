@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Scene, Survey
-from lidarpool.live.run_page import live_run
+from lidarpool.live.live_page import live_page
 from lidarpool.run.connection import local_client
 from lidarpool.run.job import Job
 from lidarpool.run.run import drive
@@ -36,8 +36,8 @@ def live(monkeypatch):
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
     job = Job(Scene.seed(), survey)
     store = RunStore(job)
-    with live_run(job, port=0, browser=False) as live:
-        live.follow(store)
+    with live_page(port=0, browser=False) as live:
+        live.begun(store)
         yield live, store
 
 
@@ -53,19 +53,18 @@ class Driven:
         begun = time.monotonic()
 
         def on_frame(frame):
-            live.on_frame(frame)
             while store.db.point_count >= self.most:
                 now = replace(store.progress(), seconds=time.monotonic() - begun)
-                live.on_progress(now)  # KeyboardInterrupt if somebody has stopped it
+                live.on_progress(now, list)  # KeyboardInterrupt if somebody has stopped it
                 time.sleep(0.05)
 
         def run():
             try:
                 result, _ = drive(
                     client, store, print, Waiting(), own=True, on_frame=on_frame,
-                    watched=live.with_progress, show=lambda progress: None,
+                    page=live, show=lambda progress: None,
                 )  # fmt: skip
-                live.finish(result)
+                live.finish(result.seconds, result)
             except BaseException as error:
                 self.error = error
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Campaign, CampaignJob, Scene, Sensor, Survey
-from lidarpool.live.campaign_page import live_campaign
+from lidarpool.live.live_page import live_page
 from lidarpool.report.campaign_output import Making, make_dataset
 from lidarpool.run.connection import local_client
 
@@ -34,7 +34,7 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
     ended = []
     with (
         local_client(gpu_workers=1, lidar_slots=5, other_workers=None, planning=False) as client,
-        live_campaign(campaign, port=0, browser=False) as live,
+        live_page(COUNT, campaign.names, "Heights", port=0, browser=False) as live,
     ):
         making = Making(tmp_path / "set", own=False, wait_s=120.0)
 

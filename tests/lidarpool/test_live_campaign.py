@@ -13,9 +13,9 @@ from tests.pages import ask
 
 from lidarpool import Campaign, CampaignJob, Scene, Sensor, Survey
 from lidarpool.export.jobs import JobRow
-from lidarpool.live.campaign_page import ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST, live_campaign
+from lidarpool.live.live_page import ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST, live_page
 from lidarpool.report.campaign_output import Making, make_dataset
-from lidarpool.run.campaign import UnderWay
+from lidarpool.run.page import JobNow
 from lidarpool.run.progress import Progress
 from lidarpool.scene.mesh import Mesh
 
@@ -46,7 +46,7 @@ def row(number, **given):
 
 @contextmanager
 def shown(count):
-    with live_campaign(Campaign(make, count, title="Walls"), port=0, browser=False) as live:
+    with live_page(count, ("height", "side"), "Walls", port=0, browser=False) as live:
         yield live
 
 
@@ -55,13 +55,13 @@ def wait_for_charts(live, count):
     stop = time.monotonic() + LONG_S
     while ask(live.page.url, "charts")["svg"].count("<svg") != count:
         assert time.monotonic() < stop, "they were not drawn"
-        ask(live.page.url, "news")
+        ask(live.page.url, "jobs")
         time.sleep(0.05)
 
 
 def test_the_page_tells_of_jobs_and_keeps_few_of_them():
     busy = [
-        UnderWay(f"{5000 + k}", {"height": 2.0, "side": "left"}, k, 40, 10 * k, 0.1, writing=k > 15)
+        JobNow(f"{5000 + k}", {"height": 2.0, "side": "left"}, k, 40, 10 * k, 0.1, writing=k > 15)
         for k in range(20)
     ]
     with shown(10_000) as live:
@@ -69,7 +69,7 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
             live.ended(row(number, error="no surface" if number % 100 == 0 else ""))
         live.on_progress(progress(3000, 10_000, 50.0), lambda: busy)
         live.on_progress(progress(5000, 10_000, 150.0), lambda: busy)
-        told = ask(live.page.url, "news")
+        told = ask(live.page.url, "jobs")
         assert told["title"] == "Walls"
         assert (told["count"], told["done"], told["failed"]) == (10_000, 4950, 50)
         assert (told["casting"], told["writing"]) == (16, 4)
@@ -90,7 +90,7 @@ def test_its_user_stops_the_run_as_an_interrupt_does():
         live.on_progress(progress(0, 3, 1.0), list)
         order = urllib.request.Request(f"{live.page.url}stop", method="POST")
         urllib.request.urlopen(order, timeout=LONG_S).close()
-        assert ask(live.page.url, "news")["state"] == "stopping"
+        assert ask(live.page.url, "jobs")["state"] == "stopping"
         with pytest.raises(KeyboardInterrupt):
             live.on_progress(progress(0, 3, 2.0), list)
 
@@ -110,7 +110,7 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
     ):
 
         def look(_):
-            told = ask(live.page.url, "news", newest=1)
+            told = ask(live.page.url, "jobs", newest=1)
             states.add(told["state"])
             assert told["done"] + told["failed"] <= 6
 
@@ -119,7 +119,7 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
         connect = lambda *_: nullcontext(client)  # noqa: E731
         run = make_dataset(campaign, making, connect, nullcontext(look), print, live)
         assert (run.done, len(run.failed)) == (5, 1)
-        told = ask(live.page.url, "news")
+        told = ask(live.page.url, "jobs")
         assert (told["done"], told["failed"], told["over"]) == (5, 1, True)
         assert "no such wall" in told["failures"][0]["error"]
         assert told["points"] == run.points
@@ -133,6 +133,6 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
         points = ask(viewer, "points", colour="z", most=1_000_000)["arrays"]["rows"]
         done = {job["name"]: job["points"] for job in told["ended"]}
         assert len(points) == done[name]
-        for page, script in ((live.page.url, b"campaign.js"), (viewer, b"page.js")):
+        for page, script in ((live.page.url, b"jobs.js"), (viewer, b"page.js")):
             with urllib.request.urlopen(page, timeout=LONG_S) as file:
                 assert script in file.read()

@@ -1,11 +1,10 @@
 """A run on its live page: the parts that it commits, those of an earlier run, and its end."""
 
-import re
 import subprocess
 import sys
 import time
 import urllib.request
-from contextlib import nullcontext
+from contextlib import contextmanager, nullcontext
 
 import numpy as np
 import pytest
@@ -18,8 +17,8 @@ from tests.pages import ask
 from lidarpool import Column, Planning, Scene, Sensor, Survey
 from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
-from lidarpool.live.live_points import LivePoints
-from lidarpool.live.run_page import LiveRun, live_run
+from lidarpool.live.live_job import LiveJob
+from lidarpool.live.live_page import LivePage, live_page
 from lidarpool.run.conductor import conducted
 from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
@@ -38,10 +37,17 @@ def make_job(scans: int) -> Job:
     return Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5))
 
 
-def news(live: LiveRun):
-    """What the page is told of the run's state, and its panel as text."""
-    told = ask(live.page.url, "news")
-    return told, re.sub(r"<[^>]*>", " ", told["panel"])
+@contextmanager
+def shown(store: RunStore):
+    """Yield the page of a run that nobody looks at."""
+    with live_page(port=0, browser=False) as live:
+        live.begun(store)
+        yield live
+
+
+def news(live: LivePage):
+    """What the page is told of the run."""
+    return ask(live.page.url, "news")
 
 
 def wait_for(condition):
@@ -52,7 +58,7 @@ def wait_for(condition):
         time.sleep(0.02)
 
 
-def displayed(live: LiveRun) -> int:
+def displayed(live: LivePage) -> int:
     """Count the points on the page."""
     news(live)  # or nobody looks
     return len(ask(live.page.url, "points", colour="z", most=1_000_000)["arrays"]["rows"])
@@ -60,12 +66,11 @@ def displayed(live: LiveRun) -> int:
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     store = RunStore(make_job(100))
-    live = LivePoints(store, most=500)
+    live = LiveJob(store, most=500)
     for scan in range(100):
         commit(store, scan, [33], [scan % 10], [165])
         live.add([store.db.part_of(scan)])
         live.gather()
-    assert live.version == 100
     assert 150 < len(live.cloud) <= 500
     by_tenth = np.histogram(live.cloud["scan"], bins=10, range=(0, 100))[0]
     assert by_tenth.min() > 0.3 * by_tenth.mean()
@@ -74,7 +79,7 @@ def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
 
 def test_a_part_that_cannot_be_read_is_left_out_and_the_others_are_shown():
     store = RunStore(make_job(4))
-    live = LivePoints(store)
+    live = LiveJob(store)
     for scan in range(3):
         commit(store, scan, [5], [7], [25])
     store.storage.remove([store.db.part_of(1).name])
@@ -90,13 +95,12 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
         commit(first, scan, [10], [7], [50])
     first.db.close()
     store = RunStore(job, tmp_path / "run", resume=True)
-    with live_run(job, port=0, browser=False) as live:
-        live.follow(store)
+    with shown(store) as live:
         # Before there is a cluster, what is left of the first is there to see.
-        told, text = news(live)
+        told = news(live)
         assert told["points"] == 600
-        assert "60 / 100" in text
-        assert "starting" in text
+        assert [*told["stages"][-1][1:]] == [60, 100]
+        assert "starting" in told["state"]
         wait_for(lambda: displayed(live) == 600)
 
 
@@ -104,16 +108,17 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])
     job = Job(SCENE, survey, planning, backend="numpy")
-    shown, busy, scans, words = [], set(), [], []
+    seen, busy, scans, words = [], set(), [], []
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
-        live_run(job, port=0, browser=False) as live,
+        live_page(port=0, browser=False) as live,
     ):
+        assert ask(live.page.url, "state")["state"] == "starting"
 
         def show(progress):
-            shown.append(progress)
-            busy.update(re.findall(r"(\w+), slots busy", news(live)[1]))
+            seen.append(progress)
+            busy.update(label.split(",")[0] for label, *_ in news(live)["slots"])
 
         with conducted(
             RunStore(job),
@@ -124,11 +129,11 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
             tell=words.append,
             on_frame=lambda frame: scans.append(frame.scan),
         ) as (result, workers):
-            live.finish(result)
+            live.finish(result.seconds, result)
         assert (scans, workers) == ([*range(survey.scan_count)], None)
-        told, text = news(live)
+        told = news(live)
         assert (told["over"], told["points"]) == (True, len(result.points))
-        assert "done" in text
+        assert told["state"] == "done"
         assert displayed(live) == len(result.points)
         state = ask(live.page.url, "state")
         assert state["path"]["corners"] == result.plan.path.tolist()
@@ -140,7 +145,7 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
             for name in ("wetness", "intensity")
         )
     assert busy == {"GPU", "LIDAR", "OTHER"}
-    assert shown[-1].collected == survey.scan_count
+    assert seen[-1].collected == survey.scan_count
     assert np.array_equal(wet, energy)
 
 
@@ -154,28 +159,30 @@ def progress(seconds, done, **more):
 @pytest.fixture
 def live():
     """Return the page of a run that nobody looks at."""
-    with live_run(make_job(100), port=0, browser=False) as live:
+    with shown(RunStore(make_job(100))) as live:
         yield live
 
 
 def test_the_panel_tells_stages_pace_and_what_is_waited_for(live):
-    assert "starting" in news(live)[1]
-    live.on_progress(progress(0.0, 0))
-    live.on_progress(progress(5.0, 50))
-    text = re.sub(r" +", " ", news(live)[1])
-    for words in ("running , 5 s, 10/s 5 s left", "50 / 100"):
-        assert words in text
-    live.on_progress(progress(6.0, 60, waits_for="<GPU>"))
-    assert "waits for slots of &lt;GPU&gt;" in news(live)[1]
+    assert "starting" in news(live)["state"]
+    live.on_progress(progress(0.0, 0), list)
+    live.on_progress(progress(5.0, 50), list)
+    told = news(live)
+    assert [told[name] for name in ("state", "seconds", "rate", "left")] == [
+        "running", 5.0, "10/s", "5 s",
+    ]  # fmt: skip
+    assert ["2 intersect", 50, 100] in told["stages"]
+    live.on_progress(progress(6.0, 60, waits_for="<GPU>"), list)
+    assert "waits for slots of <GPU>" in news(live)["state"]
 
 
 def test_a_run_is_stopped_as_by_an_interrupt(live):
-    live.on_progress(progress(1.0, 1))
+    live.on_progress(progress(1.0, 1), list)
     request = urllib.request.Request(f"{live.page.url}stop", data=b"")
     urllib.request.urlopen(request, timeout=LONG_S).close()
-    assert news(live)[0]["stopping"]
+    assert news(live)["stopping"]
     with pytest.raises(KeyboardInterrupt):
-        live.on_progress(progress(2.0, 2))
+        live.on_progress(progress(2.0, 2), list)
 
 
 def test_a_page_that_stays_shows_the_file_of_the_cloud_and_its_sweeps(live, tmp_path):
@@ -183,12 +190,11 @@ def test_a_page_that_stays_shows_the_file_of_the_cloud_and_its_sweeps(live, tmp_
     rows["x"] = np.linspace(5, 6, 3000)
     path = tmp_path / "cloud.ply"
     path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
-    live.follow(RunStore(make_job(100)))
-    live.on_progress(progress(1.0, 1))
-    before = news(live)[0]["ends"]
+    live.on_progress(progress(1.0, 1), list)
+    before = news(live)["ends"]
     live.stopped.set()  # it stays no longer than that
     live.stay(path)
-    assert news(live)[0]["ends"] > before  # the page asks for all again
+    assert news(live)["ends"] > before  # the page asks for all again
     assert displayed(live) == 3000
     assert "sweep_scans" in ask(live.page.url, "state")["arrays"]
 
@@ -197,5 +203,5 @@ def test_a_run_brings_no_page_and_no_pictures_before_it_needs_them():
     """Matplotlib takes a second."""
     code = "import sys, lidarpool.cli.run_command; print(*sys.modules, sep='\\n')"
     told = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    pages = {"lidarpool.live.server", "matplotlib", "open3d", "lidarpool.live.run_page"}
+    pages = {"lidarpool.live.server", "matplotlib", "open3d", "lidarpool.live.live_page"}
     assert pages.isdisjoint(told.stdout.split())

@@ -12,7 +12,7 @@ from ..base.declared import declared
 from ..base.storage import Storage
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
-from ..live.pages import live_page
+from ..live.pages import page_of
 from ..report.campaign_output import DataSetOutput
 from ..run.conductor import Conductor
 from ..run.options import RunOptions
@@ -111,6 +111,6 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             wait_s=wait_s,
             patience_s=patience_s,
         )
-        with live_page(self, live) as page:
+        with page_of(self, live) as page:
             output = DataSetOutput(place, self)
             return Conductor(self, options, output, Screen(on_progress), page)()

@@ -9,7 +9,7 @@ from distributed import Client
 
 from ..base.arguments import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..live.pages import live_page
+from ..live.pages import page_of
 from ..pipeline import Frame
 from ..plan import Planning
 from ..run.conductor import Conductor, Kept
@@ -141,7 +141,7 @@ def simulate(
     jobs = OneJob(Job(scene, survey, planning))
     if client is None:  # before anything is made in the folder
         check_backend_here(backend)
-    with live_page(jobs, live) as page:
+    with page_of(jobs, live) as page:
         screen, on_frame = Screen(on_progress), on_frame or (lambda frame: None)
         result = Conductor(jobs, options, Kept(), screen, page, on_frame)()
     return Result(**vars(result))

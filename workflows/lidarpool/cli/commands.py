@@ -39,6 +39,7 @@ from .stations_command import stations
 from .view_command import view
 
 if TYPE_CHECKING:
+    from ..base.storage import Storage
     from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"

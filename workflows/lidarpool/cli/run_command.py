@@ -20,7 +20,7 @@ from ..base.words import counted
 from ..export.dataset import DataSet
 from ..export.folder import local_result, output_place
 from ..export.jobs import Tally
-from ..live.pages import live_page
+from ..live.pages import page_of
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
     DataSetOutput,
@@ -123,7 +123,7 @@ def _run_survey(
         terminal.tell(note)
     jobs = OneJob(job)
     output = SurveyOutput(options.out, job, built.scenario, only == "cloud", judge)
-    with live_page(jobs, options.live) as page:
+    with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
         if terminal.as_json:
             click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
@@ -141,7 +141,7 @@ def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **
         raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
     options = options_of(campaign.pool, **given)
     assert options.out is not None, "commands write"
-    with live_page(campaign, options.live) as page:
+    with page_of(campaign, options.live) as page:
         output = DataSetOutput(options.out, campaign)
         run = Conductor(campaign, options, output, terminal, page)()
         _tell_campaign(options.out, run, as_json=terminal.as_json)
@@ -170,6 +170,7 @@ def run_job(
         out = output_place(f"{given['out']}/job-{name}")
         given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER)}
     scenario = campaign.scenario(number)
+    assert scenario is not None, "of a file"
     built, job = build(scenario, plans=False), campaign.job(number, columns=dataset.columns)
 
     def compare(result: RunResult) -> str:

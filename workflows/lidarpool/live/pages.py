@@ -1,28 +1,17 @@
-"""Live pages, if they are wanted: only then are their modules imported, with Matplotlib."""
+"""The live page, if it is wanted: only then are its modules imported, with Matplotlib."""
 
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
 
-from ..run.campaign import CampaignPage
-from ..run.conductor import Page
-from ..run.job import Job
-from ..scenario.campaign import Campaign
+from ..run.jobs import Jobs
+from ..run.page import Page
 
 
-def page_of_run(job: Job, wanted: bool) -> AbstractContextManager[Page]:
-    """Show a run in the browser, or nothing."""
+def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[Page]:
+    """Show jobs in the browser, or nothing."""
     if not wanted:
         return nullcontext(Page())
-    from .run_page import live_run
+    from .live_page import live_page
 
-    return live_run(job)
-
-
-def page_of_campaign(campaign: Campaign, wanted: bool) -> AbstractContextManager[CampaignPage]:
-    """Show a campaign in the browser, or nothing."""
-    if not wanted:
-        return nullcontext(CampaignPage())
-    from .campaign_page import live_campaign
-
-    return live_campaign(campaign)
+    return live_page(jobs.count, jobs.names, jobs.title or "lidarpool")

@@ -36,12 +36,7 @@ def result_view(
     """
     if sweeps is not None and sweeps.coordinates != "world":
         pictured, note = None, note or IN_SENSOR_AXES
-    view = View(title, file, pictured, sweeps, note=note)
-    if pictured is not None:
-        faces = len(pictured.scene.faces)
-        view.hits = lambda: pictured.hit_counts[:faces]
-        view.rays = pictured.sample_rays
-    return view
+    return View(title, file, pictured, sweeps, note=note)
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -55,14 +55,17 @@ class View:
     points: Points
     pictured: Pictured | None = None
     sweeps: Sweeps | None = None
-    hits: Callable[[], AnyArray] | None = None  # returns those of each triangle, (f,)
-    rays: Floats32 = field(default_factory=lambda: np.zeros((0, 2, 3), np.float32))
+    # Returns those of each triangle, those of actors after the others; by default as pictured.
+    hits: Callable[[], AnyArray] | None = None
     note: str = ""  # a remark on what is shown
 
     def __post_init__(self) -> None:
         self.version = 0  # of the points
-        plan = None if self.pictured is None else self.pictured.plan
-        self.path = None if plan is None else plan.path
+        self.rays: Floats32 = np.zeros((0, 2, 3), np.float32)
+        self.path: Floats | None = None
+        if (pictured := self.pictured) is not None:
+            self.rays = pictured.sample_rays
+            self.path = None if pictured.plan is None else pictured.plan.path
         self.origin, self._bounds = self._around()
         rest = {column.name: column for column in self.points.table if column not in POSITION}
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
@@ -312,10 +315,10 @@ class View:
             raise KeyError("surface")
         with self._lock:  # one browser after the other: it may take long, once
             surface = self._surface = self._surface or Surface(pictured.scene, pictured.reflectance)
-        counts, places = np.zeros(len(pictured.scene.faces)), np.zeros((0, 3), np.float32)
+        counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
         if colour == "hits":
-            counts = counts if self.hits is None else np.asarray(self.hits())
-            places = self._on_statics()
+            counts = counts if self.hits is None else self.hits()
+            counts, places = counts[: len(pictured.scene.faces)], self._on_statics()
         arrays, legend = surface.coloured(colour, counts, places)
         arrays["objects"] = arrays["objects"].astype(np.int32)
         return {"legend": legend} | self._look_around, arrays

@@ -94,7 +94,7 @@ class DataSetOutput(Output[CampaignRun]):
         for row in read_table(out):
             conductor.page.ended(row)
         run = CampaignRun.of(read_table(out), time.monotonic() - conductor.started)
-        conductor.page.finish(run)
+        conductor.page.finish(run.seconds)
         return run
 
     def look(self, conductor: Conductor[CampaignRun]) -> None:
@@ -166,13 +166,13 @@ class DataSetOutput(Output[CampaignRun]):
             store.db.close()
         else:
             store.remove()
-        conductor.page.finish(run)
+        conductor.page.finish(run.seconds)
         return run
 
     def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
         """Write what all jobs share, and last what says that the data set is complete."""
         campaign, place = self.campaign, self.dataset.place
-        made = {"identity": dict(store.identity), "casting": store.casting}
+        made: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         made |= {"backend": store.backend, "sensors": run.sensors}
         with explained(f"{place} cannot be written"):
             place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())

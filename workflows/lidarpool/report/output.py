@@ -3,27 +3,30 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import nullcontext
-from dataclasses import replace
-from functools import cache
+from contextlib import contextmanager, nullcontext
+from dataclasses import dataclass, replace
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
 from ..base.interrupts import deferred_interrupts
+from ..base.open3d_module import load_open3d
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
-from ..export.folder import LAST_FILE, staging
+from ..export.folder import LAST_FILE, result_folder, staging
 from ..export.formats import Format, refuse_strangers
 from ..export.navigation import FILES as INSTRUMENT_FILES
 from ..export.navigation import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..export.table import EXPORTS, FORMATS
+from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
+from ..scenario.job import Job
 from ..scenario.scenario import Scenario
 from ..sensor import Survey
 from .cloud_numbers import CountedCloud
@@ -83,7 +86,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         workers = conductor.lidar_workers() if in_pieces else None
         if not in_pieces:
             conductor.leave_cluster()
-        conductor.page.finish(result)
+        conductor.page.finish(result.seconds, result)
         if note := self.judge(result):
             result = replace(result, notes=(*result.notes, note))
 

@@ -24,14 +24,16 @@ class Pace:
         begin, before = self._first = self._first or (seconds, count)
         return (count - before) / (seconds - begin) if seconds > begin else 0.0
 
+    def left(self, seconds: float, count: int, whole: int) -> str:
+        """Time that is left; empty until enough has been counted, and at the end."""
+        rate = self.rate(seconds, count)
+        sure = rate and count < whole and is_sure(count, whole, seconds)
+        return time_in_words((whole - count) / rate) if sure else ""
+
     def told(self, seconds: float, count: int, whole: int) -> str:
         """Rate and time left; empty until something has been counted."""
-        rate = self.rate(seconds, count)
-        if not rate:
-            return ""
-        sure = is_sure(count, whole, seconds) and count < whole
-        left = f"  {time_in_words((whole - count) / rate)} left" if sure else ""
-        return f"{in_words(rate)}/s{left}"
+        rate, left = self.rate(seconds, count), self.left(seconds, count, whole)
+        return f"{in_words(rate)}/s{f'  {left} left' if left else ''}" if rate else ""
 
 
 def standing_still(progress: Progress) -> str:

@@ -59,7 +59,7 @@ class Kept(Output[RunResult]):
     def finish(self, conductor: Conductor[RunResult]) -> RunResult:
         """Return the result of the only job."""
         result = conductor.result()
-        conductor.page.finish(result)
+        conductor.page.finish(result.seconds, result)
         conductor.store.db.close()
         return result
 
@@ -137,7 +137,7 @@ class Conductor(Generic[R]):
         """Wait for a job that can be made, which stays the next to be taken."""
         only = self.store.only
         if only is not None and only.complete:
-            self.page.begun(only.job, only)
+            self.page.begun(only)
             return
         self._maker = JobMaker(self.jobs, self.store.left, self.output.columns)
         self.stack.callback(self._maker.close)

@@ -27,8 +27,13 @@ STOP_S = 10.0  # for a job that is being made when the run ends
 class Jobs(Protocol):
     """What a run does: a campaign, or `OneJob`."""
 
-    count: int
-    title: str
+    @property
+    def count(self) -> int:
+        """How many."""
+
+    @property
+    def title(self) -> str:
+        """Title of all; may be empty."""
 
     @property
     def names(self) -> Sequence[str]:

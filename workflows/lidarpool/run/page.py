@@ -1,23 +1,22 @@
-"""What a run tells its live page."""
+"""What a run tells a live page, see `lidarpool.live.live_page`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
-from typing import NamedTuple
 
 from poolpart import Partition
 
 from ..export.jobs import JobRow, Value
-from ..pipeline import Frame
-from ..pipeline.messages import Receipt
-from ..scenario.job import Job
+from ..pipeline import Frame, Receipt
 from .job_points import JobPoints
 from .progress import Progress
-from .result import CampaignRun, RunResult
+from .result import RunResult
 
 
-class JobNow(NamedTuple):
+@dataclass(frozen=True)
+class JobNow:
     """A job that is being cast or written, at one moment.
 
     `stored` of its `scans` are in storage, with `points`; `seconds` is the casting time so far.
@@ -33,20 +32,20 @@ class JobNow(NamedTuple):
 
 
 class Page:
-    """What a run tells its live page, see `lidarpool.live`; here of no page.
+    """What a run of one job or many tells its live page; this one shows nothing.
 
     Methods are called in the run's thread and must return at once, `look` in a thread that removes
     what is left of ended jobs.
     """
 
+    def begun(self, points: JobPoints) -> None:
+        """Show a job from now on, the only one of its run, and what an earlier run has left."""
+
     def follow(self, partitions: Mapping[str, Partition]) -> None:
         """Show what goes on from now on, on these partitions."""
 
-    def begun(self, job: Job, points: JobPoints) -> None:
-        """Show what is committed of the only job from now on, and what an earlier run has left."""
-
     def on_parts(self, receipts: Sequence[Receipt]) -> None:
-        """Show parts of the only job."""
+        """Show parts of the only job that were committed."""
 
     def on_frame(self, frame: Frame) -> None:
         """Show a frame of the only job."""
@@ -60,8 +59,8 @@ class Page:
     def look(self, row: JobRow, points: JobPoints) -> None:
         """Read points of a job that is done, before its parts are removed, if they are shown."""
 
-    def finish(self, result: RunResult | CampaignRun) -> None:
-        """Show the whole result; parts may then be removed."""
+    def finish(self, seconds: float, result: RunResult | None = None) -> None:
+        """Show that all is done, after so long, and the result of a survey; parts may then go."""
 
     def stay(self, cloud: Path | None = None) -> None:
         """Keep the page until its user ends it; points are read from the written `cloud`."""

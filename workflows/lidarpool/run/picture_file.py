@@ -24,6 +24,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey, Track
 from ..sensor.materials import MaterialTable
 from ..sensor.trajectory import ALWAYS, Beyond, presence_ns
+from .job import Job
 from .result import RunResult
 
 PICTURE_FILE = "pictures.npz"
@@ -75,25 +76,38 @@ class Pictured:
     @classmethod
     def of(cls, result: RunResult) -> Pictured:
         """Return what the pictures of a result show."""
-        scene, survey = result.scene, result.survey
+        pictured, drawn = cls.before(result)
+        return replace(
+            pictured,
+            hit_counts=drawn.hits(result.hit_counts),
+            sample_rays=result.sample_rays,
+            plan=result.plan,
+            trials=[trial.waypoints for trial in result.trials],
+        )
+
+    @classmethod
+    def before(cls, job: Job | RunResult) -> tuple[Pictured, Drawn]:
+        """Return what is pictured before there is a result, and which counters its hits have."""
+        scene, survey = job.scene, job.survey
         each = samples_each(scene.actors, PLACES_MOST)
         actors = tuple(_sampled(actor, survey.duration_ns, each) for actor in scene.actors)
         ways = sensor_ways(survey)
         drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
-        return cls(
+        pictured = cls(
             replace(drawn.scene, actors=actors),
             ways,
-            drawn.hits(result.hit_counts),
-            result.sample_rays,
-            result.planning,
-            result.plan,
-            [trial.waypoints for trial in result.trials],
+            np.zeros(0, np.int64),
+            np.zeros((0, 2, 3), np.float32),
+            job.planning,
+            None,
+            (),
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
             reflectances_of(scene, survey),
             survey.coordinates,
             scene.triangles,
         )
+        return pictured, drawn
 
     @property
     def when(self) -> str:

@@ -31,6 +31,25 @@ export function setIcon(button, icon) {
   button.innerHTML = `<svg viewBox="0 0 16 16" aria-hidden="true">${ICONS[icon]}</svg>`;
 }
 
+// Switches between light and dark; at first as users have chosen, else as their system is.
+export function themeButton(show = () => {}) {
+  const systemDark = matchMedia("(prefers-color-scheme: dark)");
+  const saved = () => { try { return localStorage.getItem("lidarpool-theme"); } catch { return null; } };
+  const set = (theme) => {
+    document.documentElement.dataset.theme = theme;
+    show(theme);
+  };
+  const use = () => set(saved() ?? (systemDark.matches ? "dark" : "light"));
+  use();
+  systemDark.addEventListener("change", use);
+  addEventListener("storage", use); // another page has changed it, as the one around this one
+  return iconButton("theme", "Light or dark", () => {
+    const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+    try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
+    set(theme);
+  });
+}
+
 export const button = (text, act) =>
   element("button", { type: "button", textContent: text, onclick: act });
 

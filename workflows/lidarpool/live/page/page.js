@@ -1,7 +1,8 @@
 // The page: what is asked of the server, the controls, and the time that is played.
 import { ask } from "./ask.js";
-import { button, dual, element, iconButton, legend, menu, number, row, section, setIcon, slider, stepFor, tick } from "./controls.js";
+import { button, dual, element, iconButton, legend, menu, number, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
+import { count, follow, pause, replace, stop } from "./run.js";
 
 const FIRST_LOOK = 200_000; // points that are asked for first
 const REST_MS = 250; // for which the camera stands still before points are asked for
@@ -16,6 +17,7 @@ const HIDDEN = "not shown";
 
 const $ = (id) => document.getElementById(id);
 const picture = new Picture($("canvas"), $("labels"), $("axes"), $("scale"), () => moved());
+const theme = themeButton((chosenOne) => picture.setTheme(chosenOne));
 
 // What users have chosen; a link holds it.
 const chosen = {
@@ -286,13 +288,6 @@ function later(act, ms = 120) {
   };
 }
 
-const savedTheme = () => { try { return localStorage.getItem("lidarpool-theme"); } catch { return null; } };
-const systemDark = matchMedia("(prefers-color-scheme: dark)");
-function setTheme(theme) {
-  document.documentElement.dataset.theme = theme;
-  picture.setTheme(theme);
-}
-
 function buildPanel() {
   const columns = state.columns.map((column) => column.name);
   panel.facts = element("div", { id: "facts" });
@@ -301,11 +296,7 @@ function buildPanel() {
     "header", {}, element("h1", { textContent: document.title, title: document.title }),
     iconButton("link", "Copy the link to this view", copyLink),
     iconButton("picture", "Save the picture", () => picture.save(`${document.title}.png`)),
-    iconButton("theme", "Light or dark", () => {
-      const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-      try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
-      setTheme(theme);
-    }),
+    theme,
   );
   panel.legend = element("div");
   const points = section("Points", true,
@@ -719,51 +710,51 @@ function takeState(told) {
 }
 
 // What is new of a run.
-async function news() {
-  for (;;) {
-    await new Promise((done) => setTimeout(done, document.hidden ? 4 * NEWS_MS : NEWS_MS));
-    const told = await ask("news");
-    if (told.rays_version !== news.rays) {
-      news.rays = told.rays_version;
-      picture.setRays(told.arrays.rays);
-    }
-    if (panel.progress.innerHTML !== told.panel) panel.progress.innerHTML = told.panel;
-    panel.stop.textContent = told.over ? "Close" : told.stopping ? "Stopping" : "Stop";
-    if (told.time !== null && !told.over) picture.setTime(told.time);
-    state.points = told.points;
-    if (told.version !== state.version && told.ends === (news.ends ?? 0)) {
-      state.version = told.version;
-      if (chosen.show === "all") await loadBase(questionAt(0));
-    }
-    if (chosen.scene === "hits" && told.hits_version !== news.hits) {
-      news.hits = told.hits_version;
-      await loadSurface();
-    }
-    if (told.path && !state.path) {
-      state.path = told.path;
-      showPath();
-    }
-    if (told.ends !== (news.ends ?? 0)) {
-      news.ends = told.ends;
-      cache.clear();
-      takeState(await ask("state"));
-      picture.setTime(chosen.time);
-      buildSteps();
-      buildTime();
-      shownKey = null;
-      refresh();
-      await loadSurface();
-    }
+const known = { rays: null, hits: null, ends: 0 };
+async function news(told) {
+  if (told.rays_version !== known.rays) {
+    known.rays = told.rays_version;
+    picture.setRays(told.arrays.rays);
+  }
+  tellRun(told);
+  if (told.time !== null && !told.over) picture.setTime(told.time);
+  state.points = told.points;
+  if (told.version !== state.version && told.ends === known.ends) {
+    state.version = told.version;
+    if (chosen.show === "all") await loadBase(questionAt(0));
+  }
+  if (chosen.scene === "hits" && told.hits_version !== known.hits) {
+    known.hits = told.hits_version;
+    await loadSurface();
+  }
+  if (told.path && !state.path) {
+    state.path = told.path;
+    showPath();
+  }
+  if (told.ends !== known.ends) {
+    known.ends = told.ends;
+    cache.clear();
+    takeState(await ask("state"));
+    picture.setTime(chosen.time);
+    buildSteps();
+    buildTime();
+    shownKey = null;
+    refresh();
+    await loadSurface();
   }
 }
 
-function follow() {
-  panel.stop = element("button", { type: "button", className: "stop", textContent: "Stop", style: { margin: "0 12px 8px" } });
-  panel.stop.onclick = () => fetch("stop", { method: "POST" }).catch(failed);
-  panel.progress.after(panel.stop);
-  news().catch((error) => {
+function tellRun(told) {
+  const left = told.left && `${told.left} left`, since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
+  const pace = told.rate && `, ${told.rate}  ${left}`;
+  const head = element("div", {}, element("b", { textContent: told.state }), since, pace);
+  replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(count));
+}
+
+function followRun() {
+  panel.progress.after(element("div", { id: "stop" }, stop));
+  follow("news", () => ({}), NEWS_MS, news).catch((error) => {
     failed(error);
-    panel.stop.hidden = true;
     panel.progress.replaceChildren(); // it goes on no more
   });
 }
@@ -798,19 +789,19 @@ function mouse() {
 }
 
 async function begin() {
-  const useTheme = () => setTheme(savedTheme() ?? (systemDark.matches ? "dark" : "light"));
-  useTheme();
-  systemDark.addEventListener("change", useTheme);
-  addEventListener("storage", useTheme); // the page around this one has changed it
   document.documentElement.classList.toggle("plain", new URLSearchParams(location.search).has("plain"));
   say("Reading …");
-  const told = await ask("state");
+  let told;
+  while (!(told = await ask("state")).columns) { // a run whose only job has not begun
+    say(told.failures[0]?.error ?? told.state);
+    await pause(NEWS_MS);
+  }
   picture.resize();
   picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
   takeState(told);
   const words = readLink();
   buildPanel();
-  setTheme(document.documentElement.dataset.theme);
+  picture.setTheme(document.documentElement.dataset.theme);
   buildSteps();
   buildTime();
   picture.setTime(chosen.time);
@@ -833,7 +824,7 @@ async function begin() {
     requestAnimationFrame(frame);
   };
   requestAnimationFrame(frame);
-  if (state.live) follow();
+  if (state.live) followRun();
   refresh();
   showImages();
   await loadSurface();

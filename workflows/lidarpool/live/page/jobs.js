@@ -1,13 +1,14 @@
-// The page of a campaign: how many jobs are done, a table of some, points of one, and charts.
+// The list of jobs: how many are done, a table of some, points of one, and charts.
 import { ask } from "./ask.js";
-import { element, iconButton } from "./controls.js";
+import { element, themeButton } from "./controls.js";
+import { count, follow, meter, replace, stop } from "./run.js";
 
 const NEWS_MS = 1000;
 const SETTLED_MS = 1500; // after its page is loaded, the viewer of a job has drawn
 
 const $ = (id) => document.getElementById(id);
 const whole = (value) => Math.round(value).toLocaleString("en");
-const several = (count, what) => `${whole(count)} ${what}${count === 1 ? "" : "s"}`;
+const several = (value, what) => `${whole(value)} ${what}${value === 1 ? "" : "s"}`;
 
 // 12,345 up to six digits, then 1.23 M
 function short(value) {
@@ -25,23 +26,7 @@ function duration(seconds) {
   return minutes < 100 ? `${minutes} min` : `${whole(Math.floor(minutes / 60))} h ${String(minutes % 60).padStart(2, "0")} min`;
 }
 
-// -- light or dark -----------------------------------------------------------------------
-
-const systemDark = matchMedia("(prefers-color-scheme: dark)");
-const saved = () => { try { return localStorage.getItem("lidarpool-theme"); } catch { return null; } };
-const setTheme = () => { document.documentElement.dataset.theme = saved() ?? (systemDark.matches ? "dark" : "light"); };
-
-function switchTheme() {
-  const theme = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
-  try { localStorage.setItem("lidarpool-theme", theme); } catch { /* a page in a frame may not */ }
-  document.documentElement.dataset.theme = theme;
-}
-
 // -- the run -----------------------------------------------------------------------------
-
-function meter(share) {
-  return element("span", { className: "meter" }, element("b", { style: { width: `${100 * share}%` } }));
-}
 
 function showRun(told) {
   document.title = `${told.over ? "" : `${Math.floor((100 * (told.done + told.failed)) / told.count)}% `}${told.title} - lidarpool`;
@@ -50,7 +35,7 @@ function showRun(told) {
   $("count").replaceChildren(element("b", { textContent: whole(told.done) }), ` of ${several(told.count, "job")} done`);
   const busy = told.casting + told.writing;
   $("bar").replaceChildren(...[["done", told.done], ["failed", told.failed], ["busy", busy]].map(
-    ([className, count]) => element("i", { className, style: { width: `${(100 * count) / told.count}%` } }),
+    ([className, jobs]) => element("i", { className, style: { width: `${(100 * jobs) / told.count}%` } }),
   ));
   const entries = [
     ["failed", whole(told.failed), "failed", told.failed > 0], ["under way", told.over ? "" : whole(busy), "busy"],
@@ -61,11 +46,7 @@ function showRun(told) {
     const mark = className ? [element("i", { className })] : [];
     return element("div", { className: bad ? "bad" : "" }, element("dt", {}, ...mark, name), element("dd", { textContent: value }));
   }));
-  $("slots").replaceChildren(...told.slots.map(([name, busySlots, slots]) => element(
-    "div", {}, element("span", { textContent: `${name}, slots busy` }),
-    element("span", { textContent: `${busySlots} / ${slots}` }), meter(slots ? busySlots / slots : 0),
-  )));
-  stop.textContent = told.over ? "Close" : told.stopping ? "Stopping" : "Stop";
+  $("slots").replaceChildren(...told.slots.map(count));
 }
 
 // -- the table ---------------------------------------------------------------------------
@@ -99,7 +80,7 @@ function showJobs(told) {
     return [own, element("tr", {}, reason)];
   });
   const ended = told.ended.map((job) => line(job, cell("done", "text"), whole(job.points), inSeconds(job.seconds)));
-  const last = (count, shown) => (count > shown ? `the last ${shown} of ${whole(count)}` : whole(count));
+  const last = (jobs, listed) => (jobs > listed ? `the last ${listed} of ${whole(jobs)}` : whole(jobs));
   const bodies = [
     ...group("Under way", busy > underWay.length ? `the first ${underWay.length} of ${whole(busy)}` : whole(busy), width, underWay),
     ...group("Failed", last(told.failed, told.failures.length), width, failed),
@@ -107,8 +88,7 @@ function showJobs(told) {
   ];
   const heads = [["job"], ["state", "text"], ["points"], ["casting"], ...told.names.map((name) => [name])];
   const head = element("thead", {}, element("tr", {}, ...heads.map(([name, className = ""]) => element("th", { className }, ...broken(name)))));
-  const table = element("table", {}, head, ...bodies);
-  if (table.innerHTML !== $("jobs").firstElementChild.innerHTML) $("jobs").replaceChildren(table);
+  replace($("jobs"), element("table", {}, head, ...bodies));
 }
 
 // -- points of a job ---------------------------------------------------------------------
@@ -139,30 +119,20 @@ function showCloud(newest) {
 
 // -- news --------------------------------------------------------------------------------
 
-const stop = element("button", { type: "button", className: "stop", textContent: "Stop" });
-stop.onclick = () => fetch("stop", { method: "POST" });
-
-async function begin() {
-  setTheme();
-  systemDark.addEventListener("change", setTheme);
-  $("buttons").append(iconButton("theme", "Light or dark", switchTheme), stop);
-  let charts = 0;
-  for (;;) {
-    const told = await ask("news", { newest: follows && !document.hidden ? 1 : undefined });
-    showRun(told);
-    showJobs(told);
-    showCloud(told.newest);
-    if (told.charts !== charts) {
-      charts = told.charts;
-      $("charts").innerHTML = (await ask("charts")).svg;
-    }
-    await new Promise((done) => setTimeout(done, document.hidden ? 4 * NEWS_MS : NEWS_MS));
+let charts = 0;
+async function show(told) {
+  showRun(told);
+  showJobs(told);
+  showCloud(told.newest);
+  if (told.charts !== charts) {
+    charts = told.charts;
+    $("charts").innerHTML = (await ask("charts")).svg;
   }
 }
 
-begin().catch((error) => {
+$("buttons").append(themeButton(), stop);
+follow("jobs", () => ({ newest: follows && !document.hidden ? 1 : undefined }), NEWS_MS, show).catch((error) => {
   console.warn(error);
-  stop.hidden = true;
   $("slots").replaceChildren(); // it goes on no more
   $("state").textContent = "The server of this page has ended.";
   $("state").className = "bad";

@@ -1,0 +1,359 @@
+"""The live page of a run: its jobs, or the only one, during the run and until it is closed.
+
+The run calls it in its own thread, and never waits for a browser: it hands over what is new. Parts
+are read when a page asks for news, or by the thread that removes what is left of ended jobs, and
+charts are drawn when a page asks for them; all within small shares of a core.
+"""
+
+from __future__ import annotations
+
+import re
+import threading
+import time
+from collections import Counter, deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import click
+
+from poolpart import Partition
+
+from ..base.errors import LidarpoolError
+from ..columns.cloud_file import CloudFile
+from ..export.jobs import JobRow, Value
+from ..pipeline import Frame, Receipt
+from ..report.campaign_figures import Figures
+from ..report.campaign_pictures import draw_results, draw_varied
+from ..run.bars import Pace, standing_still
+from ..run.page import JobNow, Page
+from ..run.progress import STAGES, Progress, in_words
+from ..run.result import RunResult
+from ..run.store import RunStore
+from .live_job import LiveJob
+from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
+
+LIST = "jobs.html"
+DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
+READING_SHARE = 0.06  # of a core, for points of the only job
+LOOKING_SHARE = 0.05  # of a core, for points of one of many jobs
+LOOK_EVERY_S = 5.0  # at most, for the points of another job
+LIST_EVERY_S = 0.5  # jobs under way
+ASK_EVERY_S = 2.0  # how busy the partitions are
+WATCHED_S = 10.0  # after a question somebody looks at the page
+ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST = 10, 6, 12  # rows of the table
+VIEWS_KEPT = 4  # jobs whose points are kept: a browser may show, or ask for, an earlier one
+
+
+class LivePage(Page):
+    """Connects a run and its page, in both directions: the list of jobs, or the only one."""
+
+    page: PageServer
+
+    def __init__(self, jobs: int, names: Sequence[str], title: str) -> None:
+        self.stopped = threading.Event()  # by a user of the page; --resume continues
+        self._count, self._names, self._title = jobs, names, title
+        self._charts = Charts(names, jobs)
+        self._state, self._over = "starting", False
+        self._progress: Progress | None = None
+        self._pace, self._rate, self._left = Pace(), "", ""  # what is left is a time
+        self._partitions: Mapping[str, Partition] = {}
+        self._busy: dict[str, tuple[int, int]] = {}  # {partition: busy slots, all slots}
+        self._under_way: Sequence[JobNow] = ()
+        self._ask_at = self._list_at = 0.0
+        self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
+        self._reading, self._looking = Share(READING_SHARE), Share(LOOKING_SHARE)
+        self._sums = Counter(done=0, failed=0, points=0, rays=0)
+        self._ended: deque[dict[str, Any]] = deque(maxlen=ENDED_MOST)
+        self._failures: deque[dict[str, Any]] = deque(maxlen=FAILED_MOST)
+        self._jobs: dict[int, LiveJob] = {}  # {number: its points}, the newest last
+
+    # -- the run's side ------------------------------------------------------------------
+
+    def begun(self, points: RunStore) -> None:
+        """Show the only job: what is committed from now on, and the scans of an earlier run."""
+        if points.kept:
+            self._progress = points.progress()
+        self._jobs = {0: LiveJob(points, self._title)}
+        self._state = "starting: workers, each with its own Python"
+
+    def follow(self, partitions: Mapping[str, Partition]) -> None:
+        """Show the jobs under way, and the busy slots of partitions."""
+        self._partitions = partitions
+        self._state = "starting: workers read the scene and make their trees"
+
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
+        """Record parts of the only job."""
+        self._jobs[0].add(receipts)
+
+    def on_frame(self, frame: Frame) -> None:
+        """Record a frame, which is displayed unless many others come at once."""
+        self._jobs[0].frames.append(frame)
+
+    def on_progress(self, progress: Progress, under_way: Callable[[], Sequence[JobNow]]) -> None:
+        """Record the progress; KeyboardInterrupt if a user of the page has stopped the run."""
+        if self.stopped.is_set():
+            raise KeyboardInterrupt
+        self._progress, now = progress, time.monotonic()
+        done, whole, over = progress.jobs_done, progress.jobs, False
+        if whole:
+            over = done == whole
+            rate = self._pace.rate(progress.seconds, done)
+            words = f"{in_words(rate)} jobs/s" if rate >= 1 else f"{in_words(60 * rate)} jobs/min"
+        else:
+            done, whole = progress.collected, progress.scans
+            rate = self._pace.rate(progress.seconds, done)
+            words = f"{in_words(rate)}/s"
+        if rate:
+            self._rate, self._left = words, self._pace.left(progress.seconds, done, whole)
+        if now >= self._list_at or over:
+            self._list_at = now + LIST_EVERY_S
+            self._under_way = under_way()
+        if over:
+            self._state = "writing the table and the card"
+        elif progress.cast or any(job.stored for job in self._under_way):
+            self._state = "running"
+        if now >= self._ask_at:
+            self._ask_at = now + ASK_EVERY_S
+            with suppress(OSError, RuntimeError):  # the run itself reports a lost cluster
+                stats = {name: part.stats() for name, part in self._partitions.items()}
+                self._busy = {name: (of.busy, of.slots) for name, of in stats.items()}
+
+    def ended(self, row: JobRow) -> None:
+        """Count a job, and list it among the last ones."""
+        told = {"name": row.name, "values": self._words(row.values)}
+        if row.error:
+            self._sums["failed"] += 1
+            self._failures.append(told | {"error": row.error})
+        else:
+            self._sums.update(done=1, points=row.points, rays=row.rays)
+            self._ended.append(told | {"points": row.points, "seconds": row.seconds})
+        self._charts.add(row)
+
+    def look(self, row: JobRow, points: RunStore) -> None:
+        """Read points of a job, if a browser shows them and there is time for it."""
+        watched = time.monotonic() - self._looked_for <= WATCHED_S and self._looking.due
+        if self._count > 1 and self._jobs and not watched:
+            return
+        with self._looking.taken(LOOK_EVERY_S):
+            title = f"job {row.name} - lidarpool" if self._count > 1 else self._title
+            job = self._jobs.get(row.number) or LiveJob(points, title, row.name)
+            job.read_all()
+            if job.cloud is not None:
+                jobs = self._jobs | {row.number: job}
+                self._jobs = {number: jobs[number] for number in [*jobs][-VIEWS_KEPT:]}
+
+    def finish(self, seconds: float, result: RunResult | None = None) -> None:
+        """Show that the run is over, and the result of a survey; its parts may then be removed."""
+        if self._count == 1 and 0 in self._jobs:
+            self._jobs[0].finish(result)
+        if self._progress is not None:
+            points = self._progress.points if result is None else len(result.points)
+            self._progress = replace(self._progress, seconds=seconds, points=points)
+        self._under_way, self._busy, self._rate, self._left = (), {}, "", ""
+        self._state, self._over = "done", True
+        self._charts.finish()
+
+    def stay(self, cloud: Path | None = None) -> None:
+        """Keep the page until Ctrl-C or its button.
+
+        Points of a survey are read from the written `cloud`, because the parts are gone.
+        """
+        if cloud is not None:
+            self._jobs[0].show_file(cloud)
+        click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
+        with suppress(KeyboardInterrupt):
+            while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+                pass
+
+    # -- the page's side -----------------------------------------------------------------
+
+    def answer(self, what: str, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Answer a question of the list, or of the viewer of a job."""
+        if what == "jobs":
+            if asked.get("newest"):
+                self._looked_for = time.monotonic()
+            return self._run() | self._list(), {}
+        if what == "charts":
+            return {"svg": self._charts.drawn()}, {}
+        found = re.fullmatch(r"(?:job/(\d+)/)?(\w+)", what)
+        if found is None:
+            raise KeyError(what)
+        number, question = int(found[1] or 0), found[2]
+        if self._count > 1:
+            with self._looking.taken():
+                return self._jobs[number].view.answer(question, asked, abandoned)
+        if number not in self._jobs and question == "state":
+            return self._run() | self._list(), {}  # until it has begun
+        return self._of_only(self._jobs[number], question, asked, abandoned)
+
+    def _of_only(self, job: LiveJob, question: str, *asked: Any) -> Answer:
+        """Answer a question of the viewer of the only job, which is shown while it goes on."""
+        points = {"points": 0 if self._progress is None else self._progress.points}
+        if question == "news":
+            if self._reading.due and not self._over:
+                with self._reading.taken():
+                    job.gather()
+            header, arrays = job.news()
+            return self._run() | header | points, arrays
+        header, arrays = job.view.answer(question, *asked)
+        if question == "state":
+            sampled = not isinstance(job.view.points, CloudFile)
+            header |= {"live": True, "sampled": sampled} | points
+        return header, arrays
+
+    def _run(self) -> dict[str, Any]:
+        """Return what the list and the viewer of the only job tell of the run."""
+        progress, state = self._progress, self._state
+        if not self._over:
+            if self.stopped.is_set():
+                state = "stopping"
+            elif progress is not None:
+                state = standing_still(progress) or state
+        return {
+            "state": state,
+            "over": self._over,
+            "stopping": self.stopped.is_set(),
+            "seconds": None if progress is None else progress.seconds,
+            "rate": self._rate,
+            "left": self._left,
+            "stages": [
+                [label, getattr(progress, count), getattr(progress, total)]
+                for label, count, total in STAGES
+                if progress is not None and getattr(progress, total)
+            ],
+            "slots": [[f"{name}, slots busy", *slots] for name, slots in self._busy.items()],
+        }
+
+    def _list(self) -> dict[str, Any]:
+        under_way, jobs = self._under_way, self._jobs
+        newest, writing = next(reversed(jobs), None), sum(job.writing for job in under_way)
+        return dict(self._sums) | {
+            "title": self._title,
+            "names": list(self._names),
+            "count": self._count,
+            "casting": len(under_way) - writing,
+            "writing": writing,
+            "under_way": [
+                {
+                    "name": job.name,
+                    "values": self._words(job.values),
+                    "points": job.points,
+                    "seconds": job.seconds,
+                    "share": 1.0 if job.writing else job.stored / max(job.scans, 1),
+                    "writing": job.writing,
+                }
+                for job in under_way[:UNDER_WAY_MOST]
+            ],
+            "failures": [*reversed(list(self._failures))],
+            "ended": [*reversed(list(self._ended))],
+            "charts": self._charts.version,
+            "newest": None if newest is None else [newest, jobs[newest].name],
+        }
+
+    def _words(self, values: Mapping[str, Value]) -> list[str]:
+        """Values in the order of the table's columns; "" for one that is not there."""
+        return [_word(values.get(name, "")) for name in self._names]
+
+
+def _word(value: Value) -> str:
+    if isinstance(value, bool):
+        return str(value).lower()
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+class Share:
+    """A share of a core that something may take; processor time, since waiting does not count."""
+
+    def __init__(self, share: float) -> None:
+        self._share, self._at = share, 0.0
+
+    @property
+    def due(self) -> bool:
+        """Whether it may be done again."""
+        return time.monotonic() >= self._at
+
+    @contextmanager
+    def taken(self, pause_s: float = 0.0) -> Iterator[None]:
+        """Put off the next time by what the body takes, and at least by a pause."""
+        started = time.thread_time()
+        try:
+            yield
+        finally:
+            self._at = max(self._at, time.monotonic() + pause_s)
+            self._at += (time.thread_time() - started) / self._share
+
+
+class Charts:
+    """How jobs were varied, and what came of it, drawn again and again while somebody asks.
+
+    A few numbers of each job are kept. Near the end it lets the run draw its own pictures first,
+    since Matplotlib draws in one thread only.
+    """
+
+    def __init__(self, names: Sequence[str], count: int) -> None:
+        self._figures, self._count = Figures(names), count
+        self._rows: deque[JobRow] = deque()  # that are not counted: the run waits for no drawing
+        self._lock = threading.Lock()
+        self._share = Share(DRAWING_SHARE)
+        self._drawn, self._svg, self._finished = 0, "", False
+
+    def add(self, row: JobRow) -> None:
+        """Count a job."""
+        self._rows.append(row)
+        if self._lock.acquire(blocking=False):
+            try:
+                self._take()
+            finally:
+                self._lock.release()
+
+    def _take(self) -> None:
+        while self._rows:
+            self._figures.add(self._rows.popleft())
+
+    def finish(self) -> None:
+        """Let all jobs be drawn."""
+        self._finished = True
+
+    @property
+    def version(self) -> int:
+        """Number of jobs that `drawn` draws, or has drawn if it is not yet time to draw again."""
+        jobs, is_due = self._figures.jobs, self._share.due and self._figures.done
+        return jobs if self._finished or (is_due and jobs < self._count) else self._drawn
+
+    def drawn(self) -> str:
+        """Draw them, if it is time, as elements of HTML."""
+        with self._lock:
+            self._take()
+            if self.version != self._drawn:
+                self._drawn = self._figures.jobs
+                with self._share.taken(), suppress(LidarpoolError):
+                    self._svg = _drawn(self._figures, self._finished)
+            return self._svg
+
+
+def _drawn(figures: Figures, complete: bool) -> str:
+    pages = [draw_varied(figures)]
+    if complete or pages[0] is None:
+        pages.append(draw_results(figures))
+    return "".join(f"<figure>{page.svg()}</figure>" for page in pages if page is not None)
+
+
+@contextmanager
+def live_page(
+    jobs: int = 1,
+    names: Sequence[str] = (),
+    title: str = "lidarpool",
+    *,
+    port: int = PORT,
+    browser: bool = True,
+) -> Iterator[LivePage]:
+    """Serve the page of a run while the body runs; see `announced`."""
+    live, index = LivePage(jobs, names, title), VIEWER if jobs == 1 else LIST
+    with (
+        page_server(live.answer, port, live.stopped.set, index=index) as live.page,
+        announced(live.page, f"live page: {live.page.url}", browser),
+    ):
+        yield live

@@ -1,0 +1,35 @@
+// What the list of jobs and the viewer of the only one have in common: bars, and news of the run.
+import { ask } from "./ask.js";
+import { element } from "./controls.js";
+
+export const stop = element("button", { type: "button", className: "stop", textContent: "Stop" });
+stop.onclick = () => fetch("stop", { method: "POST" });
+
+export const pause = (ms) => new Promise((done) => setTimeout(done, document.hidden ? 4 * ms : ms));
+
+export const meter = (share) => element("span", { className: "meter" }, element("b", { style: { width: `${100 * share}%` } }));
+
+export const count = ([label, done, whole]) => element(
+  "div", { className: "count" }, element("span", { textContent: label }),
+  element("span", { textContent: `${done.toLocaleString("en")} / ${whole.toLocaleString("en")}` }), meter(whole ? done / whole : 0),
+);
+
+// Leaves alone what shows this already.
+export function replace(box, ...children) {
+  const made = element("div", {}, ...children);
+  if (made.innerHTML !== box.innerHTML) box.replaceChildren(...made.childNodes);
+}
+
+// Asks again and again, until the server has ended.
+export async function follow(what, asked, ms, show) {
+  try {
+    for (;;) {
+      const told = await ask(what, asked());
+      stop.textContent = told.over ? "Close" : told.stopping ? "Stopping" : "Stop";
+      await show(told);
+      await pause(ms);
+    }
+  } finally {
+    stop.hidden = true;
+  }
+}
