@@ -130,6 +130,8 @@ class Conductor(Generic[R]):
         if options.resume and self.store.only and not (self.store.kept or self.store.notes):
             self.store.notes.append(f"there was nothing to resume in {options.out or place[0]}")
         self.stack.enter_context(self.store.kept_on_error())
+        if self.store.only is not None:
+            self.page.begun(self.store.only)
         self.output.look(self)
         self.stack.enter_context(self._cluster_stack)
 
@@ -137,7 +139,6 @@ class Conductor(Generic[R]):
         """Wait for a job that can be made, which stays the next to be taken."""
         only = self.store.only
         if only is not None and only.complete:
-            self.page.begun(only)
             return
         self._maker = JobMaker(self.jobs, self.store.left, self.output.columns)
         self.stack.callback(self._maker.close)

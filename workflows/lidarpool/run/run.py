@@ -163,7 +163,6 @@ class Run:
         cluster, jobs = self._cluster, self._store.jobs
         on_frame = self._on_frame
         if self._writer is None:
-            self._page.begun(points)
             if job.planning is not None:
                 self._plan(job, points)
         # Of a campaign's job many follow, so that its batches need not be divided among all.
