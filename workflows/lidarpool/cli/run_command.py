@@ -86,7 +86,7 @@ class Terminal(Screen):
             yield client
 
 
-def options_of(pool: PoolSection, backend: str | None, **given: Any) -> RunOptions:
+def options_of(pool: PoolSection, backend: str | None = None, **given: Any) -> RunOptions:
     """Options of a scenario's section `pool`, and those that were given."""
     tasks = declared(pool, TaskOptions) | ({"backend": backend} if backend else {})
     return RunOptions(gpu_workers=pool.gpu, other_workers=pool.other, **tasks, **given)

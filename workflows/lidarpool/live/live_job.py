@@ -19,9 +19,9 @@ from ..columns.table import SCAN
 from ..export.sweeps import Sweeps
 from ..pipeline import Frame, Receipt
 from ..plan import best
+from ..run.job_points import JobPoints
 from ..run.picture_file import Pictured
 from ..run.result import RunResult
-from ..run.store import RunStore
 from .points import HeldPoints, no_points
 from .server import Answer
 from .view import IN_SENSOR_AXES, View
@@ -40,7 +40,7 @@ class LiveJob:
     """
 
     def __init__(
-        self, store: RunStore, title: str = "lidarpool", name: str = "", most: int = LIVE_POINTS
+        self, store: JobPoints, title: str = "lidarpool", name: str = "", most: int = LIVE_POINTS
     ) -> None:
         self.name, self._title, self._store, self._most = name, title, store, most
         self._job = store.job
@@ -57,7 +57,7 @@ class LiveJob:
         self._making = threading.Lock()
         self._whole = False  # all parts were read
         self._ends = 0  # how often something came at the run's end that the page must ask for
-        self.add(store.db.ordered)
+        self.add(store.parts.ordered)
 
     # -- the run's side ------------------------------------------------------------------
 
@@ -102,7 +102,7 @@ class LiveJob:
             clouds = [] if self.cloud is None else [self.cloud]
             for name in names:
                 with suppress(LidarpoolError):
-                    part = read_part(self._store.storage, name)
+                    part = read_part(self._points.storage, name)
                     self._counts[part.triangles] += part.hits
                     self._hits += int(part.hits.sum())
                     rows = np.flatnonzero(self._random.random(len(part)) < self._share)
@@ -119,7 +119,7 @@ class LiveJob:
     def hit_counts(self) -> Floats:
         """Hits by counters of the scene, scaled up to all hits if some parts were not read."""
         with self._lock:
-            return np.asarray(self._counts * (self._store.db.hits / max(self._hits, 1)))
+            return np.asarray(self._counts * (self._store.parts.hits / max(self._hits, 1)))
 
     @property
     def view(self) -> View:
@@ -163,7 +163,7 @@ class LiveJob:
 
     def _planned(self) -> Floats | None:
         """Return the planned path, once all trials have ended."""
-        planning, trials = self._job.planning, self._store.db.trials
+        planning, trials = self._job.planning, self._store.parts.trials
         if planning is None or len(trials) < self._job.trials:
             return None
         return best(trials, planning).path

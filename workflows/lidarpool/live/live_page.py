@@ -28,10 +28,10 @@ from ..pipeline import Frame, Receipt
 from ..report.campaign_figures import Figures
 from ..report.campaign_pictures import draw_results, draw_varied
 from ..run.bars import Pace, standing_still
+from ..run.job_points import JobPoints
 from ..run.page import JobNow, Page
 from ..run.progress import STAGES, Progress, in_words
 from ..run.result import RunResult
-from ..run.store import RunStore
 from .live_job import LiveJob
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
 
@@ -72,7 +72,7 @@ class LivePage(Page):
 
     # -- the run's side ------------------------------------------------------------------
 
-    def begun(self, points: RunStore) -> None:
+    def begun(self, points: JobPoints) -> None:
         """Show the only job: what is committed from now on, and the scans of an earlier run."""
         if points.kept:
             self._progress = points.progress()
@@ -132,7 +132,7 @@ class LivePage(Page):
             self._ended.append(told | {"points": row.points, "seconds": row.seconds})
         self._charts.add(row)
 
-    def look(self, row: JobRow, points: RunStore) -> None:
+    def look(self, row: JobRow, points: JobPoints) -> None:
         """Read points of a job, if a browser shows them and there is time for it."""
         watched = time.monotonic() - self._looked_for <= WATCHED_S and self._looking.due
         if self._count > 1 and self._jobs and not watched:

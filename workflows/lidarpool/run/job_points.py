@@ -87,7 +87,7 @@ class JobPoints:
         storage = self._store.storage
         try:
             data = storage.read(name)
-            return Receipt.of_part(unpack(data), name, len(data), self.job.number)
+            return Receipt.of_part(unpack(data), self.job.number, name, len(data))
         except LidarpoolError:
             return None
         except OSError as error:

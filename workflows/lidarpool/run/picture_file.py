@@ -16,6 +16,7 @@ from ..base.arrays import AnyArray, Floats, Floats32
 from ..base.words import counted
 from ..columns.table import CAUSES, TABLE, Column
 from ..plan import Plan, Planning
+from ..scenario.job import Job
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.colours import Colours
 from ..scene.drawn import Drawn, cut
@@ -24,7 +25,6 @@ from ..scene.scene import Scene
 from ..sensor import Survey, Track
 from ..sensor.materials import MaterialTable
 from ..sensor.trajectory import ALWAYS, Beyond, presence_ns
-from .job import Job
 from .result import RunResult
 
 PICTURE_FILE = "pictures.npz"

@@ -24,15 +24,15 @@ SURE_SHARE, SURE_S = 0.05, 20.0
 class Progress:
     """Counts of a run at one moment."""
 
-    scans: int
-    generated: int  # scans that have passed stage 1, and so on to 4
-    cast: int
-    framed: int
-    collected: int
-    points: int
-    trials: int
-    trials_done: int
     seconds: float  # since the start
+    scans: int = 0
+    generated: int = 0  # scans that have passed stage 1, and so on to 4
+    cast: int = 0
+    framed: int = 0
+    collected: int = 0
+    points: int = 0
+    trials: int = 0
+    trials_done: int = 0
     replayed: int = 0  # batches that were sent or cast once more
     waits_for: str = ""  # partition whose slots the survey needs and other runs hold
     jobs: int = 0  # of a campaign, whose scans are not counted

@@ -43,8 +43,6 @@ PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
 LONGEST_PAUSE_S = 0.05  # while nothing moves
 SPARE = 32  # jobs under way beside two for each GPU slot
-ANNOUNCED = 16  # jobs whose scans stage 1 has yet to describe,
-ANNOUNCED_SCANS = 2_000  # unless these are so many
 
 
 class Run:
@@ -80,7 +78,7 @@ class Run:
             cluster.client, cluster.partitions[GPU], run, cluster.backend, cluster.software
         )
         self._driver = RunDriver(workers, stages, store.db, store.storage)
-        self._writer = writer and writer(self._driver.probe)
+        self._writer = writer and writer(stages.probe)
         self._trials: TrialPump | None = None
         self._made: dict[int, tuple[JobPoints, Sweeps | None]] = {}  # {number: job under way}
         self._all_made = False
@@ -154,9 +152,7 @@ class Run:
 
     @property
     def _has_room(self) -> bool:
-        announced = self._driver.announced
-        few = len(announced) < ANNOUNCED and sum(announced) < ANNOUNCED_SCANS
-        return few and len(self._made) < SPARE + 2 * self._driver.slot_count
+        return self._driver.has_room and len(self._made) < SPARE + 2 * self._driver.slot_count
 
     def _begin(self, made: Made) -> None:
         job, (points, _) = made.job, self._made[made.job.number]
@@ -261,10 +257,11 @@ class Run:
                 stored=points.parts.scans_done,
                 scans=points.job.survey.scan_count,
                 points=points.parts.point_count,
-                seconds=self._driver.seconds_of(number),
+                seconds=0.0 if state is None else state.seconds,
                 writing=number in writing,
             )
             for number, (points, _) in [*self._made.items()]
+            for state in [self._driver.jobs.get(number)]
         ]
         return sorted(jobs, key=lambda job: job.writing)
 
@@ -360,7 +357,7 @@ class Run:
         progress = replace(points.progress(), seconds=seconds, waits_for=waits_for)
         if self._trials is not None:
             progress = replace(progress, trials_done=len(self._trials.trials))
-        if (state := self._driver.state_of(points.job.number)) is None:
+        if (state := self._driver.jobs.get(points.job.number, self.kept)) is None:
             return progress
         cast = min(points.resumed + state.cast, progress.scans)
         replayed = state.offered_again

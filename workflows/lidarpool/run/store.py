@@ -177,7 +177,7 @@ class RunStore:
             self._sizes = self.storage.sizes()  # also an error if the place cannot be opened
         self._strays: dict[int, list[str]] = {}  # {number: parts that an earlier run has left}
         for name in self._sizes if resume else ():
-            if (scans := scans_of(self.db.meta["mark"], name)) is not None:
+            if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if isinstance(self.jobs, OneJob):
             self.points_of(self.jobs.only)
@@ -285,7 +285,7 @@ class RunStore:
             return points  # is checked once the run itself is known to be the same
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
-            if self.db.identity_of_job(job.number) == fingerprint(identity_of(job)):
+            if self.db.hash_of(job.number) == fingerprint(identity_of(job)):
                 points.check(self._sizes, strays)
             else:  # files that it is made of have changed
                 self.db.restart(job.number)
@@ -296,7 +296,7 @@ class RunStore:
         """Keep what a job is made of, of which parts are committed and others are not yet."""
         if not isinstance(self.jobs, OneJob) and not points.identified:
             points.identified = True
-            self.db.identify_job(points.job.number, fingerprint(identity_of(points.job)))
+            self.db.set_hash(points.job.number, fingerprint(identity_of(points.job)))
 
     def end(self, rows: Sequence[JobRow]) -> None:
         """Commit that jobs have ended."""
