@@ -60,8 +60,9 @@ def find_workers(
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
     software that a resumed run was cast with. Workers that are missing or just died, or whose jobs
-    are in the queue, are waited for as long as `waiting` says. If scans are `left` to be cast, slots
-    are wanted of partitions that grow with their work. `writing` says that jobs are written, too.
+    are in the queue, are waited for as long as `waiting` says. If scans are `left` to be cast,
+    slots are wanted of partitions that grow with their work. `writing` says that jobs are written,
+    too.
 
     LidarpoolError if workers, slots `needed` or the backend are missing, or versions differ.
     """
@@ -116,8 +117,8 @@ def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker
         )
     if min(tasks.batch_mb * MB, all_scans) > room:
         raise JobError(
-            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give GPU workers a larger "
-            "--memory-limit."
+            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give GPU workers a "
+            "larger --memory-limit."
         )
 
 
