@@ -43,6 +43,7 @@ import lidarpool.cli.run_command, lidarpool.pipeline.policies, lidarpool.report.
 import lidarpool.report.pictures as pictures
 from lidarpool.__main__ import main
 from lidarpool.pipeline.database import RunDatabase
+from lidarpool.run.store import RunStore
 from lidarpool.base.tracing import trace_to
 
 pictures.take_shot = lambda *_, **__: None
@@ -63,15 +64,15 @@ def drive(point, times):
     def before(owner, name, label):
         function = getattr(owner, name)
         def call(*arguments, **options):
-            strike(label)
+            if arguments[1:] != ([],):  # something
+                strike(label)
             return function(*arguments, **options)
         setattr(owner, name, call)
     trace_to(strike)
     before(RunDatabase, "commit", "COMMIT")
     before(RunDatabase, "__init__", "OPEN")
     before(lidarpool.report.output.Format, "write", "SAVE")
-    before(lidarpool.cli.run_command, "drop_run", "REMOVE")
-    before(lidarpool.cli.run_command.RunStore, "remove", "REMOVE")
+    before(RunStore, "remove", "REMOVE")
     sys.argv = ["lidarpool", *json.loads(sys.argv[1])]
     main()
 
@@ -127,10 +128,10 @@ def drive(tmp_path: Path, cluster: str) -> Callable[..., list[int]]:
     return drive
 
 
-def committed(folder: Path) -> int:
-    """Scans in a run's database."""
+def committed(folder: Path) -> list[tuple[int, int]]:
+    """Scans of the parts in a run's database."""
     with sqlite3.connect(f"file:{folder / 'run.db'}?mode=ro", uri=True) as sql:
-        return sql.execute("SELECT coalesce(sum(stop - first), 0) FROM parts").fetchone()[0]
+        return sql.execute("SELECT first, stop FROM parts").fetchall()
 
 
 def report_of(folder: Path) -> dict[str, Any]:
@@ -187,13 +188,13 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     assert report_of(tmp_path / "fresh")["resumed_scans"] == 0
 
     # Parts that are gone are made again; and the backend of the others is taken.
-    part = sorted((out / "run" / "parts").glob("*.npz"))[5]
+    (part,) = (out / "run" / "parts").glob("*-{:08d}-{:08d}.npz".format(*before[0]))
     part.unlink()
     resumed = lidarpool(*arguments, "--resume", "--backend", "auto")
     assert (resumed.code, resumed.err) == (0, "")
     assert (out / "cloud.ply").read_bytes() == undisturbed
     report = report_of(out)
-    assert 0 < report["resumed_scans"] < before
+    assert sum(stop - first for first, stop in before[1:]) <= report["resumed_scans"] < SCANS
     (note,) = (note for note in report["notes"] if note.startswith("cast again: "))
     assert f"{part.name} was missing" in note
 
@@ -263,7 +264,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     assert same_cloud(result.cloud, whole.cloud)
 
     # A complete run needs no cluster.
-    monkeypatch.setattr("lidarpool.api.simulation.local_client", None)
+    monkeypatch.setattr("lidarpool.run.cluster.local_client", None)
     again = simulate(Scene.seed(), SURVEY, folder=folder, resume=True)
     assert again.resumed == SURVEY.scan_count and again.records == ()
     assert again.backend == "embree"

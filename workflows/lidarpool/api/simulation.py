@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import fields
 from pathlib import Path
 
 from distributed import Client
@@ -144,4 +145,4 @@ def simulate(
     with page_of(jobs, live) as page:
         screen, on_frame = Screen(on_progress), on_frame or (lambda frame: None)
         result = Conductor(jobs, options, Kept(), screen, page, on_frame)()
-    return Result(**vars(result))
+    return Result(**{field.name: getattr(result, field.name) for field in fields(result)})
