@@ -106,7 +106,7 @@ class DataSetOutput(Output[CampaignRun]):
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
             self._take_over(store)
-        _own_files(out, begun=bool(store.kept))
+        _own_files(out, begun=bool(store.kept or store.notes))  # perhaps without its database
         if self._made is None:
             _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.kept:
@@ -209,7 +209,7 @@ def _identity(store: RunStore) -> str:
 
 
 def _made_with(store: RunStore) -> dict[str, Any]:
-    """What the bytes of all jobs depend on, for their manifests."""
+    """Return what the bytes of all jobs depend on, for their manifests."""
     return {"identity": _identity(store), "backend": store.backend, "casting": store.casting}
 
 
