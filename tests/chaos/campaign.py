@@ -42,7 +42,7 @@ DRIVER = "driver"
 HARMED = 0.5  # of the times that the driver is killed
 HARMS = 4  # runs of a finished data set, each after a file was harmed
 LINK = "link"  # is put before the driver that follows a killed one
-LINKS = ("run", "run/parts", "run/jobs/x", "jobs", ".jobs")
+LINKS = ("run", "run/parts", "jobs", ".jobs")
 BETWEEN_S = 0.3, 4.0  # seconds between faults
 ENDS_WITHIN_S = 300.0
 
@@ -102,8 +102,9 @@ class Arena:
         )
 
     def _harm(self, dataset: Path) -> list[str]:
-        """Delete a file of a job or its manifest, or cut it; returns what was done."""
-        found = sorted([*dataset.glob("jobs/*/[cs]*"), *dataset.glob(".jobs/*.json")])
+        """Delete a file of a job, a manifest or the database, or cut it; returns what was done."""
+        kinds = ("jobs/*/[cs]*", ".jobs/*.json", "run/run.db")
+        found = sorted(path for kind in kinds for path in dataset.glob(kind))
         if not found:
             return []
         path = self._chance.choice(found)
@@ -189,7 +190,7 @@ def judge(dataset: Path, reference: dict[str, bytes], tally: Tally) -> None:
     tally.differing += [
         name for name in {*found, *reference} if found.get(name) != reference.get(name)
     ]
-    left = [*(dataset / "run").rglob("*"), *dataset.glob("run"), *dataset.glob("*-dataset")]
+    left = [*(dataset / "run").rglob("*"), *dataset.glob("run"), *dataset.glob(".lidarpool-*")]
     tally.differing += [str(path.relative_to(dataset)) for path in left]
 
 

@@ -95,8 +95,8 @@ def _fault(
 class Nemesis:
     """Carries out faults during a run whose driver is in this process; a context manager around it.
 
-    The run keeps its parts in the folder `parts`. `links` lead from its folder to that of a
-    `stranger`, who has a run, too.
+    The run keeps its parts in the folder `parts`. Links lead from there to that of a `stranger`,
+    who has a run, too.
 
     Faults at points are armed at once; those at random times follow one another, from when
     anybody passes a point.
@@ -104,7 +104,6 @@ class Nemesis:
 
     def __init__(self, arena: Arena, faults: Sequence[Fault], parts: Path, stranger: Path) -> None:
         self.arena, self.parts, self.stranger = arena, parts, stranger
-        self.links: list[Path] = []
         self.faults = {fault.number: fault for fault in faults}
         self.done: Counter[tuple[str, str]] = Counter()  # {(kind, point): times}
         self.left: list[Fault] = []  # afterwards: those that were not carried out
@@ -224,12 +223,12 @@ class Nemesis:
         return {DAMAGE: self._damage, LINK: self._link}
 
     def _link(self, fault: Fault) -> bool:
-        """Put a link where a run removes what it finds."""
-        link = self.parts.with_name("jobs") / str(fault.number)
-        link.parent.mkdir(exist_ok=True)
-        link.symlink_to(self.stranger)
-        self.links.append(link)
-        return True
+        """Put a link to a file of the stranger among those of the run, as if it were its own."""
+        for mark in self.parts.glob("*-mark"):
+            link = mark.with_name(mark.name.replace("mark", f"probe-{fault.number:08x}"))
+            link.symlink_to(self.stranger / "run.owner")
+            return True
+        return False
 
     def _damage(self, fault: Fault) -> bool:
         """Flip a bit of some part; False if there is none now."""

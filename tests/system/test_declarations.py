@@ -28,12 +28,14 @@ UNFINISHED = """
 import sys
 from tests.lidarpool.committing import commit
 from lidarpool import LidarpoolError, Noise
-from lidarpool.run.job import make_job
+from lidarpool.run.jobs import OneJob
 from lidarpool.run.store import RunStore
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 
-store = RunStore(make_job(Scenario.load(sys.argv[1])), sys.argv[2])
-store.backend = "numpy"
+store = RunStore(OneJob(job_of(build(Scenario.load(sys.argv[1])))), place=sys.argv[2])
+store.cast_with("numpy", {})
 commit(store, 0, [3, 3], [0, 1], [3, 3])
 store.db.close()
 try:
