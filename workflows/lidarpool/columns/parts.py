@@ -1,10 +1,10 @@
 """Parts: the columns of some consecutive scans as one file.
 
 A part is a NumPy archive without compression (``numpy.load`` opens it): an array for each column,
-rows in (scan, ray) order, and more: `.scans`, first scan and one past the last; `.counts`, rows of
-each scan; and the hits of each triangle, `.triangles` and `.hits`, including hits that were not
-kept. `x`, `y` and `z` are whole multiples of the precision from the scene's local origin, so that
-they are rounded only once.
+rows in (scan, ray) order, and more: `.scans`, first scan and one past the last; of each scan
+`.counts`, its rows, `.scan_hits`, its hits including those that were not kept, and `.samples`, ends
+of some of its rays; and the hits of each triangle, `.triangles` and `.hits`. `x`, `y` and `z` are
+whole multiples of the precision from the scene's local origin, so that they are rounded only once.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ import re
 import zipfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from ..base.archives import read_array, read_arrays
-from ..base.arrays import AnyArray, Floats, Ints, Ints32
+from ..base.arrays import AnyArray, Floats, Floats32, Ints, Ints32, UInts32
 from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage, target_of
@@ -30,7 +31,8 @@ from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
 # Files of a run in the folder of its parts: its mark, then what it is.
-_OWN = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8}|\d{8,}-\d{8,}\.npz)", re.ASCII)
+_PART = re.compile(r"([0-9a-f]{16})-(\d{6,})-(\d{8,})-(\d{8,})\.npz", re.ASCII)
+_OTHER = re.compile(r"([0-9a-f]{16})-(?:mark|probe-[0-9a-f]{8})", re.ASCII)
 _AGAIN = "Resuming the run (--resume, in Python resume=True) casts its scans again."
 _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 
@@ -39,9 +41,17 @@ _DATE = (1980, 1, 1, 0, 0, 0)  # the same columns give the same bytes
 # random digits, and an empty file in the folder of the parts says that they are this mark's.
 
 
-def part_name(mark: str, first: int, stop: int) -> str:
+def part_name(mark: str, job: int, first: int, stop: int) -> str:
     """Name of the part of these scans: who writes it a second time writes the same bytes."""
-    return f"{mark}-{first:08d}-{stop:08d}.npz"
+    return f"{mark}-{job:06d}-{first:08d}-{stop:08d}.npz"
+
+
+def scans_of(name: str, mark: str) -> tuple[int, int, int] | None:
+    """Job, first scan and end of the part of a run that has a name; None for other names."""
+    found = _PART.fullmatch(name)
+    if found is None or found[1] != mark:
+        return None
+    return int(found[2]), int(found[3]), int(found[4])
 
 
 def probe_name(mark: str, driver: str) -> str:
@@ -69,7 +79,7 @@ def own_files(storage: Storage, mark: str | None) -> list[str]:
 
 def _mark_of(name: str) -> str:
     """Mark in the name of a file of a run; empty for any other name."""
-    found = _OWN.fullmatch(name)
+    found = _PART.fullmatch(name) or _OTHER.fullmatch(name)
     return found[1] if found else ""
 
 
@@ -82,6 +92,10 @@ class PartColumns:
     columns: Mapping[str, AnyArray]  # {name: (rows,)}, positions as cells
     triangles: Ints32  # (k,): those that were hit
     hits: Ints  # (k,): all their hits
+    # (scans,) and (scans, samples, 3): hits of each scan, and ends of some of its rays, metres,
+    # local coordinates, NaN where there are fewer; empty in a part that is not stored.
+    scan_hits: UInts32 = field(default_factory=partial(np.zeros, 0, np.uint32))
+    samples: Floats32 = field(default_factory=partial(np.zeros, (0, 0, 3), np.float32))
 
     def __len__(self) -> int:
         return int(self.counts.sum())
@@ -134,6 +148,8 @@ def pack(part: PartColumns) -> bytearray:
         ".counts": part.counts,
         ".triangles": part.triangles,
         ".hits": part.hits,
+        ".scan_hits": part.scan_hits,
+        ".samples": part.samples,
         **part.columns,
     }
     memory = io.BytesIO()
@@ -159,13 +175,16 @@ def unpack(data: bytes) -> PartColumns:
     try:
         arrays = read_arrays(data)
         first, stop = arrays.pop(".scans").tolist()
+        named = ("counts", "triangles", "hits", "scan_hits", "samples")
         part = PartColumns(
-            first, arrays.pop(".counts"), arrays, arrays.pop(".triangles"), arrays.pop(".hits")
+            first, columns=arrays, **{name: arrays.pop(f".{name}") for name in named}
         )
         if (
             part.stop != stop
             or (part.counts < 0).any()
             or part.triangles.shape != part.hits.shape
+            or part.scan_hits.shape != part.counts.shape
+            or part.samples.shape[:1] + part.samples.shape[2:] != (len(part.counts), 3)
             or any(array.shape != (len(part),) for array in part.columns.values())
         ):
             raise ValueError("its arrays do not fit together")

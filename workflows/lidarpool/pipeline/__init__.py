@@ -1,12 +1,12 @@
 """The survey pipeline: four stages on the partitions of a cluster, and their driver."""
 
-from .crew import Crew
-from .driver import SurveyDriver
+from .database import JobParts, RunDatabase
+from .driver import RunDriver
 from .failures import JobError
+from .jobs import JobState
 from .long_stages import LongStages
 from .messages import Frame, Receipt
 from .names import COLLECT, EXPORT, GENERATE, GPU, INTERSECT, LIDAR, OTHER, SORT
-from .rigs import RigPlan
 from .workers import CastingWorkers
 
 __all__ = [
@@ -19,11 +19,12 @@ __all__ = [
     "OTHER",
     "SORT",
     "CastingWorkers",
-    "Crew",
     "Frame",
     "JobError",
+    "JobParts",
+    "JobState",
     "LongStages",
     "Receipt",
-    "RigPlan",
-    "SurveyDriver",
+    "RunDatabase",
+    "RunDriver",
 ]

@@ -1,15 +1,15 @@
-"""Stage 2: casts the rays of a batch on a GPU worker, and makes its columns."""
+"""Stage 2: casts the rays of batches on a GPU worker, and makes their columns."""
 
 from __future__ import annotations
 
 from collections.abc import Collection, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from poolpart import Recorder, TaskRecord
 
+from ..base.arrays import Floats32
 from ..base.tracing import trace
 from ..columns.parts import PartColumns
 from ..simulator.batch import columns_of
@@ -17,72 +17,84 @@ from ..simulator.device import DeviceReturns
 from ..simulator.returns import BatchReturns
 from ..simulator.rig import Rig
 from .failures import naming_scans
-from .messages import Span, samples_of_scan, summary_type
+from .messages import Span, samples_of_scan
 from .names import GPU, INTERSECT
 from .rigs import drop, rig_of
+
+
+@dataclass(frozen=True, slots=True)
+class CastWork:
+    """What a casting task does for one job: cast some batches with the job's rig."""
+
+    job: int
+    handle: str  # of the rig
+    spans: Sequence[Span]  # the first scan and the end of each batch
 
 
 @dataclass(frozen=True)
 class CastBatch:
     """Result of stage 2 for a batch."""
 
+    job: int
     part: PartColumns
-    summaries: NDArray[np.void]  # (scans,) of `messages.summary_type`
     record: TaskRecord
 
 
 def intersect(
-    handle: str,
-    spans: Sequence[Span],
+    works: Sequence[CastWork],
     unneeded: Collection[str] = (),
-    plan: bytes | None = None,
     scene: bytes | None = None,
+    *plans: bytes | None,
 ) -> list[CastBatch]:
     """Cast the rays of batches and make their columns; runs on a GPU worker.
 
-    `spans` are the first scan and the end of each. `handle` is that of the survey's rig, which is
-    made of `plan` and `scene` if the worker has none; `unneeded` ones are dropped before.
+    The jobs share the still part of a scene. It is made of `scene`, and the rig of each job of its
+    plan, if the worker has none; rigs and scenes that are `unneeded` are dropped before.
 
     Raises
     ------
     RigMissing
         If the worker has no such rig, and nothing to make it of.
     RigFailed
-        If the rig cannot be made.
+        If a rig cannot be made.
     ScanError
         If casting or a column fails, naming the scans.
     """
     drop(unneeded)
-    rig = rig_of(handle, plan, scene)
-    return [_cast(rig, handle, first, stop) for first, stop in spans]
+    done = []
+    for work, plan in zip(works, plans, strict=True):
+        rig = rig_of(work.handle, plan, scene)
+        done += [_cast(rig, work, first, stop) for first, stop in work.spans]
+    return done
 
 
-def _cast(rig: Rig, handle: str, first: int, stop: int) -> CastBatch:
+def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     recorder = Recorder(INTERSECT, GPU)
+    about = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
-    trace("intersect.start", run=handle, stage=INTERSECT, scans=scans)
+    trace("intersect.start", **about, scans=scans)
     with naming_scans(first, stop - 1):
         found = list(rig.cast(first, stop))
-        trace("intersect.cast", run=handle, stage=INTERSECT, scans=scans)
-        part = columns_of(found)
-        summaries = np.concatenate([_summaries(returns) for returns in found])
-    batch = CastBatch(part, summaries, recorder.done(stop - first))
-    trace("intersect.end", run=handle, stage=INTERSECT, scans=scans)
+        trace("intersect.cast", **about, scans=scans)
+        part = replace(
+            columns_of(found),
+            scan_hits=np.concatenate([returns.hits for returns in found]).astype(np.uint32),
+            samples=np.concatenate([_samples(returns) for returns in found]),
+        )
+    batch = CastBatch(work.job, part, recorder.done(stop - first))
+    trace("intersect.end", **about, scans=scans)
     return batch
 
 
-def _summaries(returns: BatchReturns | DeviceReturns) -> NDArray[np.void]:
-    kind = summary_type(samples_of_scan(returns.survey.scan_count))
-    out = np.zeros(len(returns.specs), kind)
-    out["hits"], out["points"] = returns.hits, returns.counts
-    # Sample rays: spread over the points of each scan, their ends in float32.
-    samples = kind["samples"].shape[0]
+def _samples(returns: BatchReturns | DeviceReturns) -> Floats32:
+    """Sample rays: spread over the points of each scan, (scans, samples, 3); NaN if missing."""
+    samples = samples_of_scan(returns.survey.scan_count)
     begins = np.cumsum(returns.counts) - returns.counts
     steps = np.arange(samples) / max(samples - 1, 1)
     last = np.maximum(returns.counts - 1, 0)
     rows = begins[:, None] + np.floor(steps * last[:, None]).astype(np.int64)
     there = (np.arange(samples) < returns.counts[:, None]) & (returns.counts[:, None] > 0)
-    out["samples"] = np.nan
+    out = np.full((len(returns.specs), samples, 3), np.nan, np.float32)
     if len(returns):
-        out["samples"][there] = returns.ends(rows[there])
+        out[there] = returns.ends(rows[there])
     return out

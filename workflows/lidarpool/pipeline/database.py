@@ -1,8 +1,8 @@
-"""The database of a run: which parts and trials, or jobs, belong to the result.
+"""The database of a run: which parts and trials of its jobs belong to the result.
 
 One SQLite file. A batch belongs to the result once its receipt is in here; before that anything may
 be lost or done twice, after that a second receipt is ignored. Recovery and resuming offer all other
-batches again.
+batches again. A job that has ended leaves a row, and its receipts go.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import json
 import re
 import secrets
 import sqlite3
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -26,22 +26,127 @@ from ..columns.parts import part_name
 from ..plan import Trial
 from .messages import Receipt
 
-FORMAT = 7
+FORMAT = 8
 FILE = "run.db"
+JOBS_MOST = 100_000_000
 
 _TABLES = """
 CREATE TABLE meta (name TEXT PRIMARY KEY, value TEXT NOT NULL) WITHOUT ROWID;
 CREATE TABLE parts (
-    first INTEGER PRIMARY KEY, stop INTEGER NOT NULL, rows INTEGER NOT NULL, size INTEGER NOT NULL,
-    hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL
+    job INTEGER, first INTEGER, stop INTEGER NOT NULL, rows INTEGER NOT NULL, size INTEGER NOT NULL,
+    hits INTEGER NOT NULL, cells TEXT NOT NULL, summaries BLOB NOT NULL, PRIMARY KEY (job, first)
 );
-CREATE TABLE trials (trial INTEGER PRIMARY KEY, data TEXT NOT NULL);
+CREATE TABLE trials (
+    job INTEGER, trial INTEGER, data TEXT NOT NULL, PRIMARY KEY (job, trial)
+);
+CREATE TABLE frames (job INTEGER PRIMARY KEY, count INTEGER NOT NULL);
 CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL);
 """
+_DONE, _FAILED = 1, 2  # what became of a job
+_OF_JOBS = ("parts", "trials", "frames")  # tables about jobs under way
+
+
+class JobParts:
+    """What is committed of a job under way; only its `RunDatabase` adds and removes parts.
+
+    `read` reads the summaries of parts, by their first scans.
+    """
+
+    def __init__(
+        self, number: int, scan_count: int, read: Callable[[int, Iterable[int]], list[bytes]]
+    ) -> None:
+        self.number, self.scan_count, self._read = number, scan_count, read
+        self.has_frames = False  # whether scans are handed out as frames, too
+        self.clear()
+
+    def clear(self) -> None:
+        """Forget all of it."""
+        # {first scan: its part}, without summaries
+        self.parts: dict[int, Receipt] = {}
+        self.trials: list[Trial] = []
+        self.committed = np.zeros(self.scan_count, bool)
+        self.scans_done = self.point_count = self.hits = 0
+        self._firsts: list[int] = []  # of the parts, in order
+        self.frames = self.frames_written = 0  # scans handed out as frames, from the first on
+
+    # -- reading -------------------------------------------------------------------------
+
+    @property
+    def complete(self) -> bool:
+        """Whether all scans are committed, and were handed out if there are frames."""
+        framed = not self.has_frames or self.frames == self.scan_count
+        return framed and self.scans_done == self.scan_count
+
+    @property
+    def ordered(self) -> list[Receipt]:
+        """The parts in scan order."""
+        return [self.parts[first] for first in self._firsts]
+
+    @property
+    def cells(self) -> Ints | None:
+        """Lowest and highest cell of all points, (2, 3); None without points."""
+        found = [part.cells for part in self.parts.values() if part.cells]
+        if not found:
+            return None
+        table = np.array(found, np.int64).reshape(-1, 2, 3)
+        return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
+
+    def unframed(self) -> list[Receipt]:
+        """Parts with scans that were not handed out as frames, with summaries, in order."""
+        at = max(0, bisect.bisect_right(self._firsts, self.frames) - 1)
+        parts = [self.parts[first] for first in self._firsts[at:]]
+        return self._with_summaries([part for part in parts if part.stop > self.frames])
+
+    def summaries_of(self, scans: Iterable[int]) -> list[tuple[int, bytes]]:
+        """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
+        firsts = sorted({self.part_of(scan).first for scan in scans})
+        return [*zip(firsts, self._read(self.number, firsts), strict=True)]
+
+    def _with_summaries(self, parts: Sequence[Receipt]) -> list[Receipt]:
+        read = self._read(self.number, [part.first for part in parts])
+        return [replace(part, summaries=data) for part, data in zip(parts, read, strict=True)]
+
+    def part_of(self, scan: int) -> Receipt:
+        """Part of a committed scan; KeyError if it is not committed."""
+        at = bisect.bisect_right(self._firsts, scan) - 1
+        part = self.parts[self._firsts[at]] if at >= 0 else None
+        if part is None or scan >= part.stop:
+            raise KeyError(scan)
+        return part
+
+    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
+        """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
+        absent = np.flatnonzero(~self.committed[first:stop]) + first
+        cuts = np.flatnonzero(np.diff(absent) > 1) + 1
+        return [(int(run[0]), int(run[-1]) + 1) for run in np.split(absent, cuts) if len(run)]
+
+    # -- writing -------------------------------------------------------------------------
+
+    def count_frame(self, scan: int) -> None:
+        """Note that the next scan was handed out as a frame."""
+        self.frames = scan + 1
+
+    def enter(self, part: Receipt) -> None:
+        """Add a part."""
+        self.parts[part.first] = replace(part, summaries=b"", record=None, held_at="")
+        bisect.insort(self._firsts, part.first)
+        self.committed[part.first : part.stop] = True
+        self.scans_done += part.stop - part.first
+        self.point_count += part.rows
+        self.hits += part.hits
+
+    def leave(self, part: Receipt) -> None:
+        """Remove a part."""
+        del self.parts[part.first]
+        self._firsts.remove(part.first)
+        self.committed[part.first : part.stop] = False
+        self.scans_done -= part.stop - part.first
+        self.point_count -= part.rows
+        self.hits -= part.hits
 
 
 class RunDatabase:
-    """Committed parts and trials of one run.
+    """Committed parts and trials of the jobs of a run, and the jobs that have ended.
 
     A file that does not exist is made, and begins with the values `new`. Commits survive a power
     failure if they are `durable`. All methods that write raise LidarpoolError if the disk is full
@@ -51,18 +156,12 @@ class RunDatabase:
     written.
     """
 
-    def __init__(self, path: Path, scan_count: int, *, durable: bool = True, **new: str) -> None:
-        self.path, self.scan_count, self._durable = path, scan_count, durable
+    def __init__(self, path: Path, *, durable: bool = True, **new: str) -> None:
+        self.path, self._durable = path, durable
         self.meta: dict[str, str] = {}
-        self.parts: dict[int, Receipt] = {}  # {first scan: its part}
-        self.trials: list[Trial] = []
-        self.jobs: dict[int, int] = {}  # {number of a job that has ended: whether it failed}
-        self.committed = np.zeros(scan_count, bool)
-        self.scans_done = 0
-        self.point_count = self.hits = 0
-        self._firsts: list[int] = []  # of the parts, in order
-        self._frames_written = 0
-        self.frames = 0  # scans that were handed out as frames, from the first on
+        self.under_way: dict[int, JobParts] = {}  # {number of a job: what is committed of it}
+        self.ended_count = 0
+        self._ended = bytearray()  # of each job: 0, _DONE or _FAILED
         with self._explained():
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
@@ -87,90 +186,68 @@ class RunDatabase:
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (made := self.meta.get("format")) != str(FORMAT):
             raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
-        mark = _checked_place(self.meta)[0]
-        self.frames = self._frames_written = int(self.meta.get("frames", 0))
-        rows = self._sql.execute(
-            "SELECT first, stop, rows, size, hits, cells, "
-            "CASE WHEN stop > ? THEN summaries ELSE x'' END FROM parts ORDER BY first",
-            (self.frames,),
-        )
+        _checked_place(self.meta)
+        for number, failed in self._rows("SELECT number, failed FROM jobs"):
+            self._mark_ended(number, _FAILED if failed else _DONE)
+        self.begun  # noqa: B018 - an error if tables are missing
+
+    def _rows(self, query: str, values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
         # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
-        with closing(rows):
-            for first, stop, count, size, hits, cells, summaries in rows:
-                name, box = part_name(mark, first, stop), tuple(json.loads(cells))
-                self._enter(Receipt(first, stop, name, count, size, hits, box, summaries))
-        trials = self._sql.execute("SELECT data FROM trials ORDER BY trial").fetchall()
-        self.trials = [_trial_of(json.loads(data)) for (data,) in trials]
-        self.jobs = dict(self._sql.execute("SELECT number, failed FROM jobs"))
+        with closing(self._sql.execute(query, values)) as rows:
+            yield from rows
 
     # -- reading -------------------------------------------------------------------------
 
+    def job(self, number: int, scan_count: int) -> JobParts:
+        """Return what is committed of a job that has not ended; kept until it has."""
+        if (found := self.under_way.get(number)) is not None:
+            return found
+        job = JobParts(number, scan_count, self._summaries)
+        query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
+        with self._explained():
+            for first, stop, *counts, cells in self._rows(query, [number]):
+                if not 0 <= first < stop <= scan_count:
+                    raise ValueError(f"a part has scans {first} to {stop} of {scan_count}")
+                name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
+                rows, size, hits = counts
+                job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
+            query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
+            job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, [number])]
+            for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", [number]):
+                job.frames = job.frames_written = int(count)
+        self.under_way[number] = job
+        return job
+
     @property
-    def complete(self) -> bool:
-        """Whether all scans are committed and were handed out."""
-        return self.scans_done == self.scan_count and self.frames == self.scan_count
+    def begun(self) -> list[int]:
+        """Numbers of the jobs that have not ended and of which something is committed."""
+        query = "SELECT DISTINCT job FROM parts UNION SELECT DISTINCT job FROM trials"
+        with self._explained():
+            return sorted(number for (number,) in self._rows(query))
 
     @property
     def used(self) -> bool:
         """Whether anything is committed, or was."""
-        return bool(self.scans_done or self.trials or self.jobs) or "forgot" in self.meta
+        return "forgot" in self.meta or bool(self.ended_count or self.begun)
 
-    @property
-    def ordered(self) -> list[Receipt]:
-        """The parts in scan order."""
-        return [self.parts[first] for first in self._firsts]
+    def ended(self, number: int) -> bool:
+        """Whether a job has ended."""
+        return number < len(self._ended) and self._ended[number] != 0
 
-    @property
-    def cells(self) -> Ints | None:
-        """Lowest and highest cell of all points, (2, 3); None without points."""
-        found = [part.cells for part in self.parts.values() if part.cells]
-        if not found:
-            return None
-        table = np.array(found, np.int64).reshape(-1, 2, 3)
-        return np.stack([table[:, 0].min(axis=0), table[:, 1].max(axis=0)])
-
-    def unframed(self) -> list[Receipt]:
-        """Parts with scans that were not handed out as frames, in order."""
-        at = max(0, bisect.bisect_right(self._firsts, self.frames) - 1)
-        return [p for first in self._firsts[at:] if (p := self.parts[first]).stop > self.frames]
-
-    def forget_summaries(self, part: Receipt) -> None:
-        """Drop the summaries of a part from memory, because all were handed out."""
-        self.parts[part.first] = replace(part, summaries=b"", record=None)
-
-    def summaries_of(self, scans: Sequence[int]) -> list[tuple[int, bytes]]:
-        """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
-        found: dict[int, bytes] = {}
-        with self._explained():
-            for scan in scans:
-                part = self.part_of(scan)
-                if part.first not in found:
-                    query = "SELECT summaries FROM parts WHERE first = ?"
-                    found[part.first] = self._sql.execute(query, (part.first,)).fetchone()[0]
-        return sorted(found.items())
-
-    def part_of(self, scan: int) -> Receipt:
-        """Part of a committed scan; KeyError if it is not committed."""
-        at = bisect.bisect_right(self._firsts, scan) - 1
-        part = self.parts[self._firsts[at]] if at >= 0 else None
-        if part is None or scan >= part.stop:
-            raise KeyError(scan)
-        return part
-
-    def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
-        """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
-        absent = np.flatnonzero(~self.committed[first:stop]) + first
-        cuts = np.flatnonzero(np.diff(absent) > 1) + 1
-        return [(int(run[0]), int(run[-1]) + 1) for run in np.split(absent, cuts) if len(run)]
+    def failed(self) -> Iterator[int]:
+        """Yield the numbers of the jobs that have failed, in order."""
+        return (number for number, state in enumerate(self._ended) if state == _FAILED)
 
     def job_rows(self) -> Iterator[dict[str, Any]]:
         """Yield what was stored of the jobs that have ended, by number; one at a time."""
-        with (
-            self._explained(),
-            closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
-        ):
-            for (data,) in rows:
+        with self._explained():
+            for (data,) in self._rows("SELECT data FROM jobs ORDER BY number"):
                 yield json.loads(data)
+
+    def _summaries(self, number: int, firsts: Iterable[int]) -> list[bytes]:
+        query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
+        with self._explained():
+            return [self._sql.execute(query, (number, f)).fetchone()[0] for f in firsts]
 
     # -- writing -------------------------------------------------------------------------
 
@@ -182,74 +259,88 @@ class RunDatabase:
         self.meta |= values
 
     def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
-        """Commit parts in one transaction; returns those that were new.
+        """Commit parts of jobs under way in one transaction; returns those that were new.
 
         A part with a scan that is committed already is left out.
         """
         new: list[Receipt] = []
-        taken: set[int] = set()
+        taken: dict[int, set[int]] = {}  # {job: scans}
         for receipt in receipts:
-            scans = range(receipt.first, receipt.stop)
-            if not self.committed[receipt.first : receipt.stop].any() and taken.isdisjoint(scans):
+            scans, of_job = range(receipt.first, receipt.stop), taken.setdefault(receipt.job, set())
+            job = self.under_way.get(receipt.job)
+            if job is None or job.committed[receipt.first : receipt.stop].any():
+                continue
+            if of_job.isdisjoint(scans):
                 new.append(receipt)
-                taken.update(scans)
+                of_job.update(scans)
         if new:
+            rows = [
+                (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
+                for p in new
+            ]
             with self._transaction():
-                self._sql.executemany(
-                    "INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?)",
-                    [
-                        (p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
-                        for p in new
-                    ],
-                )
+                self._sql.executemany("INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 self._write_frames()
             for receipt in new:
-                self._enter(receipt)
+                self.under_way[receipt.job].enter(receipt)
         return new
 
-    def drop(self, receipts: Sequence[Receipt]) -> None:
+    def drop(self, number: int, receipts: Sequence[Receipt]) -> None:
         """Remove parts that are missing in storage, so that their scans are offered again."""
         with self._transaction():
             self._sql.executemany(
-                "DELETE FROM parts WHERE first = ?", [(p.first,) for p in receipts]
+                "DELETE FROM parts WHERE job = ? AND first = ?",
+                [(number, part.first) for part in receipts],
             )
         for part in receipts:
-            del self.parts[part.first]
-            self._firsts.remove(part.first)
-            self.committed[part.first : part.stop] = False
-            self.scans_done -= part.stop - part.first
-            self.point_count -= part.rows
-            self.hits -= part.hits
+            self.under_way[number].leave(part)
 
-    def add_trial(self, trial: Trial) -> None:
-        """Store a planning trial."""
+    def add_trials(self, number: int, trials: Sequence[Trial]) -> None:
+        """Store planning trials of a job under way."""
         with self._transaction():
-            self._sql.execute(
-                "INSERT OR IGNORE INTO trials VALUES (?, ?)",
+            self._sql.executemany(
+                "INSERT OR IGNORE INTO trials VALUES (?, ?, ?)",
                 # To the bit: a float is written with the digits that identify it.
-                (trial.trial, json.dumps(vars(trial), default=np.ndarray.tolist)),
+                [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
             )
-        self.trials.append(trial)
+        self.under_way[number].trials += trials
 
     def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
-        """Store which jobs of a campaign have ended or failed, and what is to be known of them."""
+        """Store which jobs have ended or failed, and what is to be known of them; no more is kept.
+
+        A job may have ended before.
+        """
+        ended: dict[int, bool] = {}
         with self._transaction():
             for number, failed, data in jobs:
                 row = (number, failed, json.dumps(data))
                 self._sql.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", row)
-                self.jobs[number] = int(failed)
+                self._delete(number, _OF_JOBS)
+                ended[number] = failed
+        for number, failed in ended.items():
+            self._mark_ended(number, _FAILED if failed else _DONE)
+            self.under_way.pop(number, None)
 
     def forget_jobs(self, numbers: Iterable[int]) -> None:
         """Let some jobs be done again: there are files of them, also if there is nothing else."""
         self.set(forgot="jobs")
+        forgotten = [*numbers]
         with self._transaction():
-            for number in numbers:
+            for number in forgotten:
                 self._sql.execute("DELETE FROM jobs WHERE number = ?", (number,))
-                del self.jobs[number]
+        for number in forgotten:
+            self._mark_ended(number, 0)
+
+    def restart(self, number: int) -> None:
+        """Drop all that is committed of a job that has not ended."""
+        with self._transaction():
+            self._delete(number, _OF_JOBS)
+        if (job := self.under_way.get(number)) is not None:
+            job.clear()
 
     def save_frames(self) -> None:
         """Store how many frames were handed out; each commit does so anyway."""
-        if self.frames != self._frames_written:
+        if any(job.frames != job.frames_written for job in self.under_way.values()):
             with self._transaction():
                 self._write_frames()
 
@@ -262,21 +353,27 @@ class RunDatabase:
         """Close the file."""
         self._sql.close()
 
-    def _enter(self, part: Receipt) -> None:
-        self.parts[part.first] = part
-        bisect.insort(self._firsts, part.first)
-        self.committed[part.first : part.stop] = True
-        self.scans_done += part.stop - part.first
-        self.point_count += part.rows
-        self.hits += part.hits
-
     def _set(self, name: str, value: str) -> None:
         self._sql.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
 
+    def _delete(self, number: int, tables: Iterable[str]) -> None:
+        for table in tables:
+            self._sql.execute(f"DELETE FROM {table} WHERE job = ?", (number,))
+
+    def _mark_ended(self, number: int, state: int) -> None:
+        if not 0 <= number < JOBS_MOST:
+            raise ValueError(f"{number} is not the number of a job")
+        if number >= len(self._ended):
+            self._ended.extend(bytes(number + 1 - len(self._ended)))
+        self.ended_count += bool(state) - bool(self._ended[number])
+        self._ended[number] = state
+
     def _write_frames(self) -> None:
-        if self.frames != self._frames_written:
-            self._set("frames", str(self.frames))
-            self._frames_written = self.frames
+        for job in self.under_way.values():
+            if job.frames != job.frames_written:
+                row = (job.number, job.frames)
+                self._sql.execute("INSERT OR REPLACE INTO frames VALUES (?, ?)", row)
+                job.frames_written = job.frames
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:

@@ -102,7 +102,7 @@ class LongStages:
         self._scans = self._pipe("scans", queue_capacity)
         self._news = self._pipe("news", 64)  # from stages 3 and 4
         self._inbox: list[Message] = []
-        self._outbox: dict[str, list[Sequence[Order]]] = {}  # by pipe
+        self._outbox: dict[str, list[Order]] = {}  # by pipe
         self._looked_at = 0.0
         self._progress = -1  # when something was last committed
         self._deaths: dict[str, list[str]] = {}  # {name: workers that have died since then}
@@ -129,7 +129,8 @@ class LongStages:
         if `scans` are wanted: each request costs driver and scheduler a millisecond.
         """
         pipes = [self._news.name, *([self._scans.name] if scans else [])]
-        puts, self._outbox = self._outbox, {}
+        puts = {name: [orders] for name, orders in self._outbox.items()}
+        self._outbox = {}
         found = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=LINGER_S)
         for items in found.values():
             self._inbox += items
@@ -146,7 +147,7 @@ class LongStages:
         """
         task = self._tasks.get(name)
         if task is not None:
-            self._outbox.setdefault(task.inlet.name, []).append(messages)
+            self._outbox.setdefault(task.inlet.name, []).extend(messages)
 
     def advise(self, scans: int) -> None:
         """Tell stage 1 how many scans an item should have."""

@@ -1,6 +1,7 @@
 """Messages between the four stages and the driver: descriptions, summaries and receipts.
 
-Their size does not depend on the number of points. Each says which `job` of a run it is about.
+Their size does not depend on the number of points. Those about scans say of which `job` of the run,
+by its number.
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from poolpart import TaskRecord
 from ..base.arrays import Floats32
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
+from ..columns.parts import PartColumns
 from ..sensor import Pose
 
 Span = tuple[int, int]  # the first scan of a batch, and its end
@@ -53,31 +55,31 @@ class StageStart:
 class Description:
     """To stage 1: describe the scans of a survey from `first` on."""
 
+    job: int
     survey: bytes  # pickled: if a worker cannot unpickle it, others can be described
     first: int
     scan_count: int
-    job: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class ScanRange:
     """From stage 1: scans `first` to `stop` can be described, and may be cast."""
 
+    job: int
     first: int
     stop: int
-    job: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Summaries:
     """To stage 3, and from it in scan order: the summaries of a committed part."""
 
+    job: int
     first: int
     stop: int
     data: bytes  # of an array of `summary_type`
     framed: int  # scans that had been handed out when it was sent, from the first on
     scan_count: int  # of the survey
-    job: str = ""
 
     @property
     def scans(self) -> range:
@@ -91,8 +93,7 @@ class CollectOrder:
 
     key: str  # of the casting task
     worker: str  # address of the worker that has its result
-    parts: tuple[tuple[Span, str], ...]  # scans and name of each
-    job: str = ""
+    parts: tuple[tuple[int, Span, str], ...]  # job, scans and name of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,13 +101,13 @@ class ColumnsLost:
     """From stage 4: the result of casting task `key` could not be fetched."""
 
     key: str
-    job: str = ""
 
 
 @dataclass(frozen=True, slots=True)
 class Receipt:
     """From stage 4: a part is whole in storage."""
 
+    job: int
     first: int  # of its scans
     stop: int
     name: str  # of the part
@@ -117,15 +118,35 @@ class Receipt:
     summaries: bytes  # of its scans, of `summary_type`
     record: TaskRecord | None = None  # the casting task; None for a receipt from the database
     held_at: str = ""  # worker that holds the part because it does not see the storage; else ""
-    job: str = ""
+
+    @classmethod
+    def of_part(
+        cls,
+        part: PartColumns,
+        job: int,
+        name: str,
+        size: int,
+        record: TaskRecord | None = None,
+        held_at: str = "",
+    ) -> Receipt:
+        """Make the receipt of a part, from what the part itself says."""
+        summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))
+        summaries["hits"], summaries["points"] = part.scan_hits, part.counts
+        summaries["samples"] = part.samples
+        box = () if (cells := part.cells) is None else tuple(cells.ravel().tolist())
+        hits, data = int(part.scan_hits.sum()), summaries.tobytes()
+        return cls(
+            job, part.first, part.stop, name, len(part), size, hits, box, data, record, held_at
+        )
 
 
 @dataclass(frozen=True, slots=True)
 class Failed:
     """From stages 1 and 4: scans of a survey cannot be described, or made a part of."""
 
+    job: int
+    stage: str
     reason: str
-    job: str = ""
 
 
 # To the driver.

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import statistics
 from collections import Counter, deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from enum import Enum
 
 from poolpart import Whereabouts
@@ -50,24 +50,29 @@ def scans_per_batch(seconds: float, scans: int, fit: int, scan_count: int, slots
     return max(1, min(wanted, 2 * scans, most_scans(fit, scan_count, slots)))
 
 
-def batches_per_task(seconds: Sequence[float], scans: int, fit: int) -> int:
-    """Choose how many batches of so many scans a casting task has, from casting times of others.
-
-    All of its batches are in a worker's memory at a time, into which so many scans `fit`.
-    """
+def batches_per_task(seconds: Sequence[float]) -> int:
+    """Choose how many small batches a casting task has, from casting times of others."""
     if not seconds:
         return 1
     typical = max(statistics.median(seconds), 1e-6)
-    most = min(TASK_BATCHES, fit // max(1, scans))
-    return max(1, min(int(TASK_SECONDS / typical), most))
+    return max(1, min(int(TASK_SECONDS / typical), TASK_BATCHES))
+
+
+def weight(batch: Batch, per_task: int) -> float:
+    """How many small batches a batch counts as, where a task has so many.
+
+    All of a task's batches are in a worker's memory at a time: one that takes half of what is there
+    counts as half a task.
+    """
+    return max(1.0, batch.share * per_task)
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
-    """Batches that may be under way, so many in a task."""
+    """Batches that may be under way by their `weight`, so many in a task."""
     return (AHEAD * slots + COLLECTING * collectors + 2) * per_task
 
 
-def room(under_way: int, span: int, most: int) -> int:
+def room(under_way: float, span: int, most: int) -> float:
     """Batches that may be taken; none while the newest is far ahead of the oldest."""
     return 0 if span >= SPAN * most else most - under_way
 
@@ -94,38 +99,36 @@ def was_alone(batch: Batch, stage: str) -> bool:
 
 
 def offers(
-    batches: Sequence[Batch],
-    slots: Mapping[str, int],
-    most: int,
-    per_task: int = 1,
-    beside: Sequence[Batch] = (),
+    batches: Sequence[Batch], slots: Mapping[str, int], most: int, per_task: int = 1
 ) -> list[tuple[list[Batch], str]]:
     """Choose workers for waiting batches, at most so many under way in all.
 
-    The worker with the least work for its slots gets the next task, of up to `per_task` batches;
-    of fewer only if a slot is idle and stage 4 keeps up. A batch with which a worker has died gets
-    a task for itself, or its neighbours would share the blame for the next one. A suspect batch
-    gets a worker for itself, and is waited for: the others must not occupy all workers. `slots`
-    says how many tasks each worker runs at a time; `beside` are batches of other surveys, which
-    are under way on the same workers. For a suspect among those that wait a worker is left alone.
+    The worker with the least work for its slots gets the next task, of up to `per_task` batches of
+    jobs that share a scene; of fewer only if a slot is idle and stage 4 keeps up. A batch with
+    which a worker has died gets a task for itself, or its neighbours would share the blame for the
+    next one. A suspect batch gets a worker for itself, and is waited for: the others must not
+    occupy all workers. Batches that wait are taken in their order. `slots` says how many tasks each
+    worker runs at a time.
     """
-    under_way = [*batches, *(b for b in beside if b.place is not Place.WAITING)]
-    casting = [b for b in under_way if b.place is Place.CASTING]
+    casting = [b for b in batches if b.place is Place.CASTING]
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
-    waiting = deque(b for b in batches if b.place is Place.WAITING)
-    if not any(suspect(b, INTERSECT) for b in waiting):  # else both would wait for each other
-        for _ in range(sum(b.place is Place.WAITING and suspect(b, INTERSECT) for b in beside)):
-            open_ones = slots.keys() - alone
-            alone |= {min(open_ones, key=lambda a: (load[a], a))} if open_ones else set()
-    left = most - sum(b.place in (Place.CAST, Place.COLLECTING) for b in under_way)
-    left -= sum(b.worker in slots for b in casting)
-    backlog = any(b.place is Place.CAST for b in under_way)
+    waiting = [b for b in batches if b.place is Place.WAITING]
+    left = most - sum(weight(b, per_task) for b in casting if b.worker in slots)
+    behind = [b for b in batches if b.place in (Place.CAST, Place.COLLECTING)]
+    left -= sum(weight(b, per_task) for b in behind)
+    backlog = any(b.place is Place.CAST for b in behind)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
     size = per_task if backlog else min(per_task, -(-len(waiting) // max(1, idle)))
+    groups: dict[object, deque[Batch]] = {}  # those that may share a task
+    for batch in waiting:
+        groups.setdefault(_group(batch), deque()).append(batch)
     chosen: list[tuple[list[Batch], str]] = []
-    while waiting:
-        wary = suspect(waiting[0], INTERSECT)
+    passed: set[Batch] = set()
+    for first in waiting:
+        if first in passed:
+            continue
+        wary = suspect(first, INTERSECT)
         fullness = {
             address: load[address] / (1 if wary else AHEAD * count)
             for address, count in slots.items()
@@ -134,14 +137,14 @@ def offers(
         address = min(fullness, key=lambda a: (fullness[a], a), default="")
         if not address or fullness[address] >= 1 or left < 1:
             break
-        blamed = bool(waiting[0].deaths)
+        group = groups[_group(first)]
         busy = backlog or load[address] >= slots[address]
-        if busy and not blamed and min(left, len(waiting)) < per_task:
-            break  # a task that has to wait may become larger
-        task = [waiting.popleft()]
-        while not blamed and waiting and not waiting[0].deaths and len(task) < min(size, left):
-            task.append(waiting.popleft())
-        left -= len(task)
+        if busy and not first.deaths and min(left, _weight(group, per_task)) < per_task:
+            passed.update(group)  # a task that has to wait may become larger
+            continue
+        task = _task(group, min(size, left), per_task)
+        left -= _weight(task, per_task)
+        passed.update(task)
         chosen.append((task, address))
         load[address] += 1
         if wary:
@@ -149,29 +152,45 @@ def offers(
     return chosen
 
 
+def _group(batch: Batch) -> object:
+    """Return what the batches of a task have in common."""
+    if batch.deaths:
+        return batch
+    return batch.job.number if batch.divided else batch.job.scene
+
+
+def _weight(batches: Iterable[Batch], per_task: int) -> float:
+    return sum(weight(batch, per_task) for batch in batches)
+
+
+def _task(group: deque[Batch], most: float, per_task: int) -> list[Batch]:
+    """Take the batches of a task from a group, one at least."""
+    task = [group.popleft()]
+    taken = weight(task[0], per_task)
+    while group and (taken := taken + weight(group[0], per_task)) <= most:
+        task.append(group.popleft())
+    return task
+
+
 def handovers(
-    batches: Sequence[Batch], collectors: Mapping[str, str], beside: Sequence[Batch] = ()
+    batches: Sequence[Batch], collectors: Mapping[str, str]
 ) -> list[tuple[list[Batch], str]]:
     """Choose collectors for batches that were cast, those of a task together.
 
     Those with which a collector has died come alone. A collector on the host of the columns is
     preferred. A suspect batch is collected while there is no other in stage 4: several collectors
-    may share a process. `collectors` has the address of the worker of each; `beside` are batches of
-    other surveys, for whose suspects stage 4 is left to empty.
+    may share a process. `collectors` has the address of the worker of each.
     """
     ready = [b for b in batches if b.place is Place.CAST]
-    busy = [b for b in (*batches, *beside) if b.place is Place.COLLECTING]
+    busy = [b for b in batches if b.place is Place.COLLECTING]
     if suspects := [b for b in ready if suspect(b, COLLECT)]:
         ready = [] if busy else suspects[:1]
-    elif any(b.place is Place.CAST and suspect(b, COLLECT) for b in beside):
-        return []
     if any(suspect(b, COLLECT) for b in busy):
         return []
     load = Counter(name for _, name in {(b.key, b.collector) for b in busy})
-    tasks: dict[tuple[str, int], list[Batch]] = {}
+    tasks: dict[tuple[str, Batch | None], list[Batch]] = {}
     for batch in ready:
-        alone = batch.first if batch.deaths[COLLECT] else -1
-        tasks.setdefault((batch.key, alone), []).append(batch)
+        tasks.setdefault((batch.key, batch if batch.deaths[COLLECT] else None), []).append(batch)
     chosen: list[tuple[list[Batch], str]] = []
     for task in tasks.values():
         free = [name for name in collectors if load[name] < COLLECTING]

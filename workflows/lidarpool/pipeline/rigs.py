@@ -32,7 +32,7 @@ class RigPlan:
     """Description of a rig; its backend is the same on all workers."""
 
     scene: Scene
-    survey: Survey
+    survey: bytes  # pickled: stage 1 gets the same
     backend: str
 
     def packed(self, scene: str) -> bytes:
@@ -40,7 +40,6 @@ class RigPlan:
 
         Workers check their version before they unpickle them.
         """
-        # Sensors and columns of a user's script, including lambdas, are sent by value.
         packed = (scene, self.scene.actors, self.survey, self.backend)
         return cloudpickle.dumps(packed, protocol=5)
 
@@ -100,7 +99,8 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
     if plan is None:
         raise RigMissing(f"This worker has no rig {handle!r}.")
     try:
-        name, actors, survey, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
+        name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
+        survey: Survey = pickle.loads(packed)  # noqa: S301
         _drop_unused(name)
         if (found := _scenes.get(name)) is not None:
             rig = found.rig.with_survey(found.rig.scene.with_actors(actors), survey)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
@@ -27,7 +27,6 @@ from poolpart import (
     telling_departure,
 )
 
-from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.parts import pack
 from ..sensor import Survey
@@ -62,35 +61,43 @@ def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     me.trace("start")
     with suppress(PipeClosed, PipeFailed):
         while True:
-            for one in chain.from_iterable(inlet.get_all()):
-                try:
-                    _describe(me, one, outlet)
-                except ScanError as error:  # others can be described
-                    failed = Failed(f"stage {GENERATE} failed: {error}", one.job)
-                    outlet.put_many([failed], unbounded=True)
-                scans += one.scan_count - one.first
+            items: list[ScanRange | Failed] = []
+            told = time.monotonic()
+            for item in _described(me, chain.from_iterable(inlet.get_all()), outlet):
+                items.append(item)
+                if len(items) == outlet.capacity or time.monotonic() - told > TELL_EVERY_S:
+                    scans += _put(me, outlet, items)
+                    items, told = [], time.monotonic()
+            scans += _put(me, outlet, items)
     return recorder.done(scans)
 
 
-def _describe(me: StageStart, one: Description, outlet: Pipe) -> None:
-    sent = one.first
-    with naming_scans(sent):
-        survey: Survey = pickle.loads(one.survey)  # noqa: S301 - of the run's own driver
-    while sent < survey.scan_count:
-        items: list[ScanRange] = []
-        until = time.monotonic() + TELL_EVERY_S
-        while not items or (
-            sent < survey.scan_count and len(items) < outlet.capacity and time.monotonic() < until
-        ):
-            item = ScanRange(sent, min(sent + outlet.advice, survey.scan_count), one.job)
-            with naming_scans(item.first, item.stop - 1):
-                survey.scan(item.stop - 1)  # raises here if a scan cannot be described
-            me.trace("put", range(item.first, item.stop))
-            items.append(item)
-            sent = item.stop
-        outlet.put_many(items)
-        for item in items:
-            me.trace("sent", range(item.first, item.stop))
+def _put(me: StageStart, outlet: Pipe, items: Sequence[ScanRange | Failed]) -> int:
+    """Send descriptions to the driver; returns of how many scans."""
+    outlet.put_many(items)
+    sent = [range(item.first, item.stop) for item in items if isinstance(item, ScanRange)]
+    for scans in sent:
+        me.trace("sent", scans)
+    return sum(map(len, sent))
+
+
+def _described(
+    me: StageStart, wanted: Iterable[Description], outlet: Pipe
+) -> Iterator[ScanRange | Failed]:
+    for one in wanted:
+        sent = one.first
+        try:
+            with naming_scans(sent):
+                survey: Survey = pickle.loads(one.survey)  # noqa: S301 - of the run's own driver
+            while sent < survey.scan_count:
+                item = ScanRange(one.job, sent, min(sent + outlet.advice, survey.scan_count))
+                with naming_scans(item.first, item.stop - 1):
+                    survey.scan(item.stop - 1)  # raises here if a scan cannot be described
+                me.trace("put", range(item.first, item.stop))
+                yield item
+                sent = item.stop
+        except ScanError as error:  # others can be described
+            yield Failed(one.job, GENERATE, str(error))
 
 
 @telling_departure()
@@ -102,7 +109,7 @@ def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     """
     secede()
     recorder = Recorder(SORT, LIDAR)
-    orders: dict[str, _Order] = {}  # {job: where its survey is}
+    orders: dict[int, _Order] = {}  # {job: where its survey is}
     count = 0
     me.trace("start")
     with suppress(PipeClosed, PipeFailed):
@@ -186,47 +193,29 @@ def _collected(
     """Make the parts of a casting task; gives the messages to the driver."""
     found = fetch_available(own_client(), [order.key], FETCH_PATIENCE_S, at=order.worker)
     if order.key not in found:
-        yield ColumnsLost(order.key, order.job)
+        yield ColumnsLost(order.key)
         return
-    batches: dict[int, CastBatch] = {batch.part.first: batch for batch in found[order.key]}
-    for (first, stop), name in order.parts:
+    batches: dict[tuple[int, int], CastBatch] = {
+        (batch.job, batch.part.first): batch for batch in found[order.key]
+    }
+    for job, (first, stop), name in order.parts:
         me.trace("get", range(first, stop))
         try:
-            yield replace(_stored(me, storage, batches[first], stop, name), job=order.job)
-        except (ScanError, LidarpoolError) as error:
-            # A survey that has failed leaves orders behind, and its folder may be removed.
-            folder_is_gone = isinstance(error.__cause__, FileNotFoundError)
-            if not isinstance(error, ScanError) and not folder_is_gone:
-                raise
-            yield Failed(f"stage {COLLECT} failed: {error}", order.job)
+            yield _stored(me, storage, batches[job, first], name)
+        except ScanError as error:
+            yield Failed(job, COLLECT, str(error))
 
 
-def _stored(
-    me: StageStart, storage: Storage | None, batch: CastBatch, stop: int, name: str
-) -> Receipt:
+def _stored(me: StageStart, storage: Storage | None, batch: CastBatch, name: str) -> Receipt:
     """Make a part of a batch."""
-    first = batch.part.first
-    scans = range(first, stop)
+    first, stop = batch.part.first, batch.part.stop
     with naming_scans(first, stop - 1):
         data = pack(batch.part)
-        cells = batch.part.cells
-    me.trace("part", scans)
-    held_at = ""
+        receipt = Receipt.of_part(batch.part, batch.job, name, len(data), batch.record)
+    me.trace("part", range(first, stop))
     if storage is None:
-        held_at = hold_for_driver(name, data)
-    else:
-        with storing(storage):
-            storage.write(name, data)
-        me.trace("stored", scans)
-    return Receipt(
-        first=first,
-        stop=stop,
-        name=name,
-        rows=len(batch.part),
-        size=len(data),
-        hits=int(batch.summaries["hits"].sum()),
-        cells=() if cells is None else tuple(cells.ravel().tolist()),
-        summaries=batch.summaries.tobytes(),
-        record=batch.record,
-        held_at=held_at,
-    )
+        return replace(receipt, held_at=hold_for_driver(name, data))
+    with storing(storage):
+        storage.write(name, data)
+    me.trace("stored", range(first, stop))
+    return receipt

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
 from enum import Enum
@@ -17,7 +17,7 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
-from .cast import intersect
+from .cast import CastWork, intersect
 from .failures import JobError, error_of, raise_if_failed, sending, was_killed, words_on_memory
 from .messages import Span
 from .names import INTERSECT
@@ -39,6 +39,7 @@ class Outcome(Enum):
     DONE = "done"
     KILLED = "killed"  # its worker died or left
     NO_RIG = "no rig"  # its worker has dropped the scene
+    DIVIDE = "divide"  # it failed by itself, and it is not known which of its jobs is the cause
 
 
 @dataclass(eq=False)
@@ -48,15 +49,16 @@ class _Packed:
     name: str  # on the workers
     pack: Callable[[], bytes]  # makes it, again if it is lost
     data: bytes | Future
-    there: set[str] = field(default_factory=set)  # addresses of workers that have it
+    sent: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
+    there: set[str] = field(default_factory=set)  # of those that have it
 
 
 class CastingWorkers:
-    """The GPU workers that may cast, and their casting tasks, for all surveys of a run.
+    """The GPU workers that may cast, and their casting tasks, for all jobs of a run.
 
     A worker's software is checked before it unpickles anything: a worker with other sources of
     lidarpool, or whose NumPy or ray caster gives other bits, is refused by name and casts nothing.
-    The first tasks of a survey on a worker bring what that worker makes its rig of.
+    The first tasks of a job on a worker bring what that worker makes its rig of.
 
     `run` is the run's id; `software` is that of the workers that may cast, see `base.software`.
     """
@@ -72,8 +74,8 @@ class CastingWorkers:
         self._client, self._partition, self.run = client, partition, run
         self.backend, self._software = backend, dict(software)
         # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
-        self._surveys: dict[str, tuple[_Packed, _Packed]] = {}
-        # Of surveys, and those used last; what packs them keeps what they are known by.
+        self._jobs: dict[int, tuple[_Packed, _Packed]] = {}
+        # Of jobs, and those used last; what packs them keeps what they are known by.
         self._scenes: dict[tuple[int, ...], _Packed] = {}
         self._unneeded: dict[str, list[str]] = {}  # {address: rigs and scenes it may drop}
         self._setups: dict[str, Future] = {}  # {address: task that is checking the worker}
@@ -82,7 +84,7 @@ class CastingWorkers:
         self._checked: dict[str, int] = {}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
         self._count = self._offered = 0
-        self._casts: dict[str, Future] = {}  # {key: casting task}
+        self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: casting task, its jobs}
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
         self.seen = Whereabouts()
@@ -104,42 +106,49 @@ class CastingWorkers:
     def futures(self) -> list[Future]:
         """All tasks."""
         brought = [one.data for one in self._packed_things if isinstance(one.data, Future)]
-        return [*self._casts.values(), *self._setups.values(), *brought]
+        casts = [future for future, _ in self._casts.values()]
+        return [*casts, *self._setups.values(), *brought]
 
     @property
     def _packed_things(self) -> list[_Packed]:
         """What tasks bring."""
-        return [*(rig for rig, _ in self._surveys.values()), *self._scenes.values()]
+        return [*(rig for rig, _ in self._jobs.values()), *self._scenes.values()]
 
     @property
     def pending(self) -> list[str]:
         """Keys of the tasks that have not ended."""
-        casts = [key for key, future in self._casts.items() if future.status == "pending"]
+        casts = [key for key, (future, _) in self._casts.items() if future.status == "pending"]
         return casts + [future.key for future in self._setups.values()]
 
-    # -- surveys ---------------------------------------------------------------------------
+    # -- jobs ------------------------------------------------------------------------------
 
-    def add(self, job: str, plan: RigPlan) -> None:
-        """Let a survey be cast; JobError if it cannot be sent to workers."""
+    def add(self, job: int, plan: RigPlan) -> str:
+        """Let a job be cast; returns the name of its scene, which it may share with others.
+
+        JobError if it cannot be sent to workers.
+        """
         with sending():
             scene = self._scenes.pop(plan.still, None) or self._packed("scene", plan.packed_scene)
             self._scenes[plan.still] = scene  # the last used
-            rig = self._packed(job, partial(plan.packed, scene.name))
-        self._surveys[job] = rig, scene
+            rig = self._packed(str(job), partial(plan.packed, scene.name))
+        self._jobs[job] = rig, scene
+        return scene.name
 
-    def remove(self, job: str) -> None:
-        """Cast nothing more of a survey; its tasks must have been forgotten.
+    def remove(self, job: int) -> None:
+        """Cast nothing more of a job.
 
         With the next task of another, the workers drop its rig, and scenes that were not used last.
         """
-        if (left := self._surveys.pop(job, None)) is None:
+        if (left := self._jobs.pop(job, None)) is None:
             return
-        used = [scene for _, scene in self._surveys.values()]
-        spare = [key for key, scene in self._scenes.items() if scene not in used]
-        old = [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
-        for address in self.slots:
-            names = self._unneeded.setdefault(address, [])
-            names += [packed.name for packed in (left[0], *old)]
+        old = [left[0]]
+        if len(self._scenes) > SPARE_SCENES:
+            used = [scene for _, scene in self._jobs.values()]
+            spare = [key for key, scene in self._scenes.items() if scene not in used]
+            old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
+        for packed in old:
+            for address in packed.sent & self._checked.keys():
+                self._unneeded.setdefault(address, []).append(packed.name)
 
     def _packed(self, what: str, pack: Callable[[], bytes]) -> _Packed:
         data = pack()
@@ -151,36 +160,61 @@ class CastingWorkers:
         self._count += 1
         return share(self._partition, data, key=f"{name}-packed-{self._count}", priority=10)
 
+    def _brought(self, packed: _Packed, worker: str) -> bytes | Future | None:
+        """Return what a task brings to a worker; None if it is there."""
+        if worker in packed.there:
+            return None
+        packed.sent.add(worker)
+        data = packed.data
+        if isinstance(data, Future) and data.status in ("lost", "cancelled", "error"):
+            packed.data = self._shared(packed.name, packed.pack())
+        return packed.data
+
     # -- casting ---------------------------------------------------------------------------
 
-    def cast(self, job: str, spans: Sequence[Span], worker: str) -> str:
-        """Offer batches of a survey to a worker as one task; returns its key."""
+    def cast(self, batches: Iterable[tuple[int, Span]], worker: str) -> str:
+        """Offer batches, each with its job, to a worker as one task; returns its key.
+
+        The jobs must share a scene.
+        """
+        spans: dict[int, list[Span]] = {}
+        for job, span in batches:
+            spans.setdefault(job, []).append(span)
+        first = next(iter(spans))
+        works = [CastWork(job, self._jobs[job][0].name, tuple(of)) for job, of in spans.items()]
+        things = [self._jobs[first][1], *(self._jobs[job][0] for job in spans)]
+        brought = [self._brought(packed, worker) for packed in things]
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
-        rig, scene = self._surveys[job]
         self._offered += 1
-        key = f"{INTERSECT}-{rig.name}-{spans[0][0]}-{spans[-1][1]}.{self._offered}"
-        brought = [None if worker in packed.there else packed.data for packed in (rig, scene)]
+        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._offered}"
         unneeded = self._unneeded.pop(worker, [])
-        self._casts[key] = self._partition.submit(
-            intersect, rig.name, spans, unneeded, *brought, key=key, workers=worker
+        future = self._partition.submit(
+            intersect, works, unneeded, *brought, key=key, workers=worker
         )
+        self._casts[key] = future, [*spans]
         return key
 
-    def outcome(self, job: str, key: str, worker: str) -> Outcome:
-        """State of a casting task; JobError if it has failed."""
-        future = self._casts[key]
-        if future.status == "finished":
-            for packed in self._surveys[job]:
-                packed.there.add(worker)
+    def outcome(self, key: str, worker: str) -> Outcome:
+        """State of a casting task; JobError if it has failed, and is of one job."""
+        future, jobs = self._casts[key]
+        status = future.status
+        if status == "pending":
+            return Outcome.PENDING
+        packed = {thing for job in jobs for thing in self._jobs.get(job, ())}
+        if status == "finished":
+            for one in packed:
+                one.there.add(worker)
             return Outcome.DONE
         error = error_of(future)
         if isinstance(error, RigMissing):
-            for packed in self._surveys[job]:
-                packed.there.discard(worker)
+            for one in packed:
+                one.there.discard(worker)
             return Outcome.NO_RIG
         if was_killed(future):
             return Outcome.KILLED
+        if status == "error" and len(jobs) > 1:
+            return Outcome.DIVIDE
         what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
         try:  # the error names the scans
             raise_if_failed(future, what)
@@ -192,8 +226,8 @@ class CastingWorkers:
 
     def forget(self, key: str) -> None:
         """Cancel a casting task, or drop its result."""
-        if (future := self._casts.pop(key, None)) is not None:
-            future.release()
+        if (cast := self._casts.pop(key, None)) is not None:
+            cast[0].release()
 
     def words_on_memory(self, worker: str) -> str:
         """Clause for a message about a dead worker, if a nanny ended it for its memory."""
@@ -229,10 +263,6 @@ class CastingWorkers:
                 self._take(address, future)
             elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
-        for packed in self._packed_things:
-            data = packed.data
-            if isinstance(data, Future) and data.status in ("lost", "cancelled", "error"):
-                packed.data = self._shared(packed.name, packed.pack())
 
     def want(self, slots: int) -> None:
         """Want so many slots of a partition that grows with its work; 0 when there is no more.
@@ -243,7 +273,7 @@ class CastingWorkers:
             self._wanted = slots
             self._adapts = self._partition.want(slots)
         if not slots:  # what workers have for tasks would keep these workers
-            self._surveys.clear()
+            self._jobs.clear()
             self._scenes.clear()
 
     def release(self) -> None:
