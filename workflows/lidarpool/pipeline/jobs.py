@@ -53,6 +53,10 @@ class JobState:
     condemned: list[str] = field(default_factory=list)  # why scans cannot be done
     sorted_at: float = field(default_factory=time.monotonic)  # when the last frames came
 
+    def __post_init__(self) -> None:
+        if not self.left:  # stage 1 need not describe what is committed
+            self.generated = self.survey.scan_count
+
     @property
     def complete(self) -> bool:
         """Whether all is committed, and was handed out if there are frames."""
