@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import fields
 
 from ..base.errors import LidarpoolError
 from ..base.fingerprint import fingerprint
 from ..base.software import software
 from ..pipeline import JobError
-from ..scenario.job import Job
+from ..scenario.sections import TaskOptions
+from .job import Job
 
-_OF_JOB = ("scene", "survey", "planning")  # what a result depends on, with all of its own fields
+# Fields of a job that do not change a result: a run may go on with others. Every other field is
+# part of its identity, with all of its own fields.
+_OWN = {"values", "number", "name", "split", "outputs", "made_of", "notes"}
+_MAY_CHANGE = {*TaskOptions.__dataclass_fields__, "wait_s", "patience_s", *_OWN}
 OF_CAMPAIGN = "campaign: "  # before names of the content of a campaign
 
 
@@ -21,8 +26,9 @@ def identity_of(job: Job) -> dict[str, str]:
 
     JobError if a sensor, column or trajectory has a field without a fingerprint.
     """
+    names = [field.name for field in fields(job) if field.name not in _MAY_CHANGE]
     try:
-        return software() | {name: fingerprint(getattr(job, name)) for name in _OF_JOB}
+        return software() | {name: fingerprint(getattr(job, name)) for name in names}
     except LidarpoolError as error:
         raise JobError(str(error)) from error
 
@@ -31,7 +37,7 @@ def difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
     """Describe the difference of an earlier run in a clause; empty if there is none."""
     for name, value in here.items():
         if there.get(name) != value:
-            if name in _OF_JOB:
+            if name in Job.__dataclass_fields__:
                 return f"it is of another {name}"
             if name.startswith(OF_CAMPAIGN):
                 return f"it is of another campaign: its {name.removeprefix(OF_CAMPAIGN)} differs"
