@@ -11,7 +11,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.pages import ask
 
-from lidarpool import Campaign, CampaignJob, Scene, Sensor, Survey
+from lidarpool import Campaign, Job, Scene, Sensor, Survey
 from lidarpool.export.jobs import JobRow
 from lidarpool.live.live_page import ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST, live_page
 from lidarpool.report.campaign_output import Making, make_dataset
@@ -29,7 +29,7 @@ def make(number, rng):
     if number == 2:
         raise ValueError("no such wall")
     survey = Survey(Sensor.grid(), poses=[(0, 0, height)], steps=4)
-    return CampaignJob(SCENE, survey, values={"height": height, "side": "left"})
+    return Job(SCENE, survey, values={"height": height, "side": "left"})
 
 
 def progress(done, count, seconds):
