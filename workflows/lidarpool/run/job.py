@@ -8,9 +8,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ..base.arguments import checked_fields
 from ..base.declared import declared
 from ..base.errors import LidarpoolError, Mistakes
+from ..base.validation import checked_fields
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..plan import Planning
 from ..scenario.scenario import KeptScenes, Scenario

@@ -18,10 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arguments import checked
 from ..base.arrays import Floats32, Ints
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
+from ..base.validation import checked
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, mark_name, own_files, read_part, read_tally, unpack
 from ..export.sweeps import Sweeps

@@ -16,10 +16,10 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import Field, ValidationError
 
-from ..base.arguments import checked, checked_fields, shown
 from ..base.declared import Seed, declared
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
+from ..base.validation import checked, checked_fields, shown, validation_errors
 from ..base.words import counted
 from ..base.yamlfile import read_yaml
 from ..scene.scene import Scene
@@ -29,7 +29,6 @@ from .draws import Draw
 from .paths import FieldPath, find_field, held, opened, put
 from .scenario import Scenario
 from .tables import Row, read_rows
-from .validation_errors import validation_errors
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")

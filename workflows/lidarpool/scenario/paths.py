@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from ..base.errors import LidarpoolError
+from ..base.validation import dotted, sections_in
 from ..base.words import counted, did_you_mean
 from .scenario import Scenario
-from .validation_errors import dotted, models_in
 
 
 @dataclass(frozen=True)
@@ -56,7 +56,7 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
     key: str | int
     while rest:
         at = ".".join(text.split(".")[: -len(rest)])
-        if node is None and not rest[0].isdecimal() and (sections := list(models_in(kind))):
+        if node is None and not rest[0].isdecimal() and (sections := list(sections_in(kind))):
             node = sections[0].model_construct()  # its defaults
             steps[-1] = (steps[-1][0], node)
         if isinstance(node, BaseModel):

@@ -19,6 +19,7 @@ from pydantic import PrivateAttr, Strict, ValidationError
 from ..base.arrays import Floats
 from ..base.declared import Text, declared, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
+from ..base.validation import validation_errors
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS, VELOCITY
@@ -63,7 +64,6 @@ from .sections import (
 )
 from .standing import Standing
 from .traffic import TrafficSection, VehicleSection, actors_of, read_fcd
-from .validation_errors import validation_errors
 
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2

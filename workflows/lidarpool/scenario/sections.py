@@ -9,7 +9,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
-from ..base.arguments import shown
 from ..base.declared import (
     Angle,
     Coordinate,
@@ -19,6 +18,7 @@ from ..base.declared import (
     Triple,
     declared,
     is_text,
+    must_be,
     short,
     told,
 )
@@ -151,9 +151,9 @@ def _pose(value: Any) -> Any:
     if isinstance(value, list):
         return {"position": value}
     if not isinstance(value, (dict, PoseSection)):
-        raise ValueError(
-            f"a pose is x, y and z in metres, [0, 0, 1], or position and angles, {{position: "
-            f"[0, 0, 1], yaw_deg: 90}}; given is {shown(value)}."
+        raise must_be(
+            "x, y and z in metres, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
+            "yaw_deg: 90}"
         )
     return value
 

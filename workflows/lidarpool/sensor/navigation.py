@@ -22,10 +22,10 @@ from typing import Annotated, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, Strict
 
-from ..base.arguments import checked_fields
 from ..base.arrays import Floats, Ints
-from ..base.declared import Seed, told, written_as
+from ..base.declared import Seed, told
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from .noise import Purpose, named_seed, normal
 from .trajectory import CENTRE, Pose, Trajectory, velocities
 
@@ -109,24 +109,13 @@ class Gnss:
     drift_vertical_m: Annotated[Deviation, told("the same, up")] = 0.0
     drift_time_s: Annotated[Correlation, told("correlation time of the drift")] = 600.0
     origin: Annotated[
-        tuple[float, float, float] | None,
-        written_as(Place | None),
+        Place | None,
         told(
             "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
             "world's zero, x to the east and y to the north; by default by cloud.epsg",
             [48.7758, 9.1829, 290.0],
         ),
     ] = None
-
-    def __post_init__(self) -> None:
-        given = self.origin
-        if given is not None and not (
-            len(given) == 3 and np.isfinite(given).all() and abs(given[0]) <= 90
-        ):
-            raise LidarpoolError(
-                f"origin is {given}; it must be latitude and longitude, degrees, and height, "
-                "metres: (48.8, 9.2, 290)."
-            )
 
 
 @dataclass(frozen=True)
