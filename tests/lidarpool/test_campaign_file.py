@@ -274,7 +274,7 @@ def test_a_section_that_the_base_lacks_is_made(campaign, folder):
     })  # fmt: skip
     made = found.describe(0).scenario
     assert (made.mount.position, made.scene.ground.height_m) == ((0, 0, 3.5), -1)
-    assert made.poses[0].pose().yaw_deg == 90
+    assert made.poses[0].yaw_deg == 90
 
 
 def test_a_mesh_file_may_be_the_base(campaign):

@@ -30,6 +30,7 @@ from pydantic import (
     AfterValidator,
     BaseModel,
     ConfigDict,
+    GetCoreSchemaHandler,
     GetPydanticSchema,
     Strict,
     TypeAdapter,
@@ -114,6 +115,8 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 def checked_fields(cls: C) -> C:
     """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
+    In a section of a file it is a section itself, of the same fields.
+
     Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
     """
     after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
@@ -123,7 +126,24 @@ def checked_fields(cls: C) -> C:
         after(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
+    cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
+    cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
     return cls
+
+
+def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    """Make a dataclass a section of files: of its fields as a mapping, or an instance."""
+    schema = handler(source)
+    own: Any = handler.resolve_ref_schema(schema)
+    own["strict"] = False  # strict ones take only instances
+
+    def made(value: Any, inner: Callable[[Any], Any]) -> Any:
+        try:
+            return inner(value)
+        except LidarpoolError as error:  # of `__post_init__`
+            raise ValueError(str(error)) from error
+
+    return core_schema.no_info_wrap_validator_function(made, schema)
 
 
 def _check(thing: Any, given: Mapping[str, Any]) -> None:
@@ -257,7 +277,7 @@ def _sentence(
     if kind == "value_error":
         message = str(details[0]["ctx"]["error"])
         return f"{at}: {message}" if at else message
-    if kind in ("extra_forbidden", "invalid_key"):
+    if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
         *section, name = place
         known = [*_within(_followed(section, fields)[1], fields)]
         if (other := _ALIKE.get(str(name), "")) in known:
@@ -344,13 +364,30 @@ def _is_union(hint: Any) -> bool:
 
 def fields_of(section: Any) -> Fields:
     """Fields of a section by their names in a file."""
-    found: Fields = section.model_fields
-    return {field.alias or name: field for name, field in found.items()}
+    return {field.alias or name: field for name, field in _declared(section).items()}
+
+
+def attributes_of(section: Any) -> Mapping[str, str]:
+    """Attributes of a section by their names in a file."""
+    return {field.alias or name: name for name, field in _declared(section).items()}
+
+
+@cache
+def _declared(section: Any) -> Fields:
+    if issubclass(section, BaseModel):
+        return section.model_fields
+    hints, made = get_type_hints(section, include_extras=True), FieldInfo.from_annotated_attribute
+    return {one.name: made(hints[one.name], one) for one in dataclass_fields(section)}
+
+
+def is_section(kind: Any) -> bool:
+    """Whether a class is a section of files: a model, or a dataclass with `checked_fields`."""
+    return issubclass(kind, BaseModel) or hasattr(kind, "__pydantic_config__")
 
 
 def sections_in(annotation: Any) -> Iterator[Any]:
     """Sections in an annotation, such as `tuple[Section, ...] | None`."""
-    return (kind for kind in classes_in(annotation) if issubclass(kind, BaseModel))
+    return filter(is_section, classes_in(annotation))
 
 
 def classes_in(annotation: Any) -> Iterator[type]:

@@ -16,7 +16,7 @@ from typing import Annotated, Any, Protocol
 import numpy as np
 from pydantic import Field, ValidationError
 
-from ..base.declared import Seed, declared
+from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
 from ..base.validation import checked, checked_fields, shown, validation_errors
@@ -168,7 +168,7 @@ class Campaign:
         assert head.count is not None, "known by now"
         self.count, self.seed, self.license = head.count, head.seed, head.license
         self.title, self.splits = head.title, dict(head.splits)
-        self.keep, self.files = Keep(**declared(head.keep, Keep)), jobs.files
+        self.keep, self.files = head.keep, jobs.files
         self._jobs, self._split = jobs, Splits(head.splits, head.seed)
 
     @classmethod
@@ -301,7 +301,6 @@ def _valid(data: Mapping[str, Any], source: str) -> CampaignSection:
 def _head(**given: Any) -> CampaignSection:
     """Check the fields that Python gives."""
     keep = given.pop("keep")
-    keep = declared(keep, Keep) if isinstance(keep, Keep) else keep
     keep = dict(keep) if isinstance(keep, Mapping) else keep
     return _valid({"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}, "")
 

@@ -257,16 +257,12 @@ class Keep:
         return () if self.format == "folder" else FORMATS[self.format].needed(self.layout)
 
 
-class KeepSection(Section, Keep):
-    """The format of the data set; in YAML also just its name."""
-
-
 KeepEntry = Annotated[
-    KeepSection,
+    Keep,
     short(
         lambda v: v is None or is_text(v),
         lambda v: {"format": v} if v else {},
-        Text | KeepSection | None,
+        Text | Keep | None,
     ),
 ]
 
@@ -300,7 +296,7 @@ class CampaignSection(Section):
             {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
-    keep: Annotated[KeepEntry, told("format of the data set")] = KeepSection()
+    keep: Annotated[KeepEntry, told("format of the data set")] = Keep()
     splits: Annotated[
         dict[str, Share],
         may_be_empty(dict[str, Share]),

@@ -36,19 +36,17 @@ from ..scene.robot import Robot
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from ..scene.urdf import load_robot
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
+from ..sensor import Material, Mounted, Navigation, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
-from ..sensor.survey import SENSORS_MOST, Steps
+from ..sensor.survey import SENSORS_MOST, CloudOptions, Steps
 from ..sensor.trajectory import CENTRE
+from ..sensor.weather import Weather
 from .copies import copies_of
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .placing import Placing, inside_note, place
 from .sections import (
-    CloudSection,
     CopiesSection,
-    MaterialSection,
     MeshFile,
-    NavigationSection,
     NoiseSection,
     OutputSection,
     PlanningSection,
@@ -58,7 +56,6 @@ from .sections import (
     SceneSection,
     Section,
     SensorSection,
-    WeatherSection,
     may_be_empty,
     scene_in_short,
 )
@@ -205,7 +202,7 @@ class Scenario(Section):
         ),
     ] = None
     materials: Annotated[
-        tuple[MaterialSection, ...],
+        tuple[Material, ...],
         Strict(False),
         told(
             "materials of objects, by name; the last entry for an object counts",
@@ -215,15 +212,15 @@ class Scenario(Section):
     ] = ()
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
-    weather: Annotated[WeatherSection, may_be_empty(WeatherSection)] = WeatherSection()
+    weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
     navigation: Annotated[
-        NavigationSection | None,
+        Navigation | None,
         told(
             "IMU and GNSS receiver of the carrier, with errors that drift",
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
         ),
     ] = None
-    cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
+    cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
@@ -685,10 +682,7 @@ class Scenario(Section):
 
     def _materials(self, scene: Scene) -> list[Material]:
         """Materials by name, with the classes of actors and copies, and of city objects."""
-        made = []
-        for number, given in enumerate(self.materials):
-            with prefixed(f"materials[{number}]"):
-                made.append(Material(**dict(given)))
+        made = [*self.materials]
         placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
         own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
         for entry in placed:
@@ -735,7 +729,9 @@ class Scenario(Section):
                     replace(pose, position=tuple(np.subtract(pose.position, scene.origin)))
                     for pose in self._world_poses(scene)
                 ]
-            cloud = dict(self.cloud) | {"columns": (*self.cloud.columns, *self.output.needs)}
+            cloud = declared(self.cloud, CloudOptions) | {
+                "columns": (*self.cloud.columns, *self.output.needs)
+            }
             cloud["epsg"] = self.cloud.epsg or self._epsg
             if self.scene.has_seed and cloud["keep_every"] is None:
                 cloud["keep_every"] = 1 if "ray" in self.output.needs else SEED_KEPT
@@ -750,8 +746,8 @@ class Scenario(Section):
                 materials=self._materials(scene),
                 returns=Returns(**dict(self.returns)),
                 noise=Noise() if own_noise else Noise(**dict(self.noise)),
-                navigation=self.navigation and self.navigation.navigation(),
-                **dict(self.weather),
+                navigation=self.navigation,
+                **declared(self.weather, Weather),
                 **cloud,
             )
 
@@ -834,7 +830,7 @@ class Scenario(Section):
 
     def _world_poses(self, scene: Scene) -> tuple[Pose, ...]:
         if self.poses is not None:
-            return tuple(pose.pose() for pose in self.poses)
+            return self.poses
         return SEED_POSES if self.scene.has_seed else self.placing(scene).poses
 
     def placing(self, scene: Scene) -> Placing:

@@ -27,7 +27,7 @@ from ..base.declared import Seed, told
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .noise import Purpose, named_seed, normal
-from .trajectory import CENTRE, Pose, Trajectory, velocities
+from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, velocities
 
 BLOCK = 1 << 14  # samples that are made at a time
 
@@ -59,7 +59,7 @@ class Imu:
     rate_hz: Annotated[
         float, told("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
     ] = 200.0
-    mount: Pose = CENTRE
+    mount: Annotated[Pose, AT_CENTRE, told("its pose in the carrier's axes")] = CENTRE
     gyroscope_noise_density: Annotated[TurnNoise, told("angle random walk, rad/s/sqrt(Hz)")] = 0.0
     gyroscope_bias: Annotated[
         TurnNoise,
@@ -94,7 +94,7 @@ class Gnss:
     """
 
     rate_hz: Annotated[float, told("positions a second", ge=0.0001, le=1000)] = 10.0
-    mount: Pose = CENTRE
+    mount: Annotated[Pose, AT_CENTRE, told("pose of its antenna in the carrier's axes")] = CENTRE
     horizontal_m: Annotated[
         Deviation, told("standard deviation of white noise to the east and north")
     ] = 0.0
@@ -134,8 +134,21 @@ class Navigation:
         If a number is outside its range.
     """
 
-    imu: Imu | None = None
-    gnss: Gnss | None = None
+    imu: Annotated[
+        Imu | None,
+        told(
+            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
+            "/imu/data_raw",
+            {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
+        ),
+    ] = None
+    gnss: Annotated[
+        Gnss | None,
+        told(
+            "GNSS receiver: positions in gnss.csv, /gnss/fix",
+            {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
+        ),
+    ] = None
     gravity_m_s2: Annotated[
         float, told("gravity, downwards along the world's z axis", ge=-100, le=100)
     ] = 9.80665

@@ -113,6 +113,7 @@ class ScanSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+@checked_fields
 class CloudOptions:
     """Which hits become points, and their columns.
 

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices
-from ..base.declared import Angle, Triple, told, written_as
+from ..base.declared import Angle, Triple, short, told, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked_fields, shown
 from .spline import knots_of, on_curve
@@ -106,6 +106,19 @@ def pose_of(name: str, given: Any) -> Pose:
 
 
 CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a carrier
+
+
+@dataclass(frozen=True)
+class InstrumentPose(Pose):
+    """Position and angles of an instrument in the carrier's axes, as a file has them."""
+
+    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
+
+
+# A pose in a file whose position may be left out.
+AT_CENTRE = short(
+    lambda v: isinstance(v, dict), lambda v: {"position": [0] * 3} | v, InstrumentPose
+)
 
 
 class Trajectory(Protocol):
