@@ -12,10 +12,10 @@ import numpy as np
 from pydantic import Field
 
 from .._version import __version__
-from ..base.arguments import checked
 from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..base.errors import LidarpoolError, explained
 from ..base.open3d_module import load_open3d
+from ..base.validation import checked
 from ..base.words import counted
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
