@@ -1,4 +1,4 @@
-"""The commands that help to write a scenario: `lidarpool init` and `lidarpool schema`."""
+"""The commands that help to write a scenario: `lidarpool init`, `import` and `schema`."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import UNITS_M
+from ..base.words import counted
 
 
 @click.command()
@@ -93,6 +94,44 @@ def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> d
         )
     said = {"file": Path(os.path.relpath(path, folder)).as_posix()}
     return said | {k: v for k, v in (("unit", unit), ("up_axis", up_axis)) if v}
+
+
+@click.command(name="import")
+@click.argument("survey", metavar="SURVEY.xml", type=click.Path(path_type=Path))
+@click.option(
+    "--assets",
+    metavar="DIR",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    multiple=True,
+    help="Folder where references in the survey start; may be given several times.  "
+    "[default: the survey's, and those above it]",
+)
+@click.option(
+    "--out",
+    "-o",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder for the scenario.  [default: named after the survey]",
+)
+def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
+    """Write a HELIOS++ survey as a scenario.
+
+    Unsupported features are listed, one line each. Mesh files stay where they are.
+
+    \b
+    Examples:
+      lidarpool import helios/data/surveys/toyblocks/als_toyblocks.xml
+      lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
+    """  # noqa: D301 - click wants the character, not its name
+    from ..importers.helios import import_survey
+
+    made = import_survey(survey, out or Path(survey.stem), assets)
+    sensors, files = len(made.scenario.sensors), len(made.scenario.scene.files)
+    name = click.format_filename(made.path)
+    click.echo(f"{name}: {counted(sensors, 'sensor')}, {counted(files, 'mesh file')}")
+    for line in made.left_out:
+        click.echo(f"not supported: {line}")
+    click.echo(f"next: lidarpool check {shlex.quote(str(made.path))}")
 
 
 @click.command()
