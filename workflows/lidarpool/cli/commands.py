@@ -26,10 +26,9 @@ from ..base.interrupts import (
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import counted
 from . import options
-from .check_command import check
 from .logs import set_logs
 from .result_commands import compare, export, plot, view
-from .scenario_commands import import_, init, schema
+from .scenario_commands import check, import_, init, schema
 from .scene_commands import scene
 from .sensor_commands import sensors, stations
 
