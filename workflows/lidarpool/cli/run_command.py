@@ -40,7 +40,6 @@ from ..scenario.sections import PoolSection
 from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
-from .worker_logs import WorkerLogs
 
 
 @dataclass(frozen=True)
@@ -229,7 +228,7 @@ def _with_status(
             client = stack.enter_context(cluster)
             if options.here:  # its workers share the terminal
                 set_logs(options.verbose)
-                client.register_plugin(WorkerLogs(options.verbose))
+                client.register_worker_callbacks(partial(set_logs, options.verbose))
         yield client
 
 
