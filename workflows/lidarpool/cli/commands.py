@@ -61,10 +61,8 @@ _shown = options.together(
 )
 
 
-def _seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
+def _seconds(text: str) -> float:
     """Parse a time such as 90, 90s, 10m or 2h."""
-    if text is None:
-        return None
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
@@ -116,7 +114,7 @@ def demo(**given: Any) -> None:
 @click.option(
     "--wait",
     "wait_s",
-    callback=_seconds,
+    type=_seconds,
     metavar="TIME",
     help="How long to wait at the start for the scheduler and for empty partitions, such as 90s "
     f"or 10m; by default {WAIT_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
@@ -124,7 +122,7 @@ def demo(**given: Any) -> None:
 @click.option(
     "--patience",
     "patience_s",
-    callback=_seconds,
+    type=_seconds,
     metavar="TIME",
     help="How long to wait for partitions that become empty later; by default "
     f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
