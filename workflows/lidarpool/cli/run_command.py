@@ -48,7 +48,6 @@ from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
-from .worker_logs import WorkerLogs
 
 
 @dataclass(frozen=True)
