@@ -270,9 +270,13 @@ class Page:
         """
         advice = "choose a folder that exists, can be written to and has room"
         with explained(f"The picture {path} could not be written", advice):
-            image = io.BytesIO()
-            self.figure.savefig(image, dpi=DPI, format=path.suffix[1:] or "png")
-            Storage.at(path.parent, durable=False).write(path.name, image.getvalue())
+            Storage.at(path.parent, durable=False).write(path.name, self.png())
+
+    def png(self) -> bytes:
+        """Return the page as a PNG, in its light colours."""
+        image = io.BytesIO()
+        self.figure.savefig(image, dpi=DPI, format="png")
+        return image.getvalue()
 
     def svg(self) -> str:
         """Return the page as an element of HTML, whose ink may follow the style around it.

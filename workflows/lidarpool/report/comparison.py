@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -22,7 +22,6 @@ from ..columns.parts import StoredCloud
 from ..export.folder import result_folder, staging
 from ..export.recordings import Recording, Turn, open_recording
 from ..sensor.noise import Purpose, uniform
-from .page.words import millimetres, ratio
 from .range_image import RangeImages, paired_images, range_images
 from .ranks import rank_correlation
 
@@ -47,7 +46,9 @@ class Comparison:
     above: tuple[Above, Above]  # of one pair of sweeps, or of all
 
     def __repr__(self) -> str:
-        return "\n".join(table(self.figures))
+        from .page.page import rendered
+
+        return rendered("comparison.txt", report=self.figures).rstrip("\n")
 
     @checked
     def save(self, folder: str | Path) -> list[Path]:
@@ -395,43 +396,3 @@ def _distances(values: Floats) -> dict[str, Any]:
         "mean_m": float(values.mean()),
         **dict(zip(shares, quantiles, strict=True)),
     }
-
-
-def table(figures: dict[str, Any]) -> Iterator[str]:
-    """Lines of a comparison for a terminal."""
-    for name in "ab":
-        one = figures[name]
-        sweeps = f", {counted(one['sweeps'], 'sweep')}" if figures["pairs"] else ""
-        told = " (the reference)" if name == "b" else ""
-        yield f"{name.upper():<9}{one['name']}: {counted(one['points'], 'point')}{sweeps}{told}"
-    image, light, far = figures["range_image"], figures["intensity"], figures["distances"]
-    if image is not None:
-        told, by = image["residual"], image["paired_by"]
-        yield (
-            f"ranges   A - B in {told['cells']:,} {by} of {len(image['rings'])} rings x "
-            f"{image['columns']:,} columns of {image['azimuth_step_deg']:.4g} deg: "
-            f"bias {millimetres(told['bias_m'])}, median {millimetres(told['median_m'])}, MAD "
-            f"{millimetres(told['mad_m'])}, RMSE {millimetres(told['rmse_m'])}"
-        )
-        if (lost := image["no_return"]) is not None:
-            yield (
-                f"no return {lost['in_both']:,} {by} in both, {lost['in_a_only']:,} in A only, "
-                f"{lost['in_b_only']:,} in B only: precision {ratio(lost['precision'])}, recall "
-                f"{ratio(lost['recall'])}, F1 {ratio(lost['f1'])}"
-            )
-    if light is not None:
-        yield (
-            f"intensity rank correlation {light['rank_correlation']:.3f} of "
-            f"{light['pairs']:,} {light['of']}"
-        )
-    for name, words in (("a_to_b", "A to B"), ("b_to_a", "B to A")):
-        told = far[name]
-        yield (
-            f"{words:<9}mean {millimetres(told['mean_m'])}, median "
-            f"{millimetres(told['median_m'])}, 95 % {millimetres(told['p95_m'])}, farthest "
-            f"{millimetres(told['max_m'])}"
-        )
-    scores = ", ".join(f"{one['f1']:.3f} at {one['distance_m']:g} m" for one in far["f_scores"])
-    yield f"F-score  {scores}; Chamfer distance {millimetres(far['chamfer_m'])}"
-    for note in figures["notes"]:
-        yield f"note: {note}"

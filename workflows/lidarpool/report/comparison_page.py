@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.lines import Line2D
@@ -16,9 +14,9 @@ from ..base.arrays import AnyArray
 from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..render import theme
-from ..render.page import FONT, Page, shortened
-from .page.page import environment
-from .page.words import MINUS, millimetres, ratio
+from ..render.page import FONT, Page
+from .page.page import rendered
+from .page.words import millimetres
 
 if TYPE_CHECKING:
     from .comparison import Comparison
@@ -37,80 +35,15 @@ CLOSEST_M = 0.001  # end of the scale of distances
 
 def write_comparison(folder: Path, found: Comparison) -> list[str]:
     """Write compare.html and the pictures as PNG into a folder; return their names."""
-    drawn, names = [], ["compare.html"]
-    for name, page, caption in _pictures(found):
-        names.append(f"compare-{name}.png")
-        page.save(folder / names[-1])
-        drawn.append((Markup(page.svg()), caption))
-    figures = found.figures
-    text = (
-        environment()
-        .get_template("comparison.html")
-        .render(
-            report=figures,
-            title=f"{_short(figures, 'a')} and {_short(figures, 'b')}",
-            begun="",
-            summary=_summary(figures),
-            facts=list(_facts(figures)),
-            pictures=drawn,
-            length=_length,
-            ratio=ratio,
-        )
-    )
-    (folder / names[0]).write_text(text, encoding="utf-8")
-    return names
-
-
-def _short(figures: dict[str, Any], which: str) -> str:
-    return shortened(figures[which]["name"].rstrip("/").rpartition("/")[2], 40)
-
-
-def _length(value: float | None) -> str:
-    return millimetres(value).replace("-", MINUS)
-
-
-def _summary(figures: dict[str, Any]) -> str:
-    pairs = counted(figures["pairs"], "pair") + " of sweeps" if figures["pairs"] else "All points"
-    text = f"{pairs} compared: A is {figures['a']['name']}, B {figures['b']['name']}, the reference"
-    return f"{text}. Residuals are A minus B."
-
-
-def _facts(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Return the numbers for the head of the page, and what each is."""
-    image, light, far = figures["range_image"], figures["intensity"], figures["distances"]
-    if image is not None:
-        told = image["residual"]
-        yield _length(told["median_m"]), "median of range residuals"
-        yield millimetres(told["mad_m"]), "their median absolute deviation"
-        if image["no_return"] is not None:
-            yield ratio(image["no_return"]["f1"]), "F1 of cells without a return"
-    if light is not None:
-        yield f"{light['rank_correlation']:.3f}", "rank correlation of intensity"
-    yield millimetres(far["a_to_b"]["median_m"]), "from A to B, the median"
-    yield millimetres(far["b_to_a"]["median_m"]), "from B to A, the median"
-
-
-def _pictures(found: Comparison) -> Iterator[tuple[str, Page, str]]:
-    """Return names, pictures and captions."""
+    drawn = {"distances": draw_distances(found), "above": draw_above(found)}
     if found.images is not None:
-        yield (
-            "ranges",
-            draw_ranges(found),
-            "Range images of a sweep, as the sensor looks around: A, B, and A minus B.",
-        )
-        yield (
-            "rings",
-            draw_rings(found),
-            "Residuals of each ring: median, and the middle 90 %; cells without a return; and all "
-            "residuals as a histogram.",
-        )
-    yield (
-        "distances",
-        draw_distances(found),
-        "Share of points that have the other cloud within a distance"
-        + ("; intensities of A and B." if found.figures["intensity"] else "."),
-    )
-    yield "above", draw_above(found), "Both clouds from above, by the distance to the other."
+        drawn = {"ranges": draw_ranges(found), "rings": draw_rings(found)} | drawn
+    for name, page in drawn.items():
+        (folder / f"compare-{name}.png").write_bytes(page.png())
+    images = {name: page.svg() for name, page in drawn.items()}
+    text = rendered("comparison.html", report=found.figures, begun="", pictures=images)
+    (folder / "compare.html").write_text(text, encoding="utf-8")
+    return ["compare.html", *(f"compare-{name}.png" for name in drawn)]
 
 
 def draw_ranges(found: Comparison) -> Page:

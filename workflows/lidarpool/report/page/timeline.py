@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -11,9 +10,10 @@ import numpy as np
 
 from poolpart import TaskRecord
 
-from ...base.words import counted
+from ...base.words import counted, natural
 from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
+from ..report import STAGES
 from .words import duration
 
 WIDTH = 1000  # units of the drawing, which the page scales
@@ -52,14 +52,8 @@ class Timeline(NamedTuple):
     row: int = ROW  # height of a row
 
 
-def make_timeline(
-    stages: Sequence[StageTotals], records: Sequence[TaskRecord], names: dict[str, str]
-) -> Timeline | None:
-    """Lay out the tasks of a run; None if nothing ran.
-
-    `stages` count all tasks, `records` are some of them, and `names` is {stage: its name on the
-    page}.
-    """
+def make_timeline(stages: Sequence[StageTotals], records: Sequence[TaskRecord]) -> Timeline | None:
+    """Lay out the tasks of a run: `stages` count all, `records` are some. None if nothing ran."""
     if not stages:
         return None
     begin = min(stage.start for stage in stages)
@@ -75,8 +69,8 @@ def make_timeline(
 
     overview = [
         Row(
-            names[stage.stage],
-            f"{names[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
+            STAGES[stage.stage],
+            f"{STAGES[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
             f"work within {duration(stage.stop - stage.start)}",
             stage.stage,
             bars(stage.busy),
@@ -102,20 +96,15 @@ def make_timeline(
         busiest = sorted(rows, key=lambda row: -sum(task.seconds for task in rows[row]))
         if len(rows) > ROWS_MOST:
             detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
-        order = list(names)
         drawn = []
-        for row in sorted(busiest[:ROWS_MOST], key=lambda r: (_natural(r[0]), order.index(r[1]))):
-            (worker, stage), those = row, rows[row]
+        for worker, stage in sorted(
+            busiest[:ROWS_MOST], key=lambda row: (natural(row[0]), [*STAGES].index(row[1]))
+        ):
+            those = rows[worker, stage]
             busy = duration(sum(task.seconds for task in those))
-            told = f"{worker}: {names[stage]}, {counted(len(those), 'task')}, {busy}"
+            told = f"{worker}: {STAGES[stage]}, {counted(len(those), 'task')}, {busy}"
             drawn.append(Row(worker, told, stage, bars((t.start, t.stop) for t in those)))
         groups.append(Group(partition, detail, drawn))
     marks = np.arange(0, seconds, nice_step(seconds / 6))
     ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
     return Timeline(seconds, ticks, groups, sum(stage.tasks for stage in stages))
-
-
-def _natural(worker: str) -> list[tuple[int, str]]:
-    """Sort key: GPU-2 before GPU-10."""
-    pieces = re.split(r"(\d+)", worker)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]
