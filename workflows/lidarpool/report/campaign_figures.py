@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from array import array
+from bisect import insort
 from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -81,8 +82,8 @@ class Figures:
         self.splits.setdefault(row.split, Counter()).update(counts, jobs=1)
         self.classes.update(row.classes)
         self.classed.update(row.classes.keys())
-        slowest = sorted([*self.slowest, row], key=lambda row: (-row.seconds, row.number))
-        self.slowest = slowest[:SLOWEST_MOST]
+        insort(self.slowest, row, key=lambda row: (-row.seconds, row.number))
+        del self.slowest[SLOWEST_MOST:]
 
     def _varied(self, name: str) -> Varied:
         values, labels = np.array(self._values[name]), dict(self._labels[name])
