@@ -223,12 +223,15 @@ class Page:
             size,
         )  # fmt: skip
 
-    def key(self, handles: list[Line2D], size: float) -> None:
-        """Put a legend of handles into the right margin; `size` of the font in points."""
-        legend = self.figure.legend(
-            handles, ["x"] * len(handles), loc="center left", bbox_to_anchor=(0.842, 0.5),
-            frameon=False, labelcolor=theme.INK, labelspacing=0.55, handletextpad=0.5,
-            borderpad=0, handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
+    def key(
+        self, handles: list[Line2D], size: float, on: Axes | Figure | None = None, **given: Any
+    ) -> None:
+        """Put a legend of handles into the right margin, or elsewhere; `size` in points."""
+        style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | given
+        style = {"handletextpad": 0.5, "handlelength": 1.4} | style
+        legend = (on or self.figure).legend(
+            handles, ["x"] * len(handles), frameon=False, labelcolor=theme.INK, labelspacing=0.55,
+            prop={"family": FONT, "size": size * self.unit}, **style,
         )  # fmt: skip
         # Names come from files: matplotlib leaves out those that begin with an underscore,
         # and fails on texts that only look like a formula ("$\\frac{x$").

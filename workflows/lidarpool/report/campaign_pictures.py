@@ -232,7 +232,8 @@ def _draw_counts(axes: Axes, scale: Scale, failures: Bools, colours: Floats) -> 
         left, right = left + 0.15, right - 0.15
     wide = right - left
     axes.bar(left, counts - failed, wide, bottom=failed, align="edge", color=colours, lw=0)
-    axes.bar(left, failed, wide, align="edge", color=theme.SENSOR, lw=0)
+    if failed.any():
+        axes.bar(left, failed, wide, align="edge", color=theme.SENSOR, lw=0)
     axes.set_ylim(0, 1.1 * max(1, counts.max()))
 
 

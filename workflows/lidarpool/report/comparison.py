@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -28,7 +28,14 @@ from .ranks import rank_correlation
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
 MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
-
+RESIDUALS: dict[str, Callable[[Floats], Any]] = {
+    "bias_m": np.mean,
+    "rmse_m": lambda values: np.sqrt(np.mean(values**2)),
+    "median_m": lambda values: np.quantile(values, 0.5),
+    "mad_m": lambda values: np.median(np.abs(values - np.quantile(values, 0.5))),
+    "p05_m": lambda values: np.quantile(values, 0.05),
+    "p95_m": lambda values: np.quantile(values, 0.95),
+}
 
 # Points (n, 3) of a cloud, and their distances (n,) to the other.
 Above = tuple[Floats, Floats]
@@ -303,7 +310,8 @@ class _Comparing:
                 "b_to_a": _distances(to_a),
                 "chamfer_m": float(to_b.mean() + to_a.mean()),
                 "f_scores": [
-                    {"distance_m": one, **_scores(np.mean(to_b <= one), np.mean(to_a <= one))}
+                    {"distance_m": one}
+                    | _scores(float(np.mean(to_b <= one)), float(np.mean(to_a <= one)))
                     for one in self.within
                 ],
             },
@@ -354,36 +362,22 @@ def nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
 
 
 def _residuals(values: Floats) -> dict[str, Any]:
-    """Figures of residuals A - B; None where there are none."""
-    if not len(values):
-        names = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
-        return {"cells": 0, **dict.fromkeys(names)}
-    exact = values.astype(np.float64)
-    low, middle, high = np.quantile(exact, (0.05, 0.5, 0.95)).tolist()
-    return {
-        "cells": len(values),
-        "bias_m": float(exact.mean()),
-        "rmse_m": float(np.sqrt(np.mean(exact**2))),
-        "median_m": middle,
-        "mad_m": float(np.median(np.abs(exact - middle))),
-        "p05_m": low,
-        "p95_m": high,
-    }
+    """Figures of residuals A - B, `RESIDUALS`; None where there are none."""
+    figures = (float(figure(values)) if len(values) else None for figure in RESIDUALS.values())
+    return {"cells": len(values), **dict(zip(RESIDUALS, figures, strict=True))}
 
 
 def _no_return(counts: Any) -> dict[str, Any]:
     """Figures of cells without a return in A, with those in B as the truth."""
-    returns, both, of_a, of_b = (int(count) for count in counts)
+    returns, both, of_a, of_b = counts.tolist()
+    names = {"in_both": both, "in_a_only": of_a, "in_b_only": of_b, "returns_in_both": returns}
     precision = both / (both + of_a) if both + of_a else None
-    recall = both / (both + of_b) if both + of_b else None
-    counted_ = {"in_both": both, "in_a_only": of_a, "in_b_only": of_b, "returns_in_both": returns}
-    return counted_ | _scores(precision, recall)
+    return names | _scores(precision, both / (both + of_b) if both + of_b else None)
 
 
-def _scores(precision: Any, recall: Any) -> dict[str, float | None]:
+def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
     f1 = None
     if precision is not None and recall is not None:
-        precision, recall = float(precision), float(recall)
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
     return {"precision": precision, "recall": recall, "f1": f1}
 

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..base.arrays import AnyArray
@@ -30,6 +31,7 @@ ONLY_A, ONLY_B = theme.rgb("#2ca25f"), theme.rgb("#101418")  # no colours of res
 NONE = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
 RANGES, RESIDUALS, FAR = "viridis", "RdBu_r", "plasma"
 SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
+CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")
 CLOSEST_M = 0.001  # end of the scale of distances
 
 
@@ -95,8 +97,7 @@ def draw_ranges(found: Comparison) -> Page:
     named = (("only A has a return", ONLY_A), ("only B has a return", ONLY_B),
              ("no return", NONE))  # fmt: skip
     handles = [_dot(text, colour) for text, colour in named]
-    _key(page, page.figure, handles, loc="upper right", bbox_to_anchor=(RIGHT, 1 - 40 / height),
-         ncols=3)  # fmt: skip
+    _key(page, page.figure, handles, loc="upper right", bbox_to_anchor=(RIGHT, 1 - 40 / height))
     return page
 
 
@@ -130,13 +131,9 @@ def draw_rings(found: Comparison) -> Page:
     left = LEFT + wide + apart
     if lost:
         axes = page.chart((left, 0.13, wide, 0.64), xlabel="cells without a return, %")
-        for colour, name, words in ((B, "in_b_only", "B"), (A, "in_a_only", "A")):
-            share = [
-                100 * (row["no_return"]["in_both"] + row["no_return"][name])
-                / max(sum(row["no_return"][key] for key in
-                          ("in_both", "in_a_only", "in_b_only", "returns_in_both")), 1)
-                for row in rows
-            ]  # fmt: skip
+        counts = np.array([[row["no_return"][name] for name in CELLS] for row in rows])
+        for colour, which, words in ((B, 2, "B"), (A, 1, "A")):
+            share = 100 * (counts[:, 0] + counts[:, which]) / counts.sum(axis=1)
             axes.plot(share, elevation, "o-", color=colour, ms=size, mew=0, lw=0.6 * page.unit,
                       label=words)  # fmt: skip
         axes.set_xlim(left=min(0, axes.get_xlim()[0]))
@@ -178,7 +175,7 @@ def draw_distances(found: Comparison) -> Page:
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     for one in far["f_scores"]:
         axes.axvline(one["distance_m"], color=theme.LINE, lw=0.9 * page.unit, ls=(0, (4, 3)))
-    _key(page, axes, [_dot("A to B", A), _dot("B to A", B)], loc="lower right")
+    _key(page, axes, [_dot("A to B", A), _dot("B to A", B)], loc="lower right", bbox_to_anchor=None)
     if found.figures["intensity"]:
         light = found.figures["intensity"]
         axes = page.chart((LEFT + 0.5, 0.13, 0.4, 0.64), xlabel="intensity in B",
@@ -247,11 +244,8 @@ def _dot(text: str, colour: Any, marker: str = "s") -> Line2D:
     return Line2D([], [], ls="", marker=marker, color=colour, mec=edge, mew=0.5, label=text, ms=4)
 
 
-def _key(page: Page, on: Any, handles: list[Line2D], **given: Any) -> None:
-    """Put a legend into axes, or anywhere on the page."""
-    given = {"loc": "upper left", "ncols": len(handles)} | given
-    if isinstance(on, Axes) and given["loc"] == "upper left":
-        given |= {"bbox_to_anchor": (0, 1.09), "borderaxespad": 0}
-    given["prop"] = {"family": FONT, "size": 6.8 * page.unit}
-    style = {"frameon": False, "handletextpad": 0.2, "columnspacing": 1.2}
-    on.legend(handles=handles, labelcolor=theme.INK, **style, **given)
+def _key(page: Page, on: Axes | Figure, handles: list[Line2D], **given: Any) -> None:
+    """Put a legend above axes, or elsewhere."""
+    above = {"loc": "upper left", "bbox_to_anchor": (0, 1.09), "borderaxespad": 0}
+    style = {"ncols": len(handles), "handletextpad": 0.2, "columnspacing": 1.2, "borderpad": 0.4}
+    page.key(handles, 6.8, on, **style, **(given or above))
