@@ -207,6 +207,15 @@ class Page:
             place = 0.03, 1 - (1.84 + 0.62 * number) * line
             self._text(self.figure, place, detail, 7.2, theme.MUTED, ha="left")
 
+    def heading(self, axes: Axes, text: str, **given: Any) -> None:
+        """Name a chart, above its left end."""
+        style: dict[str, Any] = {
+            "fontsize": 7.6 * self.unit,
+            "color": theme.INK,
+            "family": FONT,
+        } | given
+        axes.set_title(text, loc="left", parse_math=False, **style)
+
     def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
         """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
         rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]

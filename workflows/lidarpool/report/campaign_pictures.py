@@ -122,10 +122,8 @@ def draw_varied(figures: Figures) -> Page | None:
         for axes in (upper, lower):
             _set_labels(page, axes, scale, wide)
         upper.tick_params(which="both", labelbottom=False, bottom=False)
-        upper.set_title(
-            shortened(varied.name, int(wide / 13.8)), loc="left", fontsize=7.8 * page.unit,
-            color=theme.INK, family=FONT, weight="bold", pad=4 * page.unit, parse_math=False,
-        )  # fmt: skip
+        name = shortened(varied.name, int(wide / 13.8))
+        page.heading(upper, name, weight="bold", pad=4 * page.unit)
         if column == 0:
             upper.set_ylabel("jobs")
             lower.set_ylabel("points of a job")
@@ -159,18 +157,14 @@ def _remarks(figures: Figures, shown: Sequence[Varied], telling: Varied | None) 
 
 def _most_telling(scales: Sequence[Scale], points: Floats, done: Bools) -> int | None:
     """Which quantity of few labels has groups whose points differ most; None without any."""
-    best, most = None, 0.0
+    between = {}  # {number of a quantity: variance of the means of its groups}
     for number, scale in enumerate(scales):
         known = done & (scale.bin_of >= 0)
-        if not 2 <= len(scale.labels) <= MOST_COLOURS or not known.any():
-            continue
-        groups, these = scale.bin_of[known], points[known]
-        sums, counts = np.bincount(groups, these), np.bincount(groups)
-        means = sums / np.maximum(counts, 1)
-        between = float(np.var(means[groups]))
-        if best is None or between > most:
-            best, most = number, between
-    return best
+        if 2 <= len(scale.labels) <= MOST_COLOURS and known.any():
+            groups = scale.bin_of[known]
+            means = np.bincount(groups, points[known]) / np.bincount(groups).clip(1)
+            between[number] = float(np.var(means[groups]))
+    return max(between, key=lambda number: between[number], default=None)
 
 
 def draw_results(figures: Figures) -> Page | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -72,11 +71,9 @@ class Comparison:
             staging(place) as staged,
         ):
             names = write_comparison(staged, self)
-            text = json.dumps(self.figures, indent=1, allow_nan=False)
-            (staged / "compare.json").write_text(f"{text}\n", encoding="utf-8")
-            for name in ("compare.json", *names):
+            for name in names:
                 (staged / name).replace(place / name)
-        return [place / name for name in ("compare.json", *names)]
+        return [place / name for name in names]
 
 
 @checked

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +16,7 @@ from ..base.arrays import AnyArray
 from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..render import theme
-from ..render.page import FONT, Page
+from ..render.page import Page
 from .page.page import rendered
 from .page.words import millimetres
 
@@ -36,7 +37,7 @@ CLOSEST_M = 0.001  # end of the scale of distances
 
 
 def write_comparison(folder: Path, found: Comparison) -> list[str]:
-    """Write compare.html and the pictures as PNG into a folder; return their names."""
+    """Write compare.json, compare.html and pictures as PNG into a folder; return their names."""
     drawn = {"distances": draw_distances(found), "above": draw_above(found)}
     if found.images is not None:
         drawn = {"ranges": draw_ranges(found), "rings": draw_rings(found)} | drawn
@@ -45,7 +46,9 @@ def write_comparison(folder: Path, found: Comparison) -> list[str]:
     images = {name: page.svg() for name, page in drawn.items()}
     text = rendered("comparison.html", report=found.figures, begun="", pictures=images)
     (folder / "compare.html").write_text(text, encoding="utf-8")
-    return ["compare.html", *(f"compare-{name}.png" for name in drawn)]
+    text = json.dumps(found.figures, indent=1, allow_nan=False) + "\n"
+    (folder / "compare.json").write_text(text, encoding="utf-8")
+    return ["compare.json", "compare.html", *(f"compare-{name}.png" for name in drawn)]
 
 
 def draw_ranges(found: Comparison) -> Page:
@@ -86,7 +89,7 @@ def draw_ranges(found: Comparison) -> Page:
         some = np.unique(np.linspace(0, rows - 1, min(rows, 5)).round().astype(int))
         axes.set_yticks(some, [f"{images.elevation_deg[row]:.1f}" for row in some])
         axes.grid(False)
-        _name(page, axes, words)
+        page.heading(axes, words)
     share = high / height
     bottom = (height - top - 2 * high - gap) / height
     ramp = np.linspace(0, 1, 256)
@@ -185,7 +188,7 @@ def draw_distances(found: Comparison) -> Page:
                     rasterized=True)  # fmt: skip
         axes.grid(False)
         told = f"rank correlation {light['rank_correlation']:.3f}"
-        _name(page, axes, f"{told} of {light['pairs']:,} {light['of']}")
+        page.heading(axes, f"{told} of {light['pairs']:,} {light['of']}")
     return page
 
 
@@ -215,7 +218,7 @@ def draw_above(found: Comparison) -> Page:
         )  # fmt: skip
         middle = (low + high) / 2
         axes.set(xlim=middle[0] + np.array([-side, side]), ylim=middle[1] + np.array([-side, side]))
-        _name(page, axes, ("A, distance to B", "B, distance to A")[k])
+        page.heading(axes, ("A, distance to B", "B, distance to A")[k])
     page.colour_bar(theme.mapped(FAR, np.linspace(0, 1, 256)), norm, "distance, m",
                     (0.875, 0.12, 0.014, tall))  # fmt: skip
     return page
@@ -233,10 +236,6 @@ def _bins(values: AnyArray) -> AnyArray:
     if most <= 300 and (values == np.round(values)).all():
         return np.arange(-0.5, most + 1)
     return np.linspace(0, most, 121)
-
-
-def _name(page: Page, axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="left", fontsize=7.6 * page.unit, color=theme.INK, family=FONT)
 
 
 def _dot(text: str, colour: Any, marker: str = "s") -> Line2D:

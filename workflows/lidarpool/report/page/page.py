@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from types import MappingProxyType
@@ -12,8 +12,6 @@ from typing import Any
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
-
-from poolpart import TaskRecord
 
 from ...base.declared import declared
 from ...base.words import counted
@@ -57,18 +55,18 @@ def write_page(
         changed=_changed,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         scenario=_written(scenario) if scenario else "",
-        **of_tasks(result.stages, result.records),
+        **of_tasks(result.stages),
     )
     path.write_text(text, encoding="utf-8")
 
 
-def of_tasks(stages: Sequence[StageTotals], records: Sequence[TaskRecord] = ()) -> dict[str, Any]:
+def of_tasks(stages: Iterable[StageTotals]) -> dict[str, Any]:
     """Return what templates show of the tasks of a run: when it began, stages, timeline."""
     ordered, begun = in_order(stages), ""
     if ordered:
         first = datetime.fromtimestamp(min(stage.start for stage in ordered), UTC)
         begun = f"{first:%Y-%m-%d %H:%M UTC}"
-    return {"begun": begun, "stages": ordered, "timeline": make_timeline(ordered, records)}
+    return {"begun": begun, "stages": ordered, "timeline": make_timeline(ordered)}
 
 
 def rendered(template: str, *, pictures: Mapping[str, str] = _NONE, **values: Any) -> str:
@@ -87,7 +85,7 @@ def rendered(template: str, *, pictures: Mapping[str, str] = _NONE, **values: An
         finalize=lambda value: escaped(value) if type(value) is str else value,  # not of Markup
     )
     for filter_ in (
-        words.duration, words.rate, words.large, words.share, words.excess, words.metres,
+        words.duration, words.rate, words.large, words.share, words.excess,
         words.numbers, words.grouped, words.told, words.code, words.markdown, words.millimetres,
         words.ratio, counted,
     ):  # fmt: skip

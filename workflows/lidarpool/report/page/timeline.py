@@ -52,8 +52,8 @@ class Timeline(NamedTuple):
     row: int = ROW  # height of a row
 
 
-def make_timeline(stages: Sequence[StageTotals], records: Sequence[TaskRecord]) -> Timeline | None:
-    """Lay out the tasks of a run: `stages` count all, `records` are some. None if nothing ran."""
+def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
+    """Lay out the tasks of a run, of which some have records; None if nothing ran."""
     if not stages:
         return None
     begin = min(stage.start for stage in stages)
@@ -79,32 +79,37 @@ def make_timeline(stages: Sequence[StageTotals], records: Sequence[TaskRecord]) 
     ]
     groups = [Group("Stages", "while at least one task ran", overview)]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    by_partition: dict[str, list[TaskRecord]] = defaultdict(list)
-    for record in records:
+    # {partition: {(worker, stage): tasks}}
+    drawn: dict[str, dict[tuple[str, str], list[TaskRecord]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for record in (record for stage in stages for record in stage.records):
         where = record.partition if not record.misplaced else " + ".join(record.resources)
-        by_partition[where or "no partition"].append(record)
-    for partition, tasks in sorted(by_partition.items()):
-        workers = {task.worker for task in tasks}  # tasks that have a record
+        drawn[where or "no partition"][record.worker, record.stage].append(record)
+    for partition, tasks in sorted(drawn.items()):
+        workers = {worker for worker, _ in tasks}  # of tasks that have a record
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
-        detail = f"{counted(len(workers), 'worker')}, "
-        detail += counted(max(ran[partition], len(tasks)), "task")
-        if ran[partition] > len(tasks):  # else gaps would look like idle time
-            detail += f", of which {len(tasks):,} are drawn: gaps are not all idle time"
-        rows: dict[tuple[str, str], list[TaskRecord]] = defaultdict(list)
-        for task in tasks:
-            rows[task.worker, task.stage].append(task)
-        busiest = sorted(rows, key=lambda row: -sum(task.seconds for task in rows[row]))
-        if len(rows) > ROWS_MOST:
-            detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
-        drawn = []
-        for worker, stage in sorted(
-            busiest[:ROWS_MOST], key=lambda row: (natural(row[0]), [*STAGES].index(row[1]))
-        ):
-            those = rows[worker, stage]
-            busy = duration(sum(task.seconds for task in those))
-            told = f"{worker}: {STAGES[stage]}, {counted(len(those), 'task')}, {busy}"
-            drawn.append(Row(worker, told, stage, bars((t.start, t.stop) for t in those)))
-        groups.append(Group(partition, detail, drawn))
+        count = sum(map(len, tasks.values()))
+        detail = f"{counted(len(workers), 'worker')}, {counted(max(ran[partition], count), 'task')}"
+        if ran[partition] > count:  # else gaps would look like idle time
+            detail += f", of which {count:,} are drawn: gaps are not all idle time"
+        if len(tasks) > ROWS_MOST:
+            detail += f"; the busiest {ROWS_MOST} of {len(tasks):,} rows"
+        work = {row: sum(task.seconds for task in tasks[row]) for row in tasks}
+        busiest = sorted(work, key=lambda row: -work[row])[:ROWS_MOST]
+        rows = [
+            Row(
+                worker,
+                f"{worker}: {STAGES[stage]}, {counted(len(tasks[worker, stage]), 'task')}, "
+                + duration(work[worker, stage]),
+                stage,
+                bars((task.start, task.stop) for task in tasks[worker, stage]),
+            )
+            for worker, stage in sorted(
+                busiest, key=lambda row: (natural(row[0]), [*STAGES].index(row[1]))
+            )
+        ]
+        groups.append(Group(partition, detail, rows))
     marks = np.arange(0, seconds, nice_step(seconds / 6))
     ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
     return Timeline(seconds, ticks, groups, sum(stage.tasks for stage in stages))

@@ -88,11 +88,6 @@ def told(value: Any, digits: int = 6) -> str:
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
-def metres(value: float | None) -> str:
-    """Length in metres, or words for none."""
-    return "–" if value is None else f"{value:,.2f} m".replace("-", MINUS)
-
-
 def numbers(values: Sequence[float]) -> str:
     """Coordinates, short."""
     return ", ".join(f"{value:,.10g}" for value in values).replace("-", MINUS)
