@@ -35,10 +35,13 @@ from ..report.output import ROOM_BYTES, further_files, refuse_to_replace
 from ..run.checks import check_memory, find_workers, gpu_note, slots_needed
 from ..run.cluster_file import ClusterFile
 from ..run.identity import identity_of
-from ..run.job import Job, make_job
 from ..run.local import default_workers
+from ..run.options import RunOptions
 from ..run.store import RUN_FOLDER
-from ..scenario.campaign import Campaign, Described, is_campaign
+from ..scenario.advice import advice
+from ..scenario.build import Built, build
+from ..scenario.campaign import Campaign, is_campaign
+from ..scenario.job import Job, job_of
 from ..scenario.scenario import Scenario
 from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
@@ -48,7 +51,7 @@ from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
 from ..simulator.world import check_backend_here
-from .run_command import formats_of, no_hits
+from .run_command import no_hits, options_of
 from .terminal import shown_status
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
@@ -96,28 +99,31 @@ def look_at(
     if campaign is None and number is not None:
         raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
 
-    def look(described: Described | None) -> tuple[Job, dict[str, Any]]:
-        read = Scenario.load(path) if described is None else described.scenario
+    def look(number: int | None) -> tuple[Job, dict[str, Any]]:
+        one = None if campaign is None or number is None else campaign
+        read = one.scenario(number) if one and number is not None else Scenario.load(path)
         assert read is not None, "of a file"
         with shown_status("reading the scene", quiet, logged=False):
-            job = make_job(read, backend, no_plan or described is not None)
+            built = build(read, plans=not no_plan and one is None)
+            job = job_of(built)
+        options = options_of(read.pool, backend)
         with shown_status("casting some rays", quiet):
-            found = forecast(read, job, out, client, file)
-        if described is not None:
-            own = {name: getattr(described, name) for name in ("number", "name", "split")}
+            found = forecast(built, job, options, out, client, file)
+        if one is not None and number is not None:
             names = ("objects", "triangles", "scans", "rays", "estimate")
-            own |= {"values": dict(described.values)} | {name: found[name] for name in names}
+            own = {"number": number, "name": one.name(number), "split": one.split(number)}
+            own |= {"values": one.values(number)} | {name: found[name] for name in names}
             found["job"] = own
         return job, found
 
     if campaign is None or number is not None:
-        job, found = look(campaign.describe(number) if campaign and number is not None else None)
+        job, found = look(number)
         return found, _of_job(job, found)
     campaign.check_files()
     jobs, notes, mistakes = [], [], Mistakes()
     for one in dict.fromkeys((campaign.count - 1) * i // (LOOKED_AT - 1) for i in range(LOOKED_AT)):
         with mistakes.noted():
-            _, found = look(campaign.describe(one))
+            _, found = look(one)
             jobs.append(found["job"])
             notes += found["notes"]
             mistakes.lines += found["reasons"]
@@ -136,16 +142,17 @@ def look_at(
 
 
 def forecast(
-    scenario: Scenario,
+    built: Built,
     job: Job,
+    options: RunOptions,
     out: Path | Storage,
     client: Client | None = None,
     file: ClusterFile | None = None,
 ) -> dict[str, Any]:
-    """Find out what the run of a scenario's job would do and need, and whether it can run.
+    """Find out what the run of a job would do and need, and whether it can run.
 
     It runs on the cluster of `client`, on the one that `file` describes, or on one of this machine
-    with the sizes of the scenario. Neither of the latter is started, and `out` is only looked at.
+    with the sizes in `options`. Neither of the latter is started, and `out` is only looked at.
 
     Returns
     -------
@@ -153,7 +160,7 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    pool, formats = scenario.pool, formats_of(scenario)
+    formats = job.outputs
     mistakes, notes = Mistakes(), []
     with mistakes.noted():
         notes += _look_at_folder(out)
@@ -164,7 +171,11 @@ def forecast(
     for one in formats:
         with mistakes.noted():
             one.check_installed()
-    required, casting, backend = slots_needed(job), None, None
+    required, casting, backend = (
+        slots_needed(options, planning=job.planning is not None),
+        None,
+        None,
+    )
     memory = 0  # that of machines that are not there yet is unknown
     if file is not None:
         there = file.slots
@@ -175,22 +186,30 @@ def forecast(
         there = {name: int(sum(slots.get(name, 0) for slots in held)) for name in required}
         with mistakes.noted():
             try:
-                everybody, casting, backend, _ = find_workers(client, job, job.backend)
+                everybody, casting, backend, _ = find_workers(client, required, options.backend)
             except PoolError as error:
                 raise LidarpoolError(str(error)) from error
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
+            for worker in casting:
+                if worker.memory:
+                    each = worker.memory / max(1, worker.resources[GPU])
+                    name = f"the GPU worker at {worker.address}"
+                    check_memory(job, options, backend, each, name)
             notes += filter(None, [gpu_note(everybody, casting, backend)])
     else:
         workers = default_workers(CPU_COUNT, len(visible_gpus()))
-        there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
+        there = {GPU: options.gpu_workers or workers[GPU]}
+        there[OTHER] = options.other_workers or workers[OTHER]
         there[LIDAR] = required[LIDAR]  # one worker with as many threads
         memory = MEMORY_LIMIT
         with mistakes.noted():
-            check_backend_here(job.backend)
+            check_backend_here(options.backend)
             usable = [name for name, reason in available_backends().items() if not reason]
-            backend = usable[0] if job.backend == "auto" else job.backend
+            backend = usable[0] if options.backend == "auto" else options.backend
             # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
-            check_memory(job, backend, MEMORY_LIMIT / CPU_COUNT, "a GPU worker of this machine")
+            check_memory(
+                job, options, backend, MEMORY_LIMIT / CPU_COUNT, "a GPU worker of this machine"
+            )
     slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}
     casters = slots[GPU]["there"] if casting is None else len(casting)
     estimate = None
@@ -205,7 +224,7 @@ def forecast(
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     # Scans of the largest batches; small ones take less.
     on_device = backend == "cuda"
-    fit = scans_that_fit(job.scene, job.survey, job.batch_mb * MB, on_device=on_device)
+    fit = scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=on_device)
     batch = most_scans(fit, job.survey.scan_count, max(1, slots[GPU]["there"]))
     disk = _disk(job, points, batch, len(formats), out)
     stored = isinstance(out, Storage)
@@ -227,7 +246,7 @@ def forecast(
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
-        "notes": notes + scenario.advice(job.scene),
+        "notes": notes + advice(built),
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
@@ -243,7 +262,7 @@ def forecast(
         "slots": slots,
         "memory": {"needed": needed, "there": memory or None},
         "disk": disk,
-        "sources": scenario.sources,
+        "sources": dict(built.found.sources),
     }
 
 
