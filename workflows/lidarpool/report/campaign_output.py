@@ -14,7 +14,7 @@ from typing import Any
 from ..base.errors import LidarpoolError, explained
 from ..base.fingerprint import fingerprint
 from ..base.software import difference, software
-from ..base.storage import Storage
+from ..base.storage import TEMPORARY, Storage
 from ..base.words import counted
 from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
 from ..export.folder import result_folder
@@ -138,7 +138,8 @@ class DataSetOutput(Output[CampaignRun]):
         assert cluster is not None, "something is left"
         dataset = replace(self.dataset, made_with=_made_with(store))
         mark = store.db.meta["mark"]
-        probe = (f"{mark}-dataset", mark.encode())
+        # What a killed run leaves of it is removed as that of any killed writer.
+        probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
         with explained(f"{dataset.place} cannot be written"):
             dataset.place.prepare()
             dataset.place.write(*probe)
