@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import lru_cache
 from math import inf, isclose, isfinite, lcm
-from pathlib import Path
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
@@ -182,16 +182,12 @@ class Choice(Section):
 
         Not of `each` and `sample`, which need more than a job's random numbers.
         """
-        if self.uniform is not None:
-            value: Any = draw.uniform(*self.uniform)
-        elif self.log_uniform is not None:
-            value = draw.log_uniform(*self.log_uniform)
-        elif self.normal is not None:
-            value = draw.normal(self.normal.mean, self.normal.std, self.normal.limits)
-        elif self.integer is not None:
-            value = draw.integer(*self.integer)
-        else:
+        if self.choice is not None:
             return self.option(draw.position(len(self.listed), self.weights or ()))
+        if self.normal is not None:
+            value = draw.normal(self.normal.mean, self.normal.std, self.normal.limits)
+        else:
+            value = getattr(draw, self.kind)(*self.ends)
         return value, value
 
     def option(self, position: int) -> tuple[Any, Value | None]:
@@ -360,19 +356,15 @@ class Splits:
         for name, share in exact.items():
             done += share
             self._block += [name] * (round(done * size) - len(self._block))
-        self._last: tuple[int, Sequence[str]] = (-1, ())
 
     def __call__(self, number: int) -> str:
         """Name of a job's split; empty if there are none."""
         if not self._block:
             return ""
         block, place = divmod(number, len(self._block))
-        if self._last[0] != block:
-            order = Draw(self._seed, block, "splits").order(len(self._block))
-            self._last = block, [self._block[i] for i in order]
-        return self._last[1][place]
+        return self._block[_order(self._seed, block, len(self._block))[place]]
 
 
-def file_of(folder: Path, name: str) -> Path:
-    """Path of a file that a campaign names."""
-    return folder / Path(name).expanduser()
+@lru_cache
+def _order(seed: int, block: int, count: int) -> list[int]:
+    return Draw(seed, block, "splits").order(count)
