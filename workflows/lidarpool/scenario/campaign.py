@@ -320,10 +320,17 @@ class _Made(_Jobs):
         return {"make": fingerprint(self._make)}
 
     def values(self, number: int) -> dict[str, Value]:
-        return self._values(number, self._made(number).values)
+        return dict(self.job(number, None, (), {}).values)
 
     def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         made = self._made(number)
+        if extra := [name for name in made.values if name not in self.names]:
+            raise LidarpoolError(
+                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
+                "the same names, with None where there is no value."
+            )
+        values = {name: _plain(number, name, value) for name, value in made.values.items()}
+        values = {name: value for name, value in values.items() if value is not None}
         survey, seed = made.survey, _noise_seed(self._seed, number)
         check_whole(columns, survey.keep_every)
         survey = replace(
@@ -332,16 +339,7 @@ class _Made(_Jobs):
             sensors=[replace(one, noise=_seeded(one.noise, seed)) for one in survey.sensors],
             columns=(*survey.columns, *columns),
         )
-        return Job(made.scene, survey, values=self._values(number, made.values), **own)
-
-    def _values(self, number: int, given: Mapping[str, Any]) -> dict[str, Value]:
-        if extra := [name for name in given if name not in self.names]:
-            raise LidarpoolError(
-                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
-                "the same names, with None where there is no value."
-            )
-        plain = {name: _plain(number, name, value) for name, value in given.items()}
-        return {name: value for name, value in plain.items() if value is not None}
+        return Job(made.scene, survey, values=values, **own)
 
     def _made(self, number: int) -> Job:
         try:
@@ -437,7 +435,7 @@ class _Varied(_Jobs):
         for text, choice in section.vary.items():
             if choice.each is not None:
                 self._strides[text] = grid
-                grid *= len(choice.listed)
+                grid *= len(choice.options)
         drawn = [text for text in section.vary if text not in self._strides]
         if section.count is None and drawn:
             raise LidarpoolError(
@@ -492,8 +490,8 @@ class _Varied(_Jobs):
                 changes[text], told[text] = partial(_extended, rows), chosen
                 continue
             if choice.each is not None:
-                turn = number // self._strides[text] % len(choice.listed)
-                value, told[text] = choice.option(turn)
+                turn = number // self._strides[text] % len(choice.options)
+                value, told[text] = choice.options[turn]
             else:
                 value, told[text] = choice.drawn(draw)
             changes[text] = partial(_replaced, value)
