@@ -112,7 +112,7 @@ def build(
     epsg = _common_epsg(scenario, found)
     with prefixed(scenario.source):
         way = scenario.trajectory
-        track = None if way is None else way.track(scenario.folder, standing)
+        track = None if way is None else way.track(scenario.path, standing)
         sensors = _sensors(scenario, robots)
     placing = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
@@ -169,11 +169,11 @@ def _sensors(scenario: Scenario, robots: Robots) -> list[Mounted]:
     common = scenario.noise, scenario.returns
     if not scenario.sensors:
         mount = _mount(scenario, scenario.mount or MountSection(), robots)
-        return [scenario.sensor.mounted(scenario.folder, mount, *common)]
+        return [scenario.sensor.mounted(scenario.path, mount, *common)]
     out = []
     for name, section in scenario.sensors.items():
         mount = _mount(scenario, section.mount, robots)
-        carried = section.mounted(scenario.folder, mount, *common, name)
+        carried = section.mounted(scenario.path, mount, *common, name)
         out.append(replace(carried, steps=section.steps))
     return out
 
@@ -221,7 +221,7 @@ def _actors(
     """Build the actors; their trajectories begin with that of the survey."""
     shapes: dict[Any, Mesh] = {}
     with prefixed(scenario.source):
-        ways = [entry.way(scenario.folder, standing, carrier) for entry in scenario.actors]
+        ways = [entry.way(scenario.path, standing, carrier) for entry in scenario.actors]
     out: list[Actor] = []
     for entry, way in zip(scenario.actors, ways, strict=True):
         if entry.is_robot:
