@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from ..base.errors import LidarpoolError
-from ..base.validation import attributes_of, dotted, fields_of, is_section, sections_in
+from ..base.validation import dotted, fields_of, is_section, sections_in
 from ..base.words import counted, did_you_mean
 from .scenario import Scenario
 
@@ -78,11 +78,12 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
 
 
 def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
-    fields = fields_of(type(node))
+    fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
         raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
-    return name, getattr(node, attributes_of(type(node))[name], None), fields[name].annotation
+    own = fields[name]
+    return name, getattr(node, own, None), fields_of(type(node))[own].annotation
 
 
 def _named(names: Sequence[str], rest: Sequence[str], at: str) -> tuple[str, int]:
@@ -113,9 +114,8 @@ def opened(node: Any) -> Any:
     What is within stays as it is: sections that were checked are not checked again.
     """
     if is_section(type(node)):
-        names = attributes_of(type(node))
-        given = getattr(node, "model_fields_set", names.values())
-        return {n: getattr(node, a) for n, a in names.items() if a in given and hasattr(node, a)}
+        fields, given = fields_of(type(node)), getattr(node, "model_fields_set", vars(node))
+        return {f.alias or n: getattr(node, n) for n, f in fields.items() if n in given}
     return list(node) if isinstance(node, (tuple, list)) else dict(node)
 
 
