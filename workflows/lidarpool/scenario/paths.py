@@ -8,7 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 
 from ..base.errors import LidarpoolError
-from ..base.validation import attributes_of, fields_of, is_section, sections_in
+from ..base.validation import fields_of, is_section, sections_in
 from ..base.words import counted, did_you_mean
 from .scenario import Scenario
 
@@ -58,11 +58,12 @@ def find_field(scenario: Scenario, text: str) -> tuple[Steps, Any]:
 
 
 def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
-    fields = fields_of(type(node))
+    fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
         raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
-    return name, getattr(node, attributes_of(type(node))[name], None), fields[name].annotation
+    own = fields[name]
+    return name, getattr(node, own, None), fields_of(type(node))[own].annotation
 
 
 def _named(names: Sequence[str], rest: Sequence[str], at: str) -> tuple[str, int]:
@@ -104,7 +105,6 @@ def put(node: Any, steps: Steps, change: Callable[[Any], Any]) -> Any:
 
 def _own_fields(node: Any) -> dict[Any, Any]:
     if is_section(type(node)):
-        names = attributes_of(type(node))
-        given = getattr(node, "model_fields_set", names.values())
-        return {n: getattr(node, a) for n, a in names.items() if a in given and hasattr(node, a)}
+        fields, given = fields_of(type(node)), getattr(node, "model_fields_set", vars(node))
+        return {f.alias or n: getattr(node, n) for n, f in fields.items() if n in given}
     return dict(node)
