@@ -18,7 +18,7 @@ from ..run.campaign import CampaignRun
 from ..scenario.campaign import Campaign
 from .campaign_figures import Figures
 from .campaign_pictures import draw_results, draw_varied
-from .page.page import of_tasks, rendered
+from .page.page import rendered
 from .report import stage_figures
 
 CARD, PAGE, PICTURES, SPLITS = "README.md", "report.html", "pictures", "splits"
@@ -91,7 +91,7 @@ def write_card(
             slowest=figures.slowest,
             description=campaign.description,
             **values,
-            **of_tasks(run.stages),
+            stages=run.stages,
         )
         place.write(PAGE, page.encode())
         card = rendered("card.md", drawn=[*drawn], **values)

@@ -44,7 +44,7 @@ def write_comparison(folder: Path, found: Comparison) -> list[str]:
     for name, page in drawn.items():
         (folder / f"compare-{name}.png").write_bytes(page.png())
     images = {name: page.svg() for name, page in drawn.items()}
-    text = rendered("comparison.html", report=found.figures, begun="", pictures=images)
+    text = rendered("comparison.html", report=found.figures, pictures=images)
     (folder / "compare.html").write_text(text, encoding="utf-8")
     text = json.dumps(found.figures, indent=1, allow_nan=False) + "\n"
     (folder / "compare.json").write_text(text, encoding="utf-8")
