@@ -70,9 +70,9 @@ def write_card(
         figures = Figures(campaign.names, _with_splits(place, jobs))
         pages = {"job": picture, "varied": draw_varied(figures), "results": draw_results(figures)}
         drawn = {name: page for name, page in pages.items() if page is not None}
-        for name, picture in drawn.items():
+        for name, drawing in drawn.items():
             with place.writing(f"{PICTURES}/{name}.png") as file:
-                file.write(picture.png())
+                file.write(drawing.png())
         place.remove([f"{PICTURES}/{name}.png" for name in pages if name not in drawn])
         report = campaign_report(campaign, run, versions, figures)
         values: dict[str, Any] = {

@@ -68,7 +68,7 @@ def draw_ranges(found: Comparison) -> Page:
     both = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
     low, most = np.quantile(both, (0.01, 0.98)) if len(both) else (0.0, 1.0)
     norm = LogNorm(max(float(low), 0.01), max(float(most), float(low) * 1.01, 0.02))
-    (in_a, in_b), residual = images.there, images.residual
+    (in_a, in_b), residual = images.there, images.ranges[0] - images.ranges[1]
     scale = Normalize(-_limit(found), _limit(found))
     for k, words in enumerate(("A", "B", "A − B")):
         bottom = (height - top - (k + 1) * high - k * gap) / height

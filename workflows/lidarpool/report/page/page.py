@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -25,7 +24,6 @@ from . import words
 from .timeline import make_timeline
 
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
-_NONE: Mapping[str, str] = MappingProxyType({})
 
 
 def write_page(
@@ -61,7 +59,7 @@ def write_page(
 def rendered(
     template: str,
     *,
-    pictures: Mapping[str, str] = _NONE,
+    pictures: Mapping[str, str] | None = None,
     stages: Sequence[StageTotals] = (),
     **values: Any,
 ) -> str:
@@ -92,7 +90,7 @@ def rendered(
         zip(names, without_common_prefix([*names]), strict=True)
     )
     return environment.get_template(template).render(
-        pictures={name: Markup(image) for name, image in pictures.items()},
+        pictures={name: Markup(image) for name, image in (pictures or {}).items()},
         timeline=make_timeline(stages),
         **values,
     )
