@@ -298,7 +298,9 @@ def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
         axis.set_minor_formatter(NullFormatter())
     else:
         axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
-        axis.set_major_locator(MaxNLocator(max(2, min(6, int(wide / 90)))))
+        whole = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
+        few = max(2, min(6, int(wide / 90)))
+        axis.set_major_locator(MaxNLocator(few, integer=whole, min_n_ticks=1))
     axis.set_major_formatter(FuncFormatter(_tick))
 
 
