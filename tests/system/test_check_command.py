@@ -23,7 +23,6 @@ from lidarpool import Mounted, Returns, Sensor, Survey, Track, simulate
 from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.job import make_job
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.sections import PoolSection
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Cutout, Mesh
 from lidarpool.scene.scene import Scene
@@ -54,9 +53,10 @@ def check(tmp_path, lidarpool) -> Callable[..., Any]:
 
 
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
-    job = make_job(Scenario.from_data(SHORT), no_plan=True)
+    scenario = Scenario.from_data(SHORT)
+    job = make_job(scenario, no_plan=True)
     with Client(cluster, set_as_default=False) as client:
-        made = forecast(job, PoolSection(), tmp_path, client)
+        made = forecast(scenario, job, tmp_path, client)
         result = simulate(
             job.scene, job.survey, client=client, backend="numpy", folder=tmp_path / "run"
         )

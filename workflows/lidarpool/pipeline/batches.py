@@ -38,6 +38,12 @@ class Batch:
     collector: str = ""  # name of the task of stage 4
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
     divided: bool = False  # not to be cast with batches of other jobs
+    share: float = field(
+        init=False
+    )  # how much it takes of the memory that a worker has for a casting task
+
+    def __post_init__(self) -> None:
+        self.share = len(self) / self.job.fit
 
     def __len__(self) -> int:
         return self.stop - self.first
@@ -51,11 +57,6 @@ class Batch:
     def scans(self) -> range:
         """Numbers of its scans."""
         return range(self.first, self.stop)
-
-    @property
-    def share(self) -> float:
-        """How much it takes of the memory that a worker has for a casting task."""
-        return len(self) / self.job.fit
 
     @property
     def name(self) -> str:
@@ -138,7 +139,7 @@ class Batches:
         self.move(batch, Place.CASTING, now)
 
     def forget_task(self, batch: Batch) -> str:
-        """Let a batch have no casting task; returns the task's key if no other needs it, else ""."""
+        """Let a batch have no casting task; returns its key if no other batch needs it, else ""."""
         key, batch.key = batch.key, ""
         left = self._tasks.get(key)
         if left is None:

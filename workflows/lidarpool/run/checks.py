@@ -181,7 +181,7 @@ def common_software(
     Workers with another are refused one by one when they are prepared. LidarpoolError if none has
     the earlier one.
     """
-    answers = _casting_answers(client, software_there(backend), workers)
+    answers = _answers(client, software_there(backend), [worker.address for worker in workers])
     if earlier and dict(earlier) not in answers.values():
         address, there = next(iter(answers.items()))
         raise LidarpoolError(
@@ -199,19 +199,13 @@ def _answers(
 ) -> Mapping[str, Any]:
     """Return what the workers at these addresses answer; the first error of one is raised."""
     answers = ask_workers(client, question, workers)
-    for answer in answers.values():
-        if isinstance(answer, BaseException):
-            raise answer
-    return answers
-
-
-def _casting_answers(
-    client: Client, question: Callable[[], Any], workers: Sequence[WorkerInfo]
-) -> Mapping[str, Any]:
-    if not (answers := _answers(client, question, [worker.address for worker in workers])):
+    if workers and not answers:
         raise TooFewWorkersError(
             "The workers of partition 'GPU' left before the run started: their logs say why."
         )
+    for answer in answers.values():
+        if isinstance(answer, BaseException):
+            raise answer
     return answers
 
 
@@ -232,7 +226,7 @@ def common_backend(
     "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on which
     worker casts which scan. LidarpoolError, which ends with `advice`, if a worker lacks it.
     """
-    answers = _casting_answers(client, available_backends, workers)
+    answers = _answers(client, available_backends, [worker.address for worker in workers])
     if wanted == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))

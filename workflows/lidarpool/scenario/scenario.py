@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,17 +13,17 @@ from pydantic import PrivateAttr, Strict, ValidationError
 
 from ..base.declared import Text, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
+from ..base.validation import validation_errors
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.meshfile import SUFFIXES
-from ..sensor.survey import SENSORS_MOST, Steps
+from ..sensor import Material, Navigation
+from ..sensor.survey import SENSORS_MOST, CloudOptions, Steps
 from ..sensor.trajectory import CENTRE
+from ..sensor.weather import Weather
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .sections import (
-    CloudSection,
     CopiesSection,
-    MaterialSection,
-    NavigationSection,
     NoiseSection,
     OutputSection,
     PlanningSection,
@@ -32,12 +33,10 @@ from .sections import (
     SceneSection,
     Section,
     SensorSection,
-    WeatherSection,
     may_be_empty,
     scene_in_short,
 )
 from .traffic import TrafficSection
-from .validation_errors import validation_errors
 
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
@@ -126,7 +125,7 @@ class Scenario(Section):
         ),
     ] = None
     materials: Annotated[
-        tuple[MaterialSection, ...],
+        tuple[Material, ...],
         Strict(False),
         told(
             "materials of objects, by name; the last entry for an object counts",
@@ -136,15 +135,15 @@ class Scenario(Section):
     ] = ()
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
-    weather: Annotated[WeatherSection, may_be_empty(WeatherSection)] = WeatherSection()
+    weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
     navigation: Annotated[
-        NavigationSection | None,
+        Navigation | None,
         told(
             "IMU and GNSS receiver of the carrier, with errors that drift",
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
         ),
     ] = None
-    cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
+    cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()
@@ -254,7 +253,7 @@ class Scenario(Section):
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
                 with mistakes.noted(), prefixed(self._source):
-                    one = section.mounted(self._folder, CENTRE, self.noise, self.returns)
+                    one = section.mounted(self.path, CENTRE, self.noise, self.returns)
                     (one.returns or self.returns).of(one.sensor.optics)
         for path in self.files if mistakes.lines else ():
             if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
@@ -275,11 +274,7 @@ class Scenario(Section):
         for section in (self.sensor, *self.sensors.values()):
             files += [section.calibration]
             files += [section.model] if section.has_own_model else []
-        out = []
-        for file in dict.fromkeys(file for file in files if file):
-            with suppress(LidarpoolError):  # of a user who is not known
-                out.append(self.path(file))
-        return tuple(out)
+        return self.paths(file for file in files if file)
 
     @property
     def folder(self) -> Path:
@@ -297,6 +292,14 @@ class Scenario(Section):
             return self._folder / Path(file).expanduser()
         except RuntimeError as error:
             raise LidarpoolError(f"the file {file!r} cannot be found: {error}") from error
+
+    def paths(self, files: Iterable[str]) -> tuple[Path, ...]:
+        """Paths of files, each once, without those of users who are not known."""
+        out = []
+        for file in dict.fromkeys(files):
+            with suppress(LidarpoolError):
+                out.append(self.path(file))
+        return tuple(out)
 
     @property
     def links(self) -> set[str]:

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
-from ..base.arguments import shown
 from ..base.declared import (
     Angle,
     Coordinate,
@@ -17,8 +19,8 @@ from ..base.declared import (
     Text,
     TextOrTexts,
     Triple,
-    declared,
     is_text,
+    must_be,
     short,
     told,
 )
@@ -27,15 +29,14 @@ from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
 from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
-from ..sensor import Gnss, Imu, Material, Mounted, Navigation, Noise, Pose, Returns, Sensor
+from ..sensor import Mounted, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
 from ..sensor.models import datasheet, load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
-from ..sensor.survey import CloudOptions
-from ..sensor.weather import Weather
 
 COPIES_MOST = 1_000_000  # of one entry
+PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
@@ -139,36 +140,24 @@ MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | Mes
 MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
-class PoseSection(Section, Pose):
-    """Pose of the sensor, in world coordinates."""
-
-    def pose(self) -> Pose:
-        """Return it as a pose."""
-        return Pose(**declared(self, Pose))
-
-
 def _pose(value: Any) -> Any:
     if isinstance(value, list):
         return {"position": value}
-    if not isinstance(value, (dict, PoseSection)):
-        raise ValueError(
-            f"a pose is x, y and z in metres, [0, 0, 1], or position and angles, {{position: "
-            f"[0, 0, 1], yaw_deg: 90}}; given is {shown(value)}."
+    if not isinstance(value, (dict, Pose, CopySection)):
+        raise must_be(
+            "x, y and z in metres, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
+            "yaw_deg: 90}"
         )
     return value
 
 
-PoseEntry = Annotated[
-    PoseSection, BeforeValidator(_pose, json_schema_input_type=Triple | PoseSection)
-]
-
-
+PoseEntry = Annotated[Pose, BeforeValidator(_pose, json_schema_input_type=Triple | Pose)]
 Place = Annotated[
     tuple[Coordinate, ...], Strict(False), Field(min_length=2, max_length=3)
 ]  # x and y, perhaps z
 
 
-class CopySection(PoseSection):
+class CopySection(Section, Pose):
     """Where one of several copies stands; in YAML also just [x, y] or [x, y, z]."""
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
@@ -388,36 +377,32 @@ class SensorSection(Section):
         """Whether its model is a file of the user's."""
         return self.model is not None and self.model.endswith((".yaml", ".yml"))
 
-    def sensor(self, folder: Path) -> Sensor:
-        """Return the lidar, its files from a folder; LidarpoolError if they cannot be used."""
-        given = {
+    def _found(self, path: PathOf) -> str | Path | None:
+        """Return its model, of a user's file its path."""
+        return self.model and (path(self.model) if self.has_own_model else self.model)
+
+    def sensor(self, path: PathOf) -> Sensor:
+        """Return the lidar; LidarpoolError if its files, whose paths are given, cannot be used.
+
+        Equal sections have the same one, unless their files have changed.
+        """
+        limits = {
             name: value
             for name in ("rate_hz", "min_range_m", "max_range_m")
             if (value := getattr(self, name)) is not None
         }
         if self.model is None and self.calibration is None:
             azimuths = self.columns or self.rays_per_revolution
-            fov = self.vertical_fov_deg
-            return Sensor.grid(azimuths, self.layers, fov, self.step_deg, **given)
-        model = self._found(folder)
-        unit = self.calibration
-        return load_sensor(
-            model,
-            calibration=None if unit is None else folder / Path(unit).expanduser(),
-            columns=self.columns,
-            step_deg=self.step_deg,
-            **given,
-        )
-
-    def _found(self, folder: Path) -> str | None:
-        """Its model, a user's file from a folder."""
-        if self.model is None or not self.has_own_model:
-            return self.model
-        return str(folder / Path(self.model).expanduser())
+            return _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
+        model = self._found(path)
+        unit = None if self.calibration is None else path(self.calibration)
+        states = file_states(file for file in (model, unit) if isinstance(file, Path))
+        given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}
+        return _loaded(states, model=model, **given, **limits)
 
     def mounted(
         self,
-        folder: Path,
+        path: PathOf,
         mount: Pose,
         noise: NoiseSection,
         returns: ReturnsSection,
@@ -428,8 +413,8 @@ class SensorSection(Section):
         With `performance: datasheet` it has noise and returns of its own: those of the data sheet,
         but for the fields that the sections give.
         """
-        carried = Mounted(self.sensor(folder), mount, name)
-        model = self._found(folder)
+        carried = Mounted(self.sensor(path), mount, name)
+        model = self._found(path)
         if self.performance == "ideal" or model is None:
             return carried
         sheet = datasheet(model)
@@ -440,14 +425,28 @@ class SensorSection(Section):
         return replace(carried, **own)
 
 
+def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
+    """Return times and sizes of files that are there: others once a file has changed."""
+    states = []
+    for path in files:
+        with suppress(OSError, ValueError):  # which reading the file reports
+            found = path.stat()
+            states.append((path, found.st_mtime_ns, found.st_size))
+    return tuple(states)
+
+
+_grid = lru_cache(Sensor.grid)
+
+
+@lru_cache
+def _loaded(_: object, **given: Any) -> Sensor:
+    return load_sensor(**given)
+
+
 _GRID = {  # {field of a grid: its default}
     name: SensorSection.model_fields[name].default
     for name in ("rays_per_revolution", "layers", "vertical_fov_deg")
 }
-
-
-class CloudSection(Section, CloudOptions):
-    """Which hits become points, and their columns."""
 
 
 class ExportSection(Section):
@@ -492,70 +491,12 @@ class OutputSection(Section):
         return tuple(dict.fromkeys(chain.from_iterable(needed)))
 
 
-class MaterialSection(Section, Material):
-    """Material of objects; the last entry for an object counts."""
-
-
 class ReturnsSection(Section, Returns):
     """Sub-rays of a beam, and which of its returns are reported."""
 
 
 class NoiseSection(Section, Noise):
     """Noise of ranges and angles, lost returns and false ones."""
-
-
-class WeatherSection(Section, Weather):
-    """Extinction of the air, and returns from it."""
-
-
-class InstrumentPose(PoseSection):
-    """Position and angles of an instrument in the carrier's axes."""
-
-    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
-
-
-class ImuSection(Section, Imu):
-    """Inertial measurement unit of the carrier; its noise is named as in kalibr's imu.yaml."""
-
-    mount: Annotated[InstrumentPose, told("its pose in the carrier's axes")] = InstrumentPose()
-
-
-class GnssSection(Section, Gnss):
-    """GNSS receiver of the carrier."""
-
-    mount: Annotated[InstrumentPose, told("pose of its antenna in the carrier's axes")] = (
-        InstrumentPose()
-    )
-
-
-class NavigationSection(Section, Navigation):
-    """IMU and GNSS receiver of the carrier, with errors that drift: imu.csv and gnss.csv."""
-
-    imu: Annotated[
-        ImuSection | None,
-        told(
-            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
-            "/imu/data_raw",
-            {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
-        ),
-    ] = None
-    gnss: Annotated[
-        GnssSection | None,
-        told(
-            "GNSS receiver: positions in gnss.csv, /gnss/fix",
-            {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
-        ),
-    ] = None
-
-    def navigation(self) -> Navigation:
-        """Return them as instruments."""
-        imu, gnss = self.imu, self.gnss
-        return Navigation(
-            imu=imu and Imu(**declared(imu, Imu) | {"mount": imu.mount.pose()}),
-            gnss=gnss and Gnss(**declared(gnss, Gnss) | {"mount": gnss.mount.pose()}),
-            gravity_m_s2=self.gravity_m_s2,
-            seed=self.seed,
-        )
 
 
 class Obstacle(Section):
