@@ -110,7 +110,7 @@ def _run_of_another(folder: Path) -> dict[str, bytes]:
     """Make what a run removes of its own; returns the files."""
     mark = "0123456789abcdef"
     (folder / "parts").mkdir()
-    for name in ("run.owner", f"parts/{mark}-mark", f"parts/{mark}-00000000-00000004.npz"):
+    for name in ("run.owner", f"parts/{mark}-mark", f"parts/{mark}-000000-00000000-00000004.npz"):
         (folder / name).write_text("theirs")
     return _files_of(folder)
 

@@ -10,7 +10,7 @@ from distributed import Client, Worker
 from tests.clusters import thread_cluster
 
 from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
-from lidarpool.pipeline import Crew
+from lidarpool.pipeline import RunDriver
 from lidarpool.run.trials import TrialPump
 from lidarpool.run.watch import WATCH_EVERY_S
 from poolpart import placement_violations, worker_identities
@@ -121,9 +121,9 @@ def test_an_error_in_the_callback_passes_through_and_stops_the_run(
         assert same_cloud(again.cloud, undisturbed.cloud)
 
 
-@pytest.mark.parametrize("pump", [Crew, TrialPump])
+@pytest.mark.parametrize("pump", [RunDriver, TrialPump])
 def test_an_interrupt_while_starting_leaves_nothing(cluster_client, monkeypatch, pump, left_over):
-    method = "open" if pump is Crew else "step"
+    method = "open" if pump is RunDriver else "step"
     original = getattr(pump, method)
 
     def interrupted(self) -> None:
