@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     GetCoreSchemaHandler,
     GetPydanticSchema,
@@ -91,6 +92,7 @@ _ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 _ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
+_OF_FILES = (GetPydanticSchema, BeforeValidator)  # notes of `written_as` and `short`
 _LETTERS = 160  # of a value that is shown
 
 
@@ -197,8 +199,8 @@ def _instances(hint: Any) -> Any:
     """
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        notes = [note for note in hint.__metadata__ if not isinstance(note, GetPydanticSchema)]
-        return Annotated[(_instances(args[0]), *notes)]
+        own = (note for note in hint.__metadata__ if not isinstance(note, _OF_FILES))
+        return Annotated[(_instances(args[0]), *own)]
     if origin in (Union, UnionType):
         kinds = tuple(map(_instances, args))
         return Any if Any in kinds else Union[kinds]  # noqa: UP007 - of as many as there are
@@ -208,7 +210,9 @@ def _instances(hint: Any) -> Any:
             return Any
         items: Any = tuple.__class_getitem__(kinds if origin is tuple else (*kinds, ...))
         return Annotated[items, Strict(False), WrapValidator(_once)]
-    if origin is Literal or hint in (bool, int, float, str, NoneType, datetime):
+    if hint is float:
+        return Annotated[float, WrapValidator(_number)]
+    if origin is Literal or hint in (bool, int, str, NoneType, datetime):
         return hint
     if origin is Callable or origin is Mapping:
         return Callable if origin is Callable else _instance(Mapping)
@@ -226,6 +230,11 @@ def _instance(kind: type) -> Any:
 def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
     # An iterator can be read only once: leave it to the function.
     return value if isinstance(value, Iterator) else handler(value)
+
+
+def _number(value: Any, handler: Callable[[Any], Any]) -> Any:
+    # To pydantic, a truth value of NumPy is a number.
+    return handler(bool(value) if isinstance(value, np.bool_) else value)
 
 
 def _having(protocol: type) -> AfterValidator:
@@ -315,16 +324,12 @@ def _allowed(detail: ErrorDetails, hint: Any) -> str:
         inner = [*classes_in(hint)]
         of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
         examples = [_EXAMPLES[one.__name__] for one in inner if one.__name__ in _EXAMPLES]
-        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples else "")
-    if kind in ("too_short", "too_long"):
-        few = kind == "too_short"
-        count = counted(context["min_length" if few else "max_length"], "entry", "entries")
-        return f"have at {'least' if few else 'most'} {count}"
+        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples and not of else "")
     if not _LIMITS.keys().isdisjoint(context):
         limits = _limits(hint)
         return f"be {_range(limits if context.items() <= limits.items() else context)}"
-    words = detail["msg"].removeprefix("Input should ").removeprefix("it must ")
-    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words
+    words = detail["msg"].replace(" after validation", "").partition(" should ")[2]
+    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words or f"be valid ({detail['msg']})"
 
 
 def _limits(hint: Any) -> dict[str, Any]:

@@ -177,7 +177,7 @@ def no_hits(job: Job) -> str:
 
 def formats_of(scenario: Scenario) -> list[Format]:
     """List the formats that a scenario exports the cloud to."""
-    return [Format(one.format, one.layout) for one in scenario.output.write if one.format != "ply"]
+    return [one for one in scenario.output.write if one.format != "ply"]
 
 
 @contextmanager
