@@ -151,7 +151,11 @@ def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema
 def _check(thing: Any, given: Mapping[str, Any]) -> None:
     """Refuse values, other than defaults, that do not fit the annotations of a thing."""
     usual = _usual(thing)
-    given = {name: value for name, value in given.items() if value is not usual.get(name, usual)}
+    given = {
+        name: bool(value) if isinstance(value, np.bool_) else value  # to pydantic, else a number
+        for name, value in given.items()
+        if value is not usual.get(name, usual)
+    }
     if not given:
         return
     validator, hints = _python(thing)
@@ -210,9 +214,7 @@ def _instances(hint: Any) -> Any:
             return Any
         items: Any = tuple.__class_getitem__(kinds if origin is tuple else (*kinds, ...))
         return Annotated[items, Strict(False), WrapValidator(_once)]
-    if hint is float:
-        return Annotated[float, WrapValidator(_number)]
-    if origin is Literal or hint in (bool, int, str, NoneType, datetime):
+    if origin is Literal or hint in (bool, int, float, str, NoneType, datetime):
         return hint
     if origin is Callable or origin is Mapping:
         return Callable if origin is Callable else _instance(Mapping)
@@ -230,11 +232,6 @@ def _instance(kind: type) -> Any:
 def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
     # An iterator can be read only once: leave it to the function.
     return value if isinstance(value, Iterator) else handler(value)
-
-
-def _number(value: Any, handler: Callable[[Any], Any]) -> Any:
-    # To pydantic, a truth value of NumPy is a number.
-    return handler(bool(value) if isinstance(value, np.bool_) else value)
 
 
 def _having(protocol: type) -> AfterValidator:
