@@ -70,7 +70,7 @@ def allowed(words: str) -> WrapValidator:
 
 def must_be(words: str) -> PydanticCustomError:
     """Return an error of a validator that says what is allowed; the value is said before it."""
-    return PydanticCustomError("allowed", "it must be {words}", {"words": words})
+    return PydanticCustomError("allowed", "Input should be {words}", {"words": words})
 
 
 def is_text(value: Any) -> bool:

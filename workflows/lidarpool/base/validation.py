@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike, DTypeLike
 from pydantic import (
     AfterValidator,
     BaseModel,
+    BeforeValidator,
     ConfigDict,
     GetCoreSchemaHandler,
     GetPydanticSchema,
@@ -91,6 +92,7 @@ _ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 _ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
+_OF_FILES = (GetPydanticSchema, BeforeValidator)  # notes of `written_as` and `short`
 _LETTERS = 160  # of a value that is shown
 
 
@@ -149,7 +151,11 @@ def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema
 def _check(thing: Any, given: Mapping[str, Any]) -> None:
     """Refuse values, other than defaults, that do not fit the annotations of a thing."""
     usual = _usual(thing)
-    given = {name: value for name, value in given.items() if value is not usual.get(name, usual)}
+    given = {
+        name: bool(value) if isinstance(value, np.bool_) else value  # to pydantic, else a number
+        for name, value in given.items()
+        if value is not usual.get(name, usual)
+    }
     if not given:
         return
     validator, hints = _python(thing)
@@ -197,8 +203,8 @@ def _instances(hint: Any) -> Any:
     """
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        notes = [note for note in hint.__metadata__ if not isinstance(note, GetPydanticSchema)]
-        return Annotated[(_instances(args[0]), *notes)]
+        own = (note for note in hint.__metadata__ if not isinstance(note, _OF_FILES))
+        return Annotated[(_instances(args[0]), *own)]
     if origin in (Union, UnionType):
         kinds = tuple(map(_instances, args))
         return Any if Any in kinds else Union[kinds]  # noqa: UP007 - of as many as there are
@@ -315,16 +321,12 @@ def _allowed(detail: ErrorDetails, hint: Any) -> str:
         inner = [*classes_in(hint)]
         of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
         examples = [_EXAMPLES[one.__name__] for one in inner if one.__name__ in _EXAMPLES]
-        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples else "")
-    if kind in ("too_short", "too_long"):
-        few = kind == "too_short"
-        count = counted(context["min_length" if few else "max_length"], "entry", "entries")
-        return f"have at {'least' if few else 'most'} {count}"
+        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples and not of else "")
     if not _LIMITS.keys().isdisjoint(context):
         limits = _limits(hint)
         return f"be {_range(limits if context.items() <= limits.items() else context)}"
-    words = detail["msg"].removeprefix("Input should ").removeprefix("it must ")
-    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words
+    words = detail["msg"].replace(" after validation", "").partition(" should ")[2]
+    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words or f"be valid ({detail['msg']})"
 
 
 def _limits(hint: Any) -> dict[str, Any]:

@@ -6,11 +6,18 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    Strict,
+    model_validator,
+)
 
 from ..base.declared import (
     Angle,
@@ -24,8 +31,9 @@ from ..base.declared import (
     short,
     told,
 )
+from ..base.validation import STRICT
 from ..base.vocabulary import BACKENDS, UNITS_M
-from ..export.table import EXPORTS, FORMATS, LAYOUTS
+from ..export.formats import Format
 from ..plan.planning import Search
 from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
@@ -40,7 +48,17 @@ PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
-Rectangle = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False)]
+
+
+def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if sides[0] >= sides[2] or sides[1] >= sides[3]:
+        raise must_be("[x0, y0, x1, y1], the lowest x and y first")
+    return sides
+
+
+Rectangle = Annotated[
+    tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False), AfterValidator(_upright)
+]
 Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
 Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
 Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
@@ -52,15 +70,10 @@ Length = Annotated[float, Field(gt=0, le=1e4)]
 Lengths = Annotated[tuple[Length, Length, Length], Strict(False)]
 
 
-def _check_rectangle(name: str, sides: tuple[float, float, float, float] | None) -> None:
-    if sides is not None and (sides[0] >= sides[2] or sides[1] >= sides[3]):
-        raise ValueError(f"{name} is [x0, y0, x1, y1]: the lowest x and y come first.")
-
-
 class Section(BaseModel):
     """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = STRICT | ConfigDict(frozen=True)
 
 
 class MeshFile(Section):
@@ -126,7 +139,6 @@ class MeshFile(Section):
             raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
         if 0 in self.scale:
             raise ValueError("scale must not be 0: it would flatten the mesh.")
-        _check_rectangle("window", self.window)
         return self
 
     def transform(self) -> Transform:
@@ -201,7 +213,6 @@ class Scatter(Section):
     def _ordered(self) -> Scatter:
         if not 0 < self.scale[0] <= self.scale[1]:
             raise ValueError("scale is the least and the largest factor, both above 0.")
-        _check_rectangle("within", self.within)
         return self
 
 
@@ -449,25 +460,12 @@ _GRID = {  # {field of a grid: its default}
 }
 
 
-class ExportSection(Section):
-    """A format to export the cloud to; in YAML also just its name."""
-
-    format: Annotated[
-        Literal[tuple(FORMATS)],  # type: ignore[valid-type]
-        told("; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)),
-    ]
-    layout: Annotated[
-        Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        told("layout of points in mcap and rosbag2"),
-    ] = "velodyne"
-
-
 class OutputSection(Section):
     """Further files of the result; the columns that they need are kept."""
 
     write: Annotated[
         tuple[
-            Annotated[ExportSection, short(is_text, lambda v: {"format": v}, Text | ExportSection)],
+            Annotated[Format, short(is_text, lambda v: {"format": v}, Text | Format)],
             ...,
         ],
         Strict(False),
@@ -487,8 +485,7 @@ class OutputSection(Section):
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that the formats need."""
-        needed = (FORMATS[one.format].needed(one.layout) for one in self.write)
-        return tuple(dict.fromkeys(chain.from_iterable(needed)))
+        return tuple(dict.fromkeys(name for one in self.write for name in one.needs))
 
 
 class ReturnsSection(Section, Returns):
