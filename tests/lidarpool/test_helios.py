@@ -9,7 +9,7 @@ import pytest
 from click.testing import CliRunner
 
 from lidarpool import LidarpoolError
-from lidarpool.cli.import_command import import_
+from lidarpool.cli.scenario_commands import import_
 from lidarpool.importers.helios import import_survey
 from lidarpool.sensor.materials import MaterialTable
 from lidarpool.simulator.rig import Rig

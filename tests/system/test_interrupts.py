@@ -36,8 +36,8 @@ WRITING = r"writing the cloud"
 # A run that is never over before whoever is to end it has its turn.
 STAYS_STARTING = """
 import time
-import lidarpool.cli.run_command
-lidarpool.cli.run_command.WorkerLogs = lambda shown: time.sleep(600)
+import distributed
+distributed.Client.register_worker_callbacks = lambda *_: time.sleep(600)
 """
 STAYS_WRITING = """
 import time

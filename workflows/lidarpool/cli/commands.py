@@ -6,7 +6,6 @@ immediate: the imports of a run take a second.
 
 from __future__ import annotations
 
-import json
 import sys
 from collections.abc import Sequence
 from dataclasses import asdict
@@ -25,18 +24,13 @@ from ..base.interrupts import (
     interrupt_on_signals,
 )
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
+from ..base.words import counted
 from . import options
-from .check_command import check
-from .compare_command import compare
-from .export_command import export
-from .import_command import import_
 from .logs import set_logs
-from .plot_command import plot
-from .scenario_commands import init, schema
+from .result_commands import compare, export, plot, view
+from .scenario_commands import check, import_, init, schema
 from .scene_commands import scene
-from .sensor_command import sensors
-from .stations_command import stations
-from .view_command import view
+from .sensor_commands import sensors, stations
 
 if TYPE_CHECKING:
     from ..base.storage import Storage
@@ -68,10 +62,8 @@ _shown = options.together(
 )
 
 
-def _seconds(_: click.Context, __: click.Parameter, text: str | None) -> float | None:
+def _seconds(text: str) -> float:
     """Parse a time such as 90, 90s, 10m or 2h."""
-    if text is None:
-        return None
     unit = {"s": 1, "m": 60, "h": 3600}.get(text[-1:])
     try:
         return float(text[:-1]) * unit if unit else float(text)
@@ -123,7 +115,7 @@ def demo(**given: Any) -> None:
 @click.option(
     "--wait",
     "wait_s",
-    callback=_seconds,
+    type=_seconds,
     metavar="TIME",
     help="How long to wait at the start for the scheduler and for empty partitions, such as 90s "
     f"or 10m; by default {WAIT_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
@@ -131,7 +123,7 @@ def demo(**given: Any) -> None:
 @click.option(
     "--patience",
     "patience_s",
-    callback=_seconds,
+    type=_seconds,
     metavar="TIME",
     help="How long to wait for partitions that become empty later; by default "
     f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
@@ -250,32 +242,21 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
         "backends": {name: reason or "ready" for name, reason in available_backends().items()},
         "workers": [asdict(worker) for worker in workers],
     }
-    if as_json:
-        click.echo(json.dumps(told, indent=1, default=str))
-        return
-    for name, number in told["versions"].items():
-        click.echo(f"{name:<14} {number}")
-    click.echo(f"{'GPUs here':<14} {', '.join(told['gpus']) or 'none'}")
-    click.echo("backends")
-    for name, state in told["backends"].items():
-        click.echo(f"  {name:<12} {state}")
+    lines = [f"{name:<14} {number}" for name, number in told["versions"].items()]
+    lines += [f"{'GPUs here':<14} {', '.join(told['gpus']) or 'none'}", "backends"]
+    lines += [f"  {name:<12} {state}" for name, state in told["backends"].items()]
     if pool is not None:
-        _tell_workers(workers)
-
-
-def _tell_workers(workers: list[Any]) -> None:
-    from ..base.words import counted
-
-    hosts = {worker.host for worker in workers}
-    click.echo(f"cluster: {counted(len(workers), 'worker')} on {counted(len(hosts), 'host')}")
+        hosts = counted(len({worker.host for worker in workers}), "host")
+        lines.append(f"cluster: {counted(len(workers), 'worker')} on {hosts}")
     for worker in workers:
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
         name = f"{worker.name}  " if worker.name != worker.address else ""
-        click.echo(
+        lines.append(
             f"  {held or 'no partition':<12} {name}{worker.address}  "
             f"{counted(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
             f"{counted(len(worker.gpus), 'GPU')}"
         )
+    options.show(told, lines, as_json)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:

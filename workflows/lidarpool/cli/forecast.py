@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import os
 import shutil
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,19 +27,21 @@ from ..base.errors import LidarpoolError, Mistakes
 from ..base.storage import Storage
 from ..base.words import counted
 from ..columns.cloud import CHUNK_POINTS
-from ..export.formats import Format
 from ..export.navigation import instrument_bytes
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..pipeline.policies import most_scans
 from ..report.output import ROOM_BYTES, further_files, refuse_to_replace
-from ..run.checks import check_memory, find_workers, gpu_note, slots_needed
-from ..run.cluster_file import ClusterFile
+from ..run.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
 from ..run.identity import identity_of
-from ..run.job import Job
 from ..run.local import default_workers
+from ..run.options import RunOptions
 from ..run.store import RUN_FOLDER
-from ..scenario.sections import PoolSection
+from ..scenario.advice import advice
+from ..scenario.build import build
+from ..scenario.campaign import Campaign, is_campaign
+from ..scenario.job import Job, job_of
+from ..scenario.scenario import Scenario
 from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
@@ -47,7 +50,8 @@ from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
 from ..simulator.world import check_backend_here
-from .run_command import no_hits
+from .run_command import no_hits, options_of
+from .terminal import shown_status
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
 # caster is built (Embree 300, NumPy 350, CUDA 360).
@@ -66,23 +70,81 @@ SUMMARY_BYTES = 28  # of a scan, in the database
 FORMAT_BYTES = 30  # of a point in an exported file, beside its columns, at most: LAS
 _FINE = 1e-6  # edges below this share of a mesh's size are beyond float32
 
+LOOKED_AT = 5  # jobs of a campaign
 # Rays that are sampled, parts of the survey, and consecutive scans of each part, at most.
 SAMPLE_RAYS, SAMPLE_PARTS, SAMPLE_SCANS = 500_000, 500, 40
 GOLDEN = (5**0.5 - 1) / 2
 
 
-def forecast(
-    job: Job,
-    pool: PoolSection,
-    out: Path | Storage,
-    client: Client | None = None,
-    formats: Sequence[Format] = (),
-    file: ClusterFile | None = None,
-) -> dict[str, Any]:
-    """Find out what a run would do and need, and whether it can run.
+def look_at(
+    path: Path,
+    number: int | None,
+    client: Client | None,
+    *,
+    no_plan: bool,
+    quiet: bool,
+    **given: Any,
+) -> tuple[dict[str, Any], Iterator[str]]:
+    """Find out what the run of a scenario, a campaign or one of its jobs would do and need.
 
-    It runs on the cluster of `client`, on the one that `file` describes, or on one of this machine
-    with the sizes of `pool`. Neither of the latter is started, and `out` is only looked at.
+    It is a run with the options `given`, see `RunOptions`. Of a campaign, some jobs are looked at,
+    the first and the last among them; they plan no paths.
+
+    Returns
+    -------
+    Plain data for JSON, and the same as lines of text.
+    """
+    campaign = Campaign.load(path) if is_campaign(path) else None
+    if campaign is None and number is not None:
+        raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
+
+    def look(one: int = 0) -> tuple[Job, dict[str, Any]]:
+        read = Scenario.load(path) if campaign is None else campaign.scenario(one)
+        assert read is not None, "of a file"
+        with shown_status("reading the scene", quiet, logged=False):
+            built = build(read, plans=campaign is None and not no_plan)
+            job = job_of(built)
+        with shown_status("casting some rays", quiet):
+            found = forecast(job, options_of(read.pool, **given), client)
+        found["notes"] += advice(built)
+        found["sources"] = dict(built.found.sources)
+        if campaign is not None:
+            own = {"number": one, "name": campaign.name(one), "split": campaign.split(one)}
+            names = ("objects", "triangles", "scans", "rays", "estimate")
+            own |= {"values": campaign.values(one)} | {name: found[name] for name in names}
+            found["job"] = own
+        return job, found
+
+    if campaign is None or number is not None:
+        job, found = look(number or 0)
+        return found, _of_job(job, found)
+    campaign.check_files()
+    jobs, notes, mistakes = [], [], Mistakes()
+    for one in dict.fromkeys((campaign.count - 1) * i // (LOOKED_AT - 1) for i in range(LOOKED_AT)):
+        with mistakes.noted():
+            _, found = look(one)
+            jobs.append(found["job"])
+            notes += found["notes"]
+            mistakes.lines += found["reasons"]
+    found = {
+        "can_run": not mistakes.lines,
+        "reasons": list(dict.fromkeys(mistakes.lines)),
+        "notes": list(dict.fromkeys(notes)),
+        "count": campaign.count,
+        "seed": campaign.seed,
+        "choices": dict(campaign.choices),
+        "splits": dict(campaign.splits),
+        "keep": asdict(campaign.keep),
+        "jobs": jobs,
+    }
+    return found, _of_campaign(campaign, found)
+
+
+def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dict[str, Any]:
+    """Find out what the run of a survey would do and need, and whether it can run.
+
+    It runs on the cluster of `client`, on the one that `options` describe, or on one of this
+    machine. Neither of the latter is started, and the folder of the result is only looked at.
 
     Returns
     -------
@@ -90,6 +152,9 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
+    file, out = options.cluster, options.out
+    assert out is not None, "commands write"
+    formats = [one for one in job.outputs if one.format != "ply"]
     mistakes, notes = Mistakes(), []
     with mistakes.noted():
         notes += _look_at_folder(out)
@@ -100,27 +165,40 @@ def forecast(
     for one in formats:
         with mistakes.noted():
             one.check_installed()
-    slots = _slots(job, pool, client, file)
-    # The memory of machines that are not there yet is unknown.
-    memory = 0 if client or file else MEMORY_LIMIT
-    casters, backend = slots[GPU]["there"], None
-    with mistakes.noted():
-        if file is not None:
-            file.require({name: one["needed"] for name, one in slots.items()})
-        elif client is None:
-            check_backend_here(job.backend)
-            usable = [name for name, reason in available_backends().items() if not reason]
-            backend = usable[0] if job.backend == "auto" else job.backend
-            # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
-            check_memory(job, backend, MEMORY_LIMIT / CPU_COUNT, "a GPU worker of this machine")
-        else:
+    required = slots_needed(options, planning=job.planning is not None)
+    casting, backend = None, None
+    memory = 0  # that of machines that are not there yet is unknown
+    if file is not None:
+        there = file.slots
+        with mistakes.noted():
+            file.require(required)
+    elif client is not None:
+        held = [worker.resources for worker in Pool.from_client(client)]
+        there = {name: int(sum(slots.get(name, 0) for slots in held)) for name in required}
+        with mistakes.noted():
             try:
-                everybody, casting, backend, _ = find_workers(client, job, job.backend)
+                everybody, casting, backend, _ = find_workers(client, required, options.backend)
             except PoolError as error:
                 raise LidarpoolError(str(error)) from error
-            casters = len(casting)
+            check_workers(job, options, backend, casting)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
             notes += filter(None, [gpu_note(everybody, casting, backend)])
+    else:
+        workers = default_workers(CPU_COUNT, len(visible_gpus()))
+        there = {
+            GPU: options.gpu_workers or workers[GPU], OTHER: options.other_workers or workers[OTHER]
+        }  # fmt: skip
+        there[LIDAR] = required[LIDAR]  # one worker with as many threads
+        memory = MEMORY_LIMIT
+        with mistakes.noted():
+            check_backend_here(options.backend)
+            usable = [name for name, reason in available_backends().items() if not reason]
+            backend = usable[0] if options.backend == "auto" else options.backend
+            # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
+            each = MEMORY_LIMIT / CPU_COUNT
+            check_memory(job, options, backend, each, "a GPU worker of this machine")
+    slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}
+    casters = slots[GPU]["there"] if casting is None else len(casting)
     estimate = None
     # Casting here needs as much memory as on a worker: it would fail or be killed.
     if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
@@ -133,7 +211,7 @@ def forecast(
     points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
     # Scans of the largest batches; small ones take less.
     on_device = backend == "cuda"
-    fit = scans_that_fit(job.scene, job.survey, job.batch_mb * MB, on_device=on_device)
+    fit = scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=on_device)
     batch = most_scans(fit, job.survey.scan_count, max(1, slots[GPU]["there"]))
     disk = _disk(job, points, batch, len(formats), out)
     stored = isinstance(out, Storage)
@@ -291,23 +369,6 @@ class _FewRays(Sensor):
         return self.whole.begins_ns(some)[row] + self.whole.lead_ns
 
 
-def _slots(
-    job: Job, pool: PoolSection, client: Client | None, file: ClusterFile | None
-) -> dict[str, dict[str, int]]:
-    """Slots of each partition: those needed, and those that exist or would exist."""
-    needed = slots_needed(job)
-    if file is not None:
-        there = file.slots
-    elif client is not None:
-        everybody = Pool.from_client(client)
-        there = {n: int(sum(w.resources.get(n, 0) for w in everybody)) for n in needed}
-    else:
-        workers = default_workers(CPU_COUNT, len(visible_gpus()))
-        there = {GPU: pool.gpu or workers[GPU], OTHER: pool.other or workers[OTHER]}
-        there[LIDAR] = needed[LIDAR]  # one worker with as many threads
-    return {name: {"needed": needed[name], "there": there.get(name, 0)} for name in needed}
-
-
 def _existing(out: Path) -> Path:
     """Return the folder itself, or its innermost existing parent."""
     return next(path for path in (out, *out.absolute().parents) if path.exists())
@@ -352,27 +413,124 @@ def _worker_bytes(job: Job) -> int:
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
     images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
     coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())
-    return PROCESS_BYTES + triangles + coloured + _copies_bytes(job) + patterns
-
-
-def _copies_bytes(job: Job) -> int:
-    return COPY_BYTES * len(job.scene.instances) if job.scene.instances else 0
+    return PROCESS_BYTES + triangles + coloured + COPY_BYTES * _copies(job.scene) + patterns
 
 
 def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
     """Memory of the driver and of all workers but those of GPU, on one machine."""
+    scene = job.scene
     swarm = job.planning.particles * job.planning.waypoints if job.planning else 0
-    other = PROCESS_BYTES + PARTICLE_BYTES * swarm
+    planning = PROCESS_BYTES + PARTICLE_BYTES * swarm
     piece = 6 * (_point_bytes(job) + 24) * min(points, CHUNK_POINTS)  # merged, written, read back
-    shown = job.scene.kept_triangles + DRAWN_TRIANGLES
-    if not job.scene.masked:  # which is cut into more
-        shown = min(job.scene.triangles, shown)
-    driver = (
-        2 * SCENE_BYTES * shown + _copies_bytes(job) + SCAN_BYTES * job.survey.scan_count + piece
-    )
-    planning = other * slots[OTHER]["there"] if OTHER in slots else 0
-    return planning + driver + 2 * PROCESS_BYTES  # of LIDAR and the driver
+    shown = scene.kept_triangles + DRAWN_TRIANGLES
+    if not scene.masked:  # which is cut into more
+        shown = min(scene.triangles, shown)
+    driver = 2 * SCENE_BYTES * shown + COPY_BYTES * _copies(scene) + piece
+    driver += SCAN_BYTES * job.survey.scan_count
+    return planning * slots.get(OTHER, {"there": 0})["there"] + driver + 2 * PROCESS_BYTES
+
+
+def _copies(scene: Scene) -> int:
+    return len(scene.instances) if scene.instances else 0
 
 
 def _point_bytes(job: Job) -> int:
     return sum(np.dtype(column.dtype).itemsize for column in job.survey.stored_columns)
+
+
+def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
+    """Print what was found out of a campaign as lines of text."""
+    kept = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
+    yield f"campaign    {counted(campaign.count, 'job')}, seed {campaign.seed}, kept as {kept}"
+    for name, words in campaign.choices.items():
+        yield f"varied      {name}: {words}"
+    if campaign.splits:
+        shares = ", ".join(f"{name} {share:.4g}" for name, share in campaign.splits.items())
+        yield f"splits      {shares}"
+    for job in found["jobs"]:
+        yield f"job         {_in_words(job)}"
+        points = ""
+        if job["estimate"]:
+            points = f", about {job['estimate']['points']:,} points"
+        yield (
+            f"            {counted(job['objects'], 'object')}, {counted(job['scans'], 'scan')}, "
+            f"{job['rays']:,} rays{points}"
+        )
+    if found["jobs"]:
+        share = campaign.count / len(found["jobs"])
+        scans = round(share * sum(job["scans"] for job in found["jobs"]))
+        rays = round(share * sum(job["rays"] for job in found["jobs"]))
+        points = sum((job["estimate"] or {"points": 0})["points"] for job in found["jobs"])
+        yield (
+            f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
+            f"points, judged by {counted(len(found['jobs']), 'job')}"
+        )
+    for note in found["notes"]:
+        yield f"note: {note}"
+
+
+def _in_words(job: dict[str, Any]) -> str:
+    shown = {k: f"{v:.6g}" if isinstance(v, float) else v for k, v in job["values"].items()}
+    values = ", ".join(f"{name} {value}" for name, value in shown.items())
+    split = f" ({job['split']})" if job["split"] else ""
+    return f"{job['name']}{split}{': ' if values else ''}{values}"
+
+
+def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
+    """Print a forecast as lines of text."""
+    sensor, estimate, disk = job.survey.sensor, found["estimate"], found["disk"]
+    if "job" in found:
+        yield f"job         {_in_words(found['job'])}"
+    turn = f"{sensor.channels:,} a firing"
+    if sensor.period is not None and sensor.cycle != "frame":
+        turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
+    yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
+    for file, taken in found["sources"].items():
+        yield f"file        {file}: {taken}"
+    sides = list(zip("xyz", *found["bounds"], strict=True))
+    spans = ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
+    yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
+    if masked := found["masked"]:
+        have = "object has masks" if len(masked) == 1 else "objects have masks"
+        shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
+        yield f"masks       {len(masked):,} {have}: {shown}"
+    drive = found["drive"]
+    where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
+    several = len(job.survey.carried) > 1
+    turn = f"{len(job.survey.carried)} sensors" if several else turn
+    yield f"survey      {counted(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
+    if drive:
+        yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
+        for one in drive["sensors"]:
+            turns = ""
+            if one["turns"]:
+                turns = f", {one['turns']:,.2f} {one['cycle']}s; in one the carrier moves "
+                turns += f"{one['metres_a_turn']:,.3f} m"
+            firings = counted(one["firings"], "firing")
+            yield f"{one['name'] or 'sensor':<11} {one['model']}, {firings}{turns}"
+    returns = job.survey.returns_each[0]
+    if drive or returns != type(returns)():
+        rays = f", {returns.subrays} sub-rays a beam" if returns.subrays > 1 else ""
+        yield f"returns     {returns.mode} of each pulse{rays}"
+    if alpha := job.survey.extinction(sensor):
+        left = f"{100 * math.exp(-100 * alpha):.2g} % of the light from 50 m is left"
+        yield f"air         takes {1000 * alpha:.3g}/km: {left}"
+    if estimate:
+        yield (
+            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "
+            f"from {estimate['rays']:,} rays cast here"
+        )
+    yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
+    backend = found["backend"]
+    kind = {None: "", "cuda": "GPU "}.get(backend, "CPU ")
+    workers = counted(found["casters"], f"{kind}worker")
+    yield f"cast by     {workers} ({backend or 'backend not known yet'})"
+    for name, slots in found["slots"].items():
+        yield f"{name:<10}  {counted(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
+    there = found["memory"]["there"]
+    limit = f" of {format_bytes(there)}" if there else ""
+    yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"
+    parts, result, free = (format_bytes(disk[name]) for name in ("parts", "result", "free"))
+    yield f"disk        about {parts} during the run and {result} for the result; {free} free"
+    for note in found["notes"]:
+        yield f"note: {note}"

@@ -10,7 +10,9 @@ import warnings
 def set_logs(shown: bool) -> None:
     """Show log messages and warnings of libraries in this process, or drop them.
 
-    The command itself tells users what matters. For a log file, redirect the output of `-v`.
+    The command itself tells users what matters. For a log file, redirect the output of `-v`. In
+    workers that share the terminal, too: the driver reports a failed task once, and Dask's worker
+    would log it as well, with a traceback.
     """
     logging.disable(logging.NOTSET if shown else logging.CRITICAL)
     if shown:

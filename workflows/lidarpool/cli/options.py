@@ -1,14 +1,16 @@
-"""Options that several commands have."""
+"""Options and output that several commands have."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import json
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial, reduce, wraps
 from pathlib import Path
 from typing import Any
 
 import click
 
+from ..base.storage import Storage, is_url
 from ..base.vocabulary import BACKENDS
 
 Command = Callable[..., None]
@@ -22,11 +24,7 @@ class Place(click.Path):
 
     def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
         """Give a Path, or a Storage."""
-        if "://" not in str(value):
-            return super().convert(value, param, ctx)
-        from ..base.storage import Storage
-
-        return Storage.at(value)
+        return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
 
 
 flag = partial(click.option, is_flag=True)
@@ -96,3 +94,11 @@ def scheduler(command: Command) -> Command:
     return click.option(
         "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
     )(with_files)
+
+
+def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
+    """Print figures as one JSON document, or else what they say as lines of text."""
+    if as_json:
+        lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
+    for line in lines:
+        click.echo(line)

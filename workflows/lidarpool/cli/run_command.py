@@ -7,6 +7,7 @@ import math
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +49,6 @@ from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .logs import set_logs
 from .terminal import shown_progress, shown_status, tell
-from .worker_logs import WorkerLogs
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,7 @@ class Terminal(Screen):
                 client = stack.enter_context(cluster)
             if own:  # its workers share the terminal
                 set_logs(self.verbose)
-                client.register_plugin(WorkerLogs(self.verbose))
+                client.register_worker_callbacks(partial(set_logs, self.verbose))
             yield client
 
 

@@ -1,15 +1,23 @@
-"""The commands that help to write a scenario: `lidarpool init` and `lidarpool schema`."""
+"""The commands before a run: `lidarpool init`, `import`, `check` and `schema`."""
 
 from __future__ import annotations
 
 import os
 import shlex
+from contextlib import nullcontext
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import click
 
 from ..base.errors import LidarpoolError
+from ..base.storage import Storage
 from ..base.vocabulary import UNITS_M
+from ..base.words import counted
+from . import options
+
+if TYPE_CHECKING:
+    from ..run.connection import TlsFiles
 
 
 @click.command()
@@ -95,6 +103,105 @@ def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> d
         )
     said = {"file": Path(os.path.relpath(path, folder)).as_posix()}
     return said | {k: v for k, v in (("unit", unit), ("up_axis", up_axis)) if v}
+
+
+@click.command(name="import")
+@click.argument("survey", metavar="SURVEY.xml", type=click.Path(path_type=Path))
+@click.option(
+    "--assets",
+    metavar="DIR",
+    type=click.Path(path_type=Path, exists=True, file_okay=False),
+    multiple=True,
+    help="Folder where references in the survey start; may be given several times.  "
+    "[default: the survey's, and those above it]",
+)
+@click.option(
+    "--out",
+    "-o",
+    metavar="DIR",
+    type=click.Path(path_type=Path),
+    help="Folder for the scenario.  [default: named after the survey]",
+)
+def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
+    """Write a HELIOS++ survey as a scenario.
+
+    Unsupported features are listed, one line each. Mesh files stay where they are.
+
+    \b
+    Examples:
+      lidarpool import helios/data/surveys/toyblocks/als_toyblocks.xml
+      lidarpool import survey.xml --assets helios/python/pyhelios -o surveys/wood
+    """  # noqa: D301 - click wants the character, not its name
+    from ..importers.helios import import_survey
+
+    made = import_survey(survey, out or Path(survey.stem), assets)
+    sensors, files = len(made.scenario.sensors), len(made.scenario.scene.files)
+    name = click.format_filename(made.path)
+    click.echo(f"{name}: {counted(sensors, 'sensor')}, {counted(files, 'mesh file')}")
+    for line in made.left_out:
+        click.echo(f"not supported: {line}")
+    click.echo(f"next: lidarpool check {shlex.quote(str(made.path))}")
+
+
+@click.command()
+@click.argument("scenario", type=click.Path(path_type=Path))
+@options.out
+@options.scheduler
+@options.cluster
+@options.backend
+@options.no_plan
+@options.job
+@options.as_json
+def check(
+    scenario: Path,
+    out: Path | Storage,
+    scheduler: str | None,
+    files: TlsFiles,
+    cluster: Path | None,
+    backend: str | None,
+    no_plan: bool,
+    number: int | None,
+    as_json: bool,
+) -> None:
+    """Show what a run would do and need.
+
+    The scenario is checked; nothing is started. Of a campaign, the values that vary, and five of
+    its jobs.
+
+    Some rays are cast here to estimate the number of points. The exit code is 0 if it can run,
+    and 2, with the reasons, if it cannot.
+
+    \b
+    Examples:
+      lidarpool check scenario.yaml
+      lidarpool check campaign.yaml --job 17
+      lidarpool check hall.glb --no-plan --scheduler tcp://127.0.0.1:8786 --json
+    """  # noqa: D301 - click wants the character, not its name
+    from ..run.cluster_file import ClusterFile
+    from ..run.connection import connected
+    from .forecast import look_at
+
+    try:
+        file = None if cluster is None else ClusterFile.load(cluster)
+        with nullcontext() if scheduler is None else connected(scheduler, files) as client:
+            found, lines = look_at(
+                scenario, number, client, no_plan=no_plan, quiet=as_json,
+                backend=backend, out=out, cluster=file,
+            )  # fmt: skip
+    except LidarpoolError as error:
+        if as_json:
+            options.show({"can_run": False, "reasons": [str(error)], "notes": []}, (), True)
+        raise
+    options.show(found, lines, as_json)
+    if found["reasons"]:
+        raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
+    if not as_json:
+        words = ["lidarpool", "run", str(scenario)]
+        given: dict[str, Any] = {"out": out, "scheduler": scheduler, "cluster": cluster}
+        for name, value in (given | {"backend": backend, "job": number}).items():
+            wanted = value is not None and str(value) != "lidarpool-out"
+            words += [f"--{name}", str(value)] if wanted else []
+        click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
 
 
 @click.command()

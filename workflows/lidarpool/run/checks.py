@@ -60,8 +60,9 @@ def find_workers(
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
     software that a resumed run was cast with. Workers that are missing or just died, or whose jobs
-    are in the queue, are waited for as long as `waiting` says. If scans are `left` to be cast, slots
-    are wanted of partitions that grow with their work. `writing` says that jobs are written, too.
+    are in the queue, are waited for as long as `waiting` says. If scans are `left` to be cast,
+    slots are wanted of partitions that grow with their work. `writing` says that jobs are written,
+    too.
 
     LidarpoolError if workers, slots `needed` or the backend are missing, or versions differ.
     """
@@ -116,9 +117,19 @@ def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker
         )
     if min(tasks.batch_mb * MB, all_scans) > room:
         raise JobError(
-            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give GPU workers a larger "
-            "--memory-limit."
+            f"batch_mb is {tasks.batch_mb:,}, {limit}: make it smaller, or give GPU workers a "
+            "larger --memory-limit."
         )
+
+
+def check_workers(
+    job: Job, tasks: TaskOptions, backend: str, casting: Iterable[WorkerInfo]
+) -> None:
+    """Check that casting workers have memory for a job; JobError if not."""
+    for worker in casting:
+        if worker.memory:
+            each = worker.memory / max(1, worker.resources[GPU])
+            check_memory(job, tasks, backend, each, f"the GPU worker at {worker.address}")
 
 
 def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Pool:
@@ -180,7 +191,7 @@ def common_software(
     Workers with another are refused one by one when they are prepared. LidarpoolError if none has
     the earlier one.
     """
-    answers = _casting_answers(client, software_there(backend), workers)
+    answers = _answers(client, software_there(backend), [worker.address for worker in workers])
     if earlier and dict(earlier) not in answers.values():
         address, there = next(iter(answers.items()))
         raise LidarpoolError(
@@ -198,19 +209,13 @@ def _answers(
 ) -> Mapping[str, Any]:
     """Return what the workers at these addresses answer; the first error of one is raised."""
     answers = ask_workers(client, question, workers)
-    for answer in answers.values():
-        if isinstance(answer, BaseException):
-            raise answer
-    return answers
-
-
-def _casting_answers(
-    client: Client, question: Callable[[], Any], workers: Sequence[WorkerInfo]
-) -> Mapping[str, Any]:
-    if not (answers := _answers(client, question, [worker.address for worker in workers])):
+    if workers and not answers:
         raise TooFewWorkersError(
             "The workers of partition 'GPU' left before the run started: their logs say why."
         )
+    for answer in answers.values():
+        if isinstance(answer, BaseException):
+            raise answer
     return answers
 
 
@@ -231,7 +236,7 @@ def common_backend(
     "auto" is resolved here, once: if each worker chose for itself, a cloud would depend on which
     worker casts which scan. LidarpoolError, which ends with `advice`, if a worker lacks it.
     """
-    answers = _casting_answers(client, available_backends, workers)
+    answers = _answers(client, available_backends, [worker.address for worker in workers])
     if wanted == "auto":
         names = next(iter(answers.values()))
         return next(n for n in names if not any(reasons[n] for reasons in answers.values()))

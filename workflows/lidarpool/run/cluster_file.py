@@ -38,6 +38,17 @@ class Workers(BaseModel):
     slots: int = Field(1, ge=1, le=10_000)
     hosts: list[str] | None = Field(None, min_length=1)
 
+    @property
+    def most(self) -> int:
+        """Workers that there may be."""
+        if self.adapt:
+            return self.adapt[1]
+        counted = self.hosts and "workers" not in self.model_fields_set
+        return len(self.hosts or ()) if counted else self.workers
+
+    def __str__(self) -> str:
+        return f"{self.adapt[0]} to {self.most}" if self.adapt else str(self.most)
+
     def wrong(self) -> str:
         """Say what is wrong with the number of workers; empty if nothing is."""
         if self.adapt is None:
@@ -74,13 +85,13 @@ class ClusterFile(BaseModel):
             told = [f"{path}: {line}" for line in validation_errors(error, cls)]
             raise LidarpoolError("\n".join(told)) from error
         file._source = str(path)
-        for name in file.partitions:
+        for name, workers in file.partitions.items():
             if name not in (GPU, LIDAR, OTHER):
                 raise LidarpoolError(
                     f"{path}: partitions.{name} is not a partition of a survey: GPU, LIDAR or "
                     f"OTHER.{did_you_mean(name, (GPU, LIDAR, OTHER))}"
                 )
-            if wrong := file.partitions[name].wrong():
+            if wrong := workers.wrong():
                 raise LidarpoolError(f"{path}: partitions.{name}.{wrong}")
         file._factory()
         return file
@@ -88,7 +99,7 @@ class ClusterFile(BaseModel):
     @property
     def slots(self) -> dict[str, int]:
         """Slots of each partition, the most that it may have."""
-        return {name: self._count(name) * one.slots for name, one in self.partitions.items()}
+        return {name: one.most * one.slots for name, one in self.partitions.items()}
 
     def require(self, needed: Mapping[str, int]) -> None:
         """Check that the partitions have so many slots; LidarpoolError if not."""
@@ -100,8 +111,8 @@ class ClusterFile(BaseModel):
                 )
 
     def __str__(self) -> str:
-        parts = ", ".join(f"{name} {self._range(name)}" for name in self.partitions)
-        total = counted(sum(map(self._count, self.partitions)), "worker")
+        parts = ", ".join(f"{name} {workers}" for name, workers in self.partitions.items())
+        total = counted(sum(one.most for one in self.partitions.values()), "worker")
         total = f"up to {total}" if any(one.adapt for one in self.partitions.values()) else total
         return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
 
@@ -113,18 +124,13 @@ class ClusterFile(BaseModel):
         start, or does not take an argument.
         """
         arguments = dict(self.arguments)
-        partitions = {
-            name: one.model_dump(exclude_unset=True) for name, one in self.partitions.items()
-        }
+        partitions = self.model_dump(exclude_unset=True)["partitions"]
         factory = self._factory()
         heard: list[str] = []
         try:
             if factory is SSHCluster:
-                common = {
-                    option: arguments.pop(option)
-                    for option in ("worker_options", "worker_class")
-                    if option in arguments
-                }
+                shared = {"worker_options", "worker_class"} & arguments.keys()
+                common = {option: arguments.pop(option) for option in shared}
                 partitions = {name: common | own for name, own in partitions.items()}
                 for option, key, value in (
                     ("scheduler_options", "idle_timeout", _IDLE),
@@ -147,18 +153,6 @@ class ClusterFile(BaseModel):
             ) from error
         with cluster:
             yield cluster
-
-    def _count(self, name: str) -> int:
-        one = self.partitions[name]
-        if one.adapt:
-            return one.adapt[1]
-        return (
-            len(one.hosts) if one.hosts and "workers" not in one.model_fields_set else one.workers
-        )
-
-    def _range(self, name: str) -> str:
-        adapt = self.partitions[name].adapt
-        return f"{adapt[0]} to {adapt[1]}" if adapt else str(self._count(name))
 
     def _factory(self) -> Any:
         """Import the class; only clusters are taken."""

@@ -1,8 +1,7 @@
-"""The command `lidarpool stations`: where to put a terrestrial scanner, and what it sees there."""
+"""The commands `lidarpool sensors`, and `stations`, which plans where to put a scanner."""
 
 from __future__ import annotations
 
-import json
 import math
 import os
 import shlex
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
+from ..base.words import counted
 from . import options
 
 if TYPE_CHECKING:
@@ -23,16 +23,84 @@ SCENARIO_FILE, PICTURE_FILE = "stations.yaml", "stations.png"
 _OBJECTS_TOLD = 12
 
 
-def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> float | None:
+@click.command()
+@click.argument("model", required=False, metavar="[MODEL|FILE.yaml]")
+@click.option(
+    "--out",
+    type=click.Path(path_type=Path),
+    metavar="FILE.png",
+    help="File for the picture.  [default: named after the model]",
+)
+def sensors(model: str | None, out: Path | None) -> None:
+    """List sensor models, or draw the beams of one.
+
+    \b
+    Examples:
+      lidarpool sensors
+      lidarpool sensors velodyne/vlp16 --out vlp16.png
+    """  # noqa: D301 - click wants the character, not its name
+    from ..sensor.models import datasheet, load_sensor, model_names, read_model, shown_noise
+
+    if model is None:
+        heads = ("model", "channels", "field of view", "range", "turns a second", "points a second")
+        rows = [heads, *map(_row, model_names())]
+        widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+        for row in rows:
+            click.echo("  ".join(map(str.ljust, row, widths)).rstrip())
+        return
+    described = read_model(model)
+    from ..render.beam_picture import draw_beams  # imports Matplotlib, which lists do not need
+
+    target = out or Path("-".join(Path(model).with_suffix("").parts[-2:]) + ".png")
+    if target.suffix.lower() != ".png":
+        raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
+    click.echo(described.name)
+    for figure, source in described.sources.items():
+        click.echo(f"{figure:<11}  {source}")
+    if described.performance is not None:
+        sheet = datasheet(model)
+        click.echo(f"{'noise':<11}  {shown_noise(sheet.noise)}")
+        returns = f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"
+        click.echo(f"{'returns':<11}  {returns}")
+        if sheet.missing:
+            click.echo(f"{'unknown':<11}  {', '.join(sheet.missing)}")
+    draw_beams(target, load_sensor(model))
+    click.echo(click.format_filename(target))
+
+
+def _row(name: str) -> tuple[str, ...]:
+    """Name of a model, channels, field of view, range, rates, points a second."""
+    import numpy as np
+
+    from ..sensor.models import load_sensor, read_model
+
+    model = read_model(name)
+    low, high = model.range_m or (0.0, float("inf"))
+    rates = dict.fromkeys(model.rates_hz or (model.rate_hz,))
+    firings, rate = model.turn(None, None)
+    beams = model.beams
+    channels = len(beams.elevation_deg) or len(beams.time_us) or 1
+    if model.needs_calibration:
+        view = "by the unit's file"
+    elif model.mirror:
+        view = f"{model.mirror.width_deg:g}° across, below"
+    elif model.prisms:
+        ahead = load_sensor(name).directions(np.arange(20_000))[..., 0].min()
+        view = f"{2 * np.degrees(np.arccos(ahead)):.1f}° circle ahead"
+    else:
+        view = f"360° x {min(beams.elevation_deg):.1f}° to {max(beams.elevation_deg):.1f}°"
+    turns, points = " to ".join(f"{one:g}" for one in rates), f"{firings * rate * channels:,.0f}"
+    return name, f"{channels:,}", view, f"{low:g} to {high:g} m", turns, points
+
+
+def _share(text: str) -> float:
     """Parse a percentage such as 95% or 95."""
-    if value is None:
-        return None
     try:
-        share = float(value.removesuffix("%")) / 100
+        share = float(text.removesuffix("%")) / 100
     except ValueError:
         share = math.nan
     if not (0.01 <= share <= 1):
-        raise click.BadParameter(f"{value!r} is not 1% to 100%: give a percentage, such as 95%.")
+        raise click.BadParameter(f"{text!r} is not 1% to 100%: give a percentage, such as 95%.")
     return share
 
 
@@ -48,7 +116,7 @@ def _share(ctx: click.Context, param: click.Parameter, value: str | None) -> flo
 @click.option("--count", type=click.IntRange(1, 100), help="Number of stations.")
 @click.option(
     "--coverage",
-    callback=_share,
+    type=_share,
     metavar="SHARE",
     help="Choose until this share of what can be seen is covered, such as 95%; without --count "
     "and --coverage, for as long as each station adds 1%.",
@@ -131,22 +199,18 @@ def stations(
         )
     if count is not None and len(plan.stations) < count:
         notes.append(f"{len(plan.stations)} of {count} stations already see all that can be seen")
-    if as_json:
-        click.echo(json.dumps(_figures(plan, built.scene.names, sensor.model, notes), indent=1))
-        return
-    for line in _told(plan, built.scene.names):
-        click.echo(line)
-    for note in notes:
-        click.echo(f"note: {note}")
-    click.echo(f"stations in {click.format_filename(folder)}: {SCENARIO_FILE}, {PICTURE_FILE}")
-    click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
+    figures = _figures(plan, built.scene.names, sensor.model, notes)
+    lines = [*_told(plan, built.scene.names), *(f"note: {note}" for note in notes)]
+    options.show(figures, lines, as_json)
+    if not as_json:
+        click.echo(f"stations in {click.format_filename(folder)}: {SCENARIO_FILE}, {PICTURE_FILE}")
+        click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
 def _scenario(read: Scenario, base: Path, folder: Path, model: str, plan: StationPlan) -> str:
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
-    from ..base.words import counted
     from ..scenario.scenario import MESH_CLOUD
 
     def moved(file: str) -> str:
@@ -197,7 +261,6 @@ def _figures(
 
 def _told(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
     """Print a plan as lines of text: stations, then objects, those with most left first."""
-    from ..base.words import counted
     from ..render.page import without_common_prefix
 
     yield (

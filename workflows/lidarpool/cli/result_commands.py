@@ -1,0 +1,261 @@
+"""The commands for finished results: `lidarpool plot`, `export`, `view` and `compare`."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..base.errors import LidarpoolError
+from ..base.storage import Storage
+from ..base.vocabulary import PICTURES
+from ..export.table import EXPORTS, LAYOUTS
+from . import options
+
+
+def _size(text: str) -> tuple[int, int]:
+    """Parse width and height in pixels from a text such as 1600x1000."""
+    if found := re.fullmatch(r"(\d{1,6})[xX×](\d{1,6})", text):
+        return int(found[1]), int(found[2])
+    raise click.BadParameter(
+        f"{text!r} is not a picture size: give width x height in pixels, such as 1600x1000."
+    )
+
+
+@click.command()
+@options.result
+@click.option(
+    "--only",
+    type=click.Choice(PICTURES),
+    multiple=True,
+    help="Picture to draw; may be given several times.  [default: all]",
+)
+@click.option(
+    "--size",
+    type=_size,
+    metavar="WxH",
+    default="1600x1000",
+    show_default=True,
+    help="Width and height in pixels.",
+)
+@options.copies
+@click.option(
+    "--colour",
+    metavar="COLUMN",
+    default="z",
+    show_default=True,
+    help="Column to colour the points of the cloud by; rgb for red, green and blue.",
+)
+def plot(
+    result: Path | Storage,
+    only: tuple[str, ...],
+    size: tuple[int, int],
+    out: Path | Storage | None,
+    colour: str,
+) -> None:
+    """Draw the pictures of a result again.
+
+    \b
+    Examples:
+      lidarpool plot lidarpool-out
+      lidarpool plot lidarpool-out --only cloud --colour intensity --size 2400x1500 --out figures
+    """  # noqa: D301 - click wants the character, not its name
+    from ..base.fork_server import keep_freed_memory
+    from ..export.folder import local_folder, local_result, send
+    from ..report.pictures import draw_pictures
+    from ..run.picture_file import PICTURE_FILE, Pictured
+
+    place = result if out is None else out
+    with local_result(result, (PICTURE_FILE, "cloud.ply")) as made:
+        if not (made / PICTURE_FILE).exists():
+            raise LidarpoolError(
+                f"{result} holds no {PICTURE_FILE}, the data of the pictures: give the "
+                "folder of a finished run (its --out)."
+            )
+        keep_freed_memory()
+        shown, cloud = Pictured.load(made / PICTURE_FILE), made / "cloud.ply"
+        with local_folder(place) as folder:
+            for path in draw_pictures(shown, cloud, folder, only, size, colour):
+                click.echo(click.format_filename(send(path, place)))
+
+
+@click.command()
+@options.result
+@click.option(
+    "--format",
+    "-f",
+    "formats",
+    type=click.Choice(list(EXPORTS)),
+    multiple=True,
+    required=True,
+    help="Format to write; may be given several times.",
+)
+@click.option(
+    "--layout",
+    type=click.Choice(list(LAYOUTS)),
+    default="velodyne",
+    show_default=True,
+    help="Layout of points in mcap and rosbag2.",
+)
+@options.copies
+@options.overwrite
+def export(
+    result: Path | Storage,
+    formats: tuple[str, ...],
+    layout: str,
+    out: Path | Storage | None,
+    overwrite: bool,
+) -> None:
+    """Write the cloud of a finished result in other formats.
+
+    \b
+    Examples:
+      lidarpool export lidarpool-out --format laz
+      lidarpool export lidarpool-out --format mcap --layout autoware --out bags
+    """  # noqa: D301 - click wants the character, not its name
+    from ..columns.cloud_file import CloudFile
+    from ..export.folder import local_result, result_folder, send
+    from ..export.formats import Format
+    from ..export.navigation import FILES as INSTRUMENT_FILES
+    from ..export.sweeps import SWEEPS_FILE, Sweeps
+
+    # The report of a result is moved into place last.
+    needed = ("cloud.ply", SWEEPS_FILE, "report.json")
+    place = result if out is None else out
+    if isinstance(result, Path) and result.is_file():
+        raise LidarpoolError(f"{result} is a file: give its folder, {result.parent}.")
+    with local_result(result, (*needed, *INSTRUMENT_FILES)) as made:
+        for name in needed:
+            if not (made / name).exists():
+                raise LidarpoolError(
+                    f"{result} holds no {name}: give the folder of a finished run (its --out); "
+                    "lidarpool run --resume continues an unfinished one."
+                )
+        sweeps = Sweeps.load(made / SWEEPS_FILE)
+        cloud = CloudFile(made / "cloud.ply")
+        wanted = [Format(name, layout) for name in dict.fromkeys(formats)]
+        written: list[str] = []
+        with result_folder(place) as folder:
+            for one in wanted:  # before any is written, which may take long
+                one.check(folder / one.file, cloud, overwrite=overwrite)
+                if isinstance(place, Storage) and not overwrite and one.file in place.entries():
+                    raise LidarpoolError(
+                        f"{place.path(one.file)} is there already: give another place with --out, "
+                        "or --overwrite."
+                    )
+            try:
+                for one in wanted:
+                    one.write(folder / one.file, cloud, sweeps, overwrite=overwrite)
+                    written.append(click.format_filename(send(folder / one.file, place)))
+                    for note in one.notes(cloud):
+                        click.echo(f"note: {note}", err=True)
+                    click.echo(written[-1])
+            except (LidarpoolError, KeyboardInterrupt) as error:
+                if written:
+                    error.add_note(f"Written before: {', '.join(written)}.")
+                raise
+
+
+@click.command()
+@click.argument("result", type=options.Place())
+@click.option(
+    "--port",
+    type=click.IntRange(0, 65_535),
+    default=8080,
+    show_default=True,
+    help="Port on 127.0.0.1, or the next free one; 0 for any.",
+)
+@options.flag("--no-browser", help="Only print the address.")
+def view(result: Path | Storage, port: int, no_browser: bool) -> None:
+    """Show a result or a cloud in the browser.
+
+    \b
+    Examples:
+      lidarpool view lidarpool-out
+      lidarpool view lidarpool-out/cloud.ply --no-browser
+    """  # noqa: D301 - click wants the character, not its name
+    from ..export.folder import local_result
+    from ..export.sweeps import SWEEPS_FILE
+    from ..live.result_page import CLOUD, view_result
+    from ..run.picture_file import PICTURE_FILE
+
+    with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:
+        view_result(made, port=port, browser=not no_browser)
+
+
+@click.command()
+@click.argument("a", metavar="A", type=click.Path(path_type=Path))
+@click.argument("b", metavar="B", type=click.Path(path_type=Path))
+@click.option(
+    "--out",
+    type=click.Path(file_okay=False, path_type=Path),
+    default=Path("lidarpool-compare"),
+    show_default=True,
+    help="Folder for compare.html, compare.json and pictures; earlier ones are replaced.",
+)
+@click.option(
+    "--sweep",
+    "sweeps",
+    type=click.IntRange(0),
+    metavar="N",
+    multiple=True,
+    help="Compare only this pair of sweeps, from 0; may be given several times.",
+)
+@click.option(
+    "--match",
+    type=click.Choice(["order", "time"]),
+    default="order",
+    show_default=True,
+    help="Which sweeps belong together.",
+)
+@click.option("--sensor-a", metavar="NAME", help="Sensor of A, or topic of a bag, of several.")
+@click.option("--sensor-b", metavar="NAME", help="The same of B.")
+@click.option("--intensity-a", metavar="COLUMN", help="Column of A to compare as intensity.")
+@click.option("--intensity-b", metavar="COLUMN", help="The same of B.")
+@click.option(
+    "--azimuth-deg",
+    type=click.FloatRange(0, 90, min_open=True),
+    help="Width of a cell of the range images; by default the step from pulse to pulse.",
+)
+@click.option(
+    "--distance",
+    "distances_m",
+    type=click.FloatRange(0, min_open=True),
+    metavar="METRES",
+    multiple=True,
+    help="Distance for the F-score; may be given several times.  [default: 0.05 0.1 0.2 0.5]",
+)
+@click.option(
+    "--most-points",
+    type=click.IntRange(1000),
+    default=10_000_000,
+    show_default=True,
+    help="Points of a cloud without sweeps that are held in memory.",
+)
+@options.as_json
+def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
+    """Compare two clouds or recordings of the same place; B is the reference.
+
+    A and B: the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz,
+    a bag of ROS 2 (.mcap, or its folder). Sweeps of one sensor are compared by range images, in
+    the axes of the sensor; clouds without rings by nearest neighbours alone.
+
+    \b
+    Examples:
+      lidarpool compare noisy clean
+      lidarpool compare result recording.mcap --sensor-b /lidar/points --out compared
+      lidarpool compare scan.laz earlier.laz --distance 0.05
+    """  # noqa: D301 - click wants the character, not its name
+    from ..base.fork_server import keep_freed_memory
+    from ..report.comparison import DISTANCES_M
+    from ..report.comparison import compare as compared
+
+    keep_freed_memory()
+    given["distances_m"] = given["distances_m"] or DISTANCES_M
+    given["sweeps"] = given["sweeps"] or None
+    found = compared(a, b, **given)
+    page = next(path for path in found.save(out) if path.suffix == ".html")
+    words = [repr(found), f"page     {click.format_filename(page)}"]
+    options.show(found.figures, words, as_json)
