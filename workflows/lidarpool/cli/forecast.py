@@ -51,7 +51,7 @@ from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
 from ..simulator.world import check_backend_here
 from .run_command import no_hits, options_of
-from .terminal import shown_status
+from .terminal import Terminal
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
 # caster is built (Embree 300, NumPy 350, CUDA 360).
@@ -98,13 +98,15 @@ def look_at(
     if campaign is None and number is not None:
         raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
 
+    terminal = Terminal(quiet)
+
     def look(one: int = 0) -> tuple[Job, dict[str, Any]]:
         read = Scenario.load(path) if campaign is None else campaign.scenario(one)
         assert read is not None, "of a file"
-        with shown_status("reading the scene", quiet, logged=False):
+        with terminal.status("reading the scene", logged=False):
             built = build(read, plans=campaign is None and not no_plan)
             job = job_of(built)
-        with shown_status("casting some rays", quiet):
+        with terminal.status("casting some rays"):
             found = forecast(job, options_of(read.pool, **given), client)
         found["notes"] += advice(built)
         found["sources"] = dict(built.found.sources)

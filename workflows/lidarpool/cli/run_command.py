@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
-from distributed import Client
 
 from ..base.declared import declared
 from ..base.errors import LidarpoolError
@@ -35,9 +32,7 @@ from ..report.report import summary
 from ..run.conductor import Conductor
 from ..run.jobs import OneJob
 from ..run.options import RunOptions
-from ..run.progress import Show
 from ..run.result import CampaignRun, RunResult
-from ..run.screen import Screen
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, build
@@ -48,42 +43,7 @@ from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .logs import set_logs
-from .terminal import shown_progress, shown_status, tell
-
-
-@dataclass(frozen=True)
-class Terminal(Screen):
-    """Tells the user of a command."""
-
-    quiet: bool = False
-    verbose: bool = False
-    as_json: bool = False
-
-    def tell(self, words: str) -> None:
-        """Print a note."""
-        if not self.quiet:
-            tell(f"note: {words}")
-
-    def status(self, words: str) -> AbstractContextManager[None]:
-        """Show what is going on while the body runs."""
-        return shown_status(words, self.quiet)
-
-    def progress(self) -> AbstractContextManager[Show]:
-        """Show bars or lines while the body runs."""
-        return shown_progress(self.quiet)
-
-    @contextmanager
-    def starting(
-        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
-    ) -> Iterator[Client]:
-        """Show a status until the cluster has started; its workers log as this process does."""
-        with ExitStack() as stack:
-            with self.status(words):
-                client = stack.enter_context(cluster)
-            if own:  # its workers share the terminal
-                set_logs(self.verbose)
-                client.register_worker_callbacks(partial(set_logs, self.verbose))
-            yield client
+from .terminal import Terminal
 
 
 def options_of(pool: PoolSection, backend: str | None = None, **given: Any) -> RunOptions:
@@ -103,7 +63,7 @@ def run_scenario(
     options = options_of(scenario.pool, **given)
     if options.own:  # before reading the scene, which may take long
         check_backend_here(options.backend)
-    with shown_status("reading the scene", terminal.quiet, logged=False):
+    with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = job_of(built)
     _run_survey(built, job, options, terminal, only)
