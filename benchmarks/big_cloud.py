@@ -48,7 +48,8 @@ def make_parts(storage: Storage, points: int) -> StoredCloud:
     for number in range(max(1, points // rows)):
         counts = np.full(PER_PART, PER_SCAN, np.int64)
         tally = np.zeros(0, np.int32), np.zeros(0, np.int64)
-        part = PartColumns(number * PER_PART, counts, columns, *tally)
+        of_scans = counts.astype(np.uint32), np.zeros((PER_PART, 1, 3), np.float32)
+        part = PartColumns(number * PER_PART, counts, columns, *tally, *of_scans)
         names.append(f"{number:08d}.npz")
         storage.write(names[-1], pack(part))
     cells = np.array([[0, 0, 0], [90_000] * 3], np.int64)

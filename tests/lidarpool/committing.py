@@ -5,24 +5,29 @@ from __future__ import annotations
 import numpy as np
 
 from lidarpool.columns.parts import PartColumns, pack, part_name
-from lidarpool.pipeline.messages import Receipt, samples_of_scan, summary_type
+from lidarpool.pipeline.messages import Receipt, samples_of_scan
 
 
-def commit(store, first, counts, triangles, hits):
-    """Write a part of scans, with so many points of each, and commit it; whether it was new."""
+def commit(store, first, counts, triangles, hits, job=None):
+    """Write a part of scans, with so many points of each, and commit it; whether it was new.
+
+    It is of the only job of a run, or of one that is under way.
+    """
     rng = np.random.default_rng(first)
-    counts, survey = np.array(counts), store.job.survey
+    job = job or store.only.job
+    counts, survey = np.array(counts), job.survey
     columns = {
         c.name: rng.integers(0, 2, counts.sum()).astype(c.dtype) for c in survey.stored_columns
     }
-    part = PartColumns(first, counts, columns, np.int32(triangles), np.int64(hits))
-    data, name = bytes(pack(part)), part_name(store.db.meta["mark"], first, part.stop)
+    of_scans = np.zeros(len(counts), np.uint32)
+    of_scans[0] = sum(hits)
+    ends = np.zeros((len(counts), samples_of_scan(survey.scan_count), 3), np.float32)
+    ends[..., 0] = first
+    triangles, hits = np.int32(triangles), np.int64(hits)
+    part = PartColumns(first, counts, columns, triangles, hits, of_scans, ends)
+    data = bytes(pack(part))
+    name = part_name(store.db.meta["mark"], job.number, first, part.stop)
     store.storage.prepare()
     store.storage.write(name, data)
-    summaries = np.zeros(len(counts), summary_type(samples_of_scan(survey.scan_count)))
-    summaries["samples"] = [first, 0, 0]
-    box = () if part.cells is None else tuple(part.cells.ravel().tolist())
-    receipt = Receipt(
-        first, part.stop, name, len(part), len(data), sum(hits), box, summaries.tobytes()
-    )
+    receipt = Receipt.of_part(part, job.number, name, len(data))
     return store.db.commit([receipt]) == [receipt]

@@ -74,7 +74,7 @@ def write_set(
     ]
     for row in rows:
         if row.done:
-            data.write_job(row.number, row.name, points_of(scene, row.number), sweeps)
+            data.write_job(row, points_of(scene, row.number), sweeps)
     data.finish(rows)
     write_table(data.place, ["rain"], rows)
     return data

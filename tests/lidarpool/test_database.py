@@ -6,6 +6,7 @@ import os
 import sqlite3
 import subprocess
 import sys
+from contextlib import closing
 
 import numpy as np
 import pytest
@@ -24,9 +25,12 @@ SCANS = 20
 MARK = "0123456789abcdef"
 
 
-def receipt(first, stop, rows=7, cells=(0, 0, 0, 1, 1, 1)):
-    name = part_name(MARK, first, stop)
-    return Receipt(first, stop, name, rows, 100 + rows, 3 * rows, cells, b"summary")
+JOB = 7
+
+
+def receipt(first, stop, rows=7, cells=(0, 0, 0, 1, 1, 1), job=JOB):
+    name = part_name(MARK, job, first, stop)
+    return Receipt(job, first, stop, name, rows, 100 + rows, 3 * rows, cells, b"summary")
 
 
 @pytest.fixture(autouse=True)
@@ -39,14 +43,15 @@ def mark(monkeypatch):
 
 @pytest.fixture
 def db(tmp_path):
-    made = RunDatabase(tmp_path / "run.db", SCANS)
+    made = RunDatabase(tmp_path / "run.db")
+    made.job(JOB, SCANS)
     yield made
     made.close()
 
 
 def reopened(db):
     db.close()
-    return RunDatabase(db.path, SCANS)
+    return RunDatabase(db.path)
 
 
 def test_what_is_committed_is_there_once(db):
@@ -55,7 +60,7 @@ def test_what_is_committed_is_there_once(db):
     assert db.commit([one]) == []
     assert db.commit([receipt(0, 5), receipt(0, 4)]) == []
     again = reopened(db)
-    for found in (db, again):
+    for found in (db.job(JOB, SCANS), again.job(JOB, SCANS)):
         assert [p.name for p in found.ordered] == [one.name, two.name]
         assert (found.scans_done, found.point_count, found.hits) == (7, 9, 27)
         assert found.committed.nonzero()[0].tolist() == [0, 1, 2, 3, 4, 10, 11]
@@ -67,8 +72,8 @@ def test_what_is_committed_is_there_once(db):
 @given(
     st.lists(
         st.lists(
-            st.tuples(st.integers(0, SCANS - 1), st.integers(1, 6)).map(
-                lambda span: (span[0], min(span[0] + span[1], SCANS))
+            st.tuples(st.integers(0, 1), st.integers(0, SCANS - 1), st.integers(1, 6)).map(
+                lambda span: (span[0], span[1], min(span[1] + span[2], SCANS))
             ),
             max_size=4,
         ),
@@ -77,23 +82,25 @@ def test_what_is_committed_is_there_once(db):
 )
 def test_whatever_comes_each_scan_is_of_one_part_or_missing(tmp_path_factory, commits):
     path = tmp_path_factory.mktemp("db") / "run.db"
-    db, owners = RunDatabase(path, SCANS), {}
+    db, owners = RunDatabase(path), [{}, {}]
+    jobs = [db.job(number, SCANS) for number in range(2)]
     for spans in commits:
-        for part in db.commit([receipt(first, stop) for first, stop in spans]):
+        for part in db.commit([receipt(first, stop, job=job) for job, first, stop in spans]):
             for scan in range(part.first, part.stop):
-                assert scan not in owners
-                owners[scan] = part.name
+                assert scan not in owners[part.job]
+                owners[part.job][scan] = part.name
     again = reopened(db)
-    for found in (db, again):
-        assert found.missing(0, SCANS) == runs(set(range(SCANS)) - set(owners))
-        assert found.missing(5, 9) == runs(set(range(5, 9)) - set(owners))
+    for found in (*jobs, *(again.job(number, SCANS) for number in range(2))):
+        mine = owners[found.number]
+        assert found.missing(0, SCANS) == runs(set(range(SCANS)) - set(mine))
+        assert found.missing(5, 9) == runs(set(range(5, 9)) - set(mine))
         for scan in range(SCANS):
-            if scan in owners:
-                assert found.part_of(scan).name == owners[scan]
+            if scan in mine:
+                assert found.part_of(scan).name == mine[scan]
             else:
                 with pytest.raises(KeyError):
                     found.part_of(scan)
-        assert found.scans_done == len(owners)
+        assert found.scans_done == len(mine)
         assert [p.first for p in found.ordered] == sorted(p.first for p in found.ordered)
     again.close()
 
@@ -108,59 +115,118 @@ def runs(scans):
 def test_parts_that_are_dropped_are_missing_again(db):
     parts = [receipt(0, 4), receipt(4, 8), receipt(8, 20)]
     db.commit(parts)
-    db.drop([parts[1]])
+    db.drop(JOB, [parts[1]])
     again = reopened(db)
-    for found in (db, again):
+    for found in (db.job(JOB, SCANS), again.job(JOB, SCANS)):
         assert found.missing(0, SCANS) == [(4, 8)]
         assert (found.scans_done, found.point_count, found.hits) == (16, 14, 42)
     assert again.commit([receipt(4, 6), receipt(6, 8)]) == [receipt(4, 6), receipt(6, 8)]
-    assert again.missing(0, SCANS) == [] and not again.complete
-    again.frames = SCANS
-    assert again.complete
+    assert found.missing(0, SCANS) == [] and found.complete
+    found.has_frames = True
+    assert not found.complete
+    found.count_frame(SCANS - 1)
+    assert found.complete
     again.close()
 
 
 def test_frames_that_were_handed_out_are_kept_with_the_next_commit(db):
+    job = db.job(JOB, SCANS)
     db.commit([receipt(0, 4), receipt(4, 8), receipt(12, 16)])
-    db.frames = 5
-    assert [p.first for p in db.unframed()] == [4, 12]
-    db.frames = 4
-    assert [p.first for p in db.unframed()] == [4, 12]
-    db.frames = 8
-    assert [p.first for p in db.unframed()] == [12]
+    for scan, firsts in ((4, [4, 12]), (3, [4, 12]), (7, [12])):
+        job.count_frame(scan)
+        assert [p.first for p in job.unframed()] == firsts
     db.commit([receipt(8, 12)])
-    db.frames = 10
+    job.count_frame(9)
     again = reopened(db)
-    assert again.frames == 8, "those since are handed out once more"
-    again.frames = 10
+    job = again.job(JOB, SCANS)
+    assert job.frames == 8, "those since are handed out once more"
+    job.count_frame(9)
     again.save_frames()
     last = reopened(again)
-    assert last.frames == 10
-    assert [(p.first, p.summaries) for p in last.unframed()] == [(8, b"summary"), (12, b"summary")]
-    assert last.part_of(0).summaries == b"", "of those that are out nobody needs them in memory"
-    assert last.summaries_of([13, 0, 1, 9]) == [(0, b"summary"), (8, b"summary"), (12, b"summary")]
+    job = last.job(JOB, SCANS)
+    assert job.frames == 10
+    assert [(p.first, p.summaries) for p in job.unframed()] == [(8, b"summary"), (12, b"summary")]
+    assert job.part_of(12).summaries == b"", "nobody needs them in memory"
+    assert job.summaries_of([13, 0, 1, 9]) == [(0, b"summary"), (8, b"summary"), (12, b"summary")]
     last.close()
 
 
 def test_the_cells_of_all_parts(db):
-    assert db.cells is None
+    job = db.job(JOB, SCANS)
+    assert job.cells is None
     db.commit([receipt(0, 1, cells=()), receipt(1, 2, cells=(-5, 0, 3, 0, 9, 4))])
-    assert db.cells.tolist() == [[-5, 0, 3], [0, 9, 4]]
+    assert job.cells.tolist() == [[-5, 0, 3], [0, 9, 4]]
     db.commit([receipt(2, 3, cells=(0, -7, 3, 1, 1, 2**40))])
-    assert reopened(db).cells.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
+    assert reopened(db).job(JOB, SCANS).cells.tolist() == [[-5, -7, 3], [1, 9, 2**40]]
 
 
 def test_values_and_trials_come_back(db):
     planning = Planning((0, 0), (9, 1), [(5, 0)], 1.0, trials=2, particles=10, iterations=5)
     trials = [run_trial(planning, number) for number in (1, 0)]
-    for trial in trials:
-        db.add_trial(trial)
+    db.add_trials(JOB, trials[:1])
+    db.add_trials(JOB, trials[1:])
     db.set(backend="numpy", note="π")
     again = reopened(db)
     assert again.meta["backend"] == "numpy" and again.meta["note"] == "π"
-    assert [t.trial for t in again.trials] == [0, 1]
-    for one, two in zip(again.trials, reversed(trials), strict=True):
+    assert again.begun == [JOB] and again.used
+    found = again.job(JOB, SCANS).trials
+    assert [t.trial for t in found] == [0, 1]
+    for one, two in zip(found, reversed(trials), strict=True):
         assert np.array_equal(one.waypoints, two.waypoints) and one.length == two.length
+    again.close()
+
+
+# -- jobs ------------------------------------------------------------------------------------------
+
+
+def test_of_a_job_that_has_ended_a_row_is_left(db):
+    other = db.job(9, SCANS)
+    db.commit([receipt(0, 5), receipt(0, 5, job=9)])
+    assert db.begun == [JOB, 9]
+    db.end_jobs([(JOB, False, {"points": 3}), (2, True, {"error": "too large"})])
+    assert db.under_way == {9: other} and db.commit([receipt(5, 9)]) == []
+    again = reopened(db)
+    for found in (db, again):
+        assert [found.ended(number) for number in (0, 2, JOB, 8, 10**6)] == [
+            False, True, True, False, False,
+        ]  # fmt: skip
+        assert [*found.failed()] == [2] and found.ended_count == 2
+    assert again.begun == [9] and again.job(9, SCANS).scans_done == 5
+    assert [*again.job_rows()] == [{"error": "too large"}, {"points": 3}]
+    again.close()
+
+
+def test_jobs_that_are_forgotten_are_done_again(db):
+    assert not db.used
+    db.end_jobs([(number, number == 2, {}) for number in (1, 2)])
+    db.end_jobs([(2, False, {"points": 1})])
+    assert [*db.failed()] == []
+    db.forget_jobs([1, 2])
+    assert db.ended_count == 0 and not db.ended(1) and db.used
+    again = reopened(db)
+    assert again.used and not again.begun and again.ended_count == 0
+    again.close()
+
+
+def test_a_job_that_is_restarted_has_nothing(db):
+    job = db.job(JOB, SCANS)
+    db.commit([receipt(0, 5)])
+    job.count_frame(4)
+    db.save_frames()
+    db.restart(JOB)
+    assert (job.scans_done, job.frames, job.parts) == (0, 0, {}) and db.begun == []
+    assert db.commit([receipt(0, 6)])
+    db.restart(8)
+    again = reopened(db)
+    assert again.job(JOB, SCANS).frames == 0 and again.job(JOB, SCANS).scans_done == 6
+    again.close()
+
+
+def test_thousands_of_jobs_take_little_memory_and_time(db):
+    db.end_jobs((number, number % 1000 == 0, {"points": number}) for number in range(50_000))
+    again = reopened(db)
+    assert again.ended_count == 50_000 and len([*again.failed()]) == 50
+    assert not again.under_way and len(again._ended) < 100_000
     again.close()
 
 
@@ -181,7 +247,8 @@ DAMAGE = {
     "zeros": lambda path: path.write_bytes(bytes(8192)),
     "of something else": lambda path: sql(path, "DROP TABLE parts"),
     "cells": lambda path: sql(path, "UPDATE parts SET cells = '{'"),
-    "trial of nothing": lambda path: sql(path, "INSERT INTO trials VALUES (0, '{}')"),
+    "trial of nothing": lambda path: sql(path, "INSERT INTO trials VALUES (7, 0, '{}')"),
+    "jobs without numbers": lambda path: sql(path, "INSERT INTO jobs VALUES (-1, 0, '{}')"),
     "place of another run": lambda path: sql(
         path, "INSERT INTO meta VALUES ('parts', '/data/run-fedcba9876543210')"
     ),
@@ -197,17 +264,20 @@ def test_a_damaged_file_is_refused_and_left_alone(db, damage):
     db.close()
     DAMAGE[damage](db.path)
     before = db.path.read_bytes()
-    with pytest.raises(LidarpoolError, match=r"run\.db (is damaged|cannot be written) \(.*\): "):
-        RunDatabase(db.path, SCANS)
+    with (
+        pytest.raises(LidarpoolError, match=r"run\.db (is damaged|cannot be written) \(.*\): "),
+        closing(RunDatabase(db.path)) as opened,
+    ):
+        opened.job(JOB, SCANS)
     assert db.path.read_bytes() == before
 
 
 def test_a_file_that_cannot_be_made(tmp_path):
     with pytest.raises(LidarpoolError, match=r"run\.db cannot be written .*give another folder"):
-        RunDatabase(tmp_path / "none" / "run.db", SCANS)
+        RunDatabase(tmp_path / "none" / "run.db")
     (tmp_path / "run.db").mkdir()
     with pytest.raises(LidarpoolError, match="cannot be written"):
-        RunDatabase(tmp_path / "run.db", SCANS)
+        RunDatabase(tmp_path / "run.db")
 
 
 def test_one_run_at_a_time(db, tmp_path):
@@ -215,7 +285,7 @@ def test_one_run_at_a_time(db, tmp_path):
     code = (
         "import sys; from pathlib import Path\n"
         "from lidarpool.pipeline.database import RunDatabase\n"
-        f"try: RunDatabase(Path(sys.argv[1]), {SCANS})\n"
+        "try: RunDatabase(Path(sys.argv[1]))\n"
         "except Exception as error: print(type(error).__name__, error)\n"
     )
     done = subprocess.run(
@@ -227,6 +297,6 @@ def test_one_run_at_a_time(db, tmp_path):
     )
     assert done.stdout.strip() == f"LidarpoolError Another run is using {tmp_path}."
     with pytest.raises(LidarpoolError, match="Another run is using"):  # nor in this process
-        RunDatabase(db.path, SCANS)
+        RunDatabase(db.path)
     assert db.commit([receipt(5, 6)])
     reopened(db).close()

@@ -48,7 +48,7 @@ def written(tmp_path, job, sweeps):
         place = tmp_path / format
         data = DataSet(Storage.at(place), format, layout)
         for number in jobs:
-            data.write_job(number, f"{number:03}", job(number), sweeps)
+            data.write_job(JobRow(number, f"{number:03}"), job(number), sweeps)
         data.finish(JobRow(number, f"{number:03}") for number in jobs)
         return data, place
 
@@ -162,14 +162,14 @@ def test_the_same_job_has_the_same_bytes_and_can_be_undone(written, job, sweeps,
     assert before and not [name for name in before if "lidarpool-" in Path(name).name]
     moved = pickle.loads(pickle.dumps(data))
     assert len(pickle.dumps(data)) < 500
-    moved.write_job(1, "001", job(1), sweeps)
+    moved.write_job(JobRow(1, "001"), job(1), sweeps)
     assert files_of(place) == before
     only = tmp_path / "only"
     other, listing = DataSet(Storage.at(only), format), Listing(str(only))
     for number in (7, 0):
-        other.write_job(number, f"{number:03}", job(number), sweeps)
+        other.write_job(JobRow(number, f"{number:03}"), job(number), sweeps)
     before = files_of(only)
-    other.write_job(1, "001", job(1), sweeps, listing=listing)
+    other.write_job(JobRow(1, "001"), job(1), sweeps, listing=listing)
     listing.prune(listing.files)
     assert files_of(only) == before and not [*only.rglob("001")]
     other.finish([JobRow(0, "000"), JobRow(1, "001", error="failed"), JobRow(7, "007")])
@@ -178,7 +178,7 @@ def test_the_same_job_has_the_same_bytes_and_can_be_undone(written, job, sweeps,
 
 def _write(data: DataSet, cloud: Cloud, sweeps: Sweeps) -> None:
     for _ in range(5):
-        data.write_job(3, "003", cloud, sweeps)
+        data.write_job(JobRow(3, "003"), cloud, sweeps)
 
 
 @pytest.mark.parametrize("format", ["kitti", "mcap"])
@@ -191,7 +191,7 @@ def test_two_processes_write_a_job_at_once(job, sweeps, tmp_path, format):  # no
     for process in two:
         process.join(60)
         assert process.exitcode == 0
-    DataSet(Storage.at(tmp_path / "one"), format).write_job(3, "003", job(3), sweeps)
+    DataSet(Storage.at(tmp_path / "one"), format).write_job(JobRow(3, "003"), job(3), sweeps)
     assert files_of(tmp_path / "both") == files_of(tmp_path / "one")
 
 
@@ -219,7 +219,7 @@ def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeyp
         write(storage, name, data)
 
     monkeypatch.setattr(Storage, "write", look)
-    DataSet(Storage.at(tmp_path), "kitti").write_job(0, "0", job(0), sweeps)
+    DataSet(Storage.at(tmp_path), "kitti").write_job(JobRow(0, "0"), job(0), sweeps)
     assert max(held) < 16 * len(job(0)) / 3
 
 
@@ -253,13 +253,22 @@ def test_a_manifest_lists_the_files_of_a_job(written, format):  # noqa: A002
     ]
 
 
+def test_a_manifest_says_what_became_of_a_job_and_what_made_it(job, sweeps, tmp_path):
+    data = DataSet(Storage.at(tmp_path), "kitti", made_with={"backend": "numpy"})
+    row = JobRow(4, "004", "train", {"rain": 0.5}, scans=9, seconds=1.5)
+    made = data.write_job(row, job(4), sweeps)
+    assert (made.points, made.seconds, len(made.sha256)) == (len(job(4)), 1.5, 64)
+    found = replace(made, seconds=0.0)  # the rest is the same in each run
+    assert [*data.rows({"005"})] == [(found, {"backend": "numpy"})] and [*data.rows({"004"})] == []
+
+
 def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
     """One of each: a file of Parquet is not a sweep, and has no boxes of actors."""
     one = Survey(Sensor.grid(360, 4), [(0, 0, 1)], steps=SCANS)
     only, cloud = Sweeps.of(one, scene), job(0)
     cloud = cloud.part(np.flatnonzero(cloud.scan < SCANS))
     assert len(only) == 1 and only.actors
-    DataSet(Storage.at(tmp_path), "parquet").write_job(0, "0", cloud, only)
+    DataSet(Storage.at(tmp_path), "parquet").write_job(JobRow(0, "0"), cloud, only)
     with np.load(tmp_path / "boxes/0.npz") as kept:
         np.testing.assert_allclose(kept["centres"][0], Boxes.of(only, 0, cloud).centres)
 
@@ -270,20 +279,20 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
         DataSet(place, "las")
     bare = Cloud(job(0).positions, {"scan": job(0).scan})
     with pytest.raises(LidarpoolError, match="kitti needs object, intensity, class"):
-        DataSet(place, "kitti").write_job(0, "0", bare, sweeps)
+        DataSet(place, "kitti").write_job(JobRow(0, "0"), bare, sweeps)
     assert DataSet(place, "kitti").columns == ("scan", "object", "intensity", "class")
     assert DataSet(place, "folder").columns == ()
     assert "range" in DataSet(place, "mcap", "ouster").columns
     half = replace(sweeps, scans=sweeps.scans[:4], begins_ns=sweeps.begins_ns[:3])
     with pytest.raises(LidarpoolError, match="not in the order of their scans, or of another"):
-        DataSet(place, "kitti").write_job(0, "0", job(0), half)
+        DataSet(place, "kitti").write_job(JobRow(0, "0"), job(0), half)
     with pytest.raises(LidarpoolError, match=r"Job 5 of .* is not whole: its \.jobs/5\.json"):
         DataSet(place, "kitti").finish([JobRow(5, "5")])
     assert not (tmp_path / "d" / INDEX_FILE).exists()
     (tmp_path / "file").write_text("")
     with pytest.raises(LidarpoolError, match=r"Job 0 cannot be written to .*file") as told:
-        DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(0, "0", job(0), sweeps)
+        DataSet(Storage.at(tmp_path / "file"), "kitti").write_job(JobRow(0, "0"), job(0), sweeps)
     assert "\n" not in str(told.value)
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
     with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[parquet\]"'):
-        DataSet(place, "parquet").write_job(0, "0", job(0), sweeps)
+        DataSet(place, "parquet").write_job(JobRow(0, "0"), job(0), sweeps)

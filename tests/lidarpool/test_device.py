@@ -188,12 +188,11 @@ def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeyp
     for name in (backend, "numpy"):
         rig = Rig(scenes["both"], survey, name)
         monkeypatch.setattr(cast, "rig_of", lambda *_, rig=rig: rig)
-        tasks.append(pickle.loads(pickle.dumps(cast.intersect("a run", spans), protocol=5)))
+        done = cast.intersect([cast.CastWork(0, "a run", spans)], (), None, None)
+        tasks.append(pickle.loads(pickle.dumps(done, protocol=5)))
     for mine, other in zip(*tasks, strict=True):
-        assert pack(mine.part) == pack(other.part)
-        for field in ("hits", "points"):
-            assert np.array_equal(mine.summaries[field], other.summaries[field])
-        samples, exact = mine.summaries["samples"], other.summaries["samples"]
+        samples, exact = mine.part.samples, other.part.samples
+        assert pack(mine.part) == pack(replace(other.part, samples=samples))
         assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
 
 

@@ -13,12 +13,20 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import LidarpoolError, Scene, Sensor, Survey
+from lidarpool import Scene, Sensor, Survey
 from lidarpool.base.storage import Storage
-from lidarpool.pipeline import Crew, JobError, RigPlan, driver, policies
+from lidarpool.pipeline import (
+    JobError,
+    RunDatabase,
+    RunDriver,
+    casting,
+    collecting,
+    driver,
+    jobs,
+    policies,
+)
 from lidarpool.pipeline.batches import PIECES, Place
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.pipeline.driver import STALL_S, SurveyDriver
+from lidarpool.pipeline.driver import ANNOUNCED, STALL_S
 from lidarpool.pipeline.long_stages import StageChanges
 from lidarpool.pipeline.messages import (
     ColumnsLost,
@@ -35,8 +43,8 @@ from poolpart import TaskRecord, Whereabouts
 
 SCANS = 60
 SURVEY = Survey(Sensor.grid(rays_per_revolution=SCANS, layers=1, step_deg=6), [(0, 0, 1)], SCANS)
-PLAN = RigPlan(Scene.seed(), SURVEY, "numpy")
-SUMMARY = summary_type(samples_of_scan(SCANS))
+TINY = Survey(Sensor.grid(rays_per_revolution=5, layers=1, step_deg=72), [(0, 0, 1)], 5)
+SCENE = Scene.seed()
 GONE = "tcp://gone:1"
 
 
@@ -44,14 +52,16 @@ class Workers:
     """Workers that cast a batch when they are told to."""
 
     notes = futures = pending = ()
+    backend = "numpy"
 
     def __init__(self):
         self.jobs = {}  # {job: plan}
         self.slots = {"tcp://a:1": 1, "tcp://b:1": 1}
         self.silent = set()
-        self.casts = {}  # {key: (spans, worker, outcome)}
-        self.tried = Counter()  # {(first, stop): casting tasks}
+        self.casts = {}  # {key: (batches, worker, outcome)}
+        self.tried = Counter()  # {(job, first, stop): casting tasks}
         self.most = 0  # batches of a task
+        self.tasks = 0  # so far
         self.released = False
         self.wanted = []
         self._joined = 0
@@ -70,6 +80,7 @@ class Workers:
 
     def add(self, job, plan):
         self.jobs[job] = plan
+        return str(id(plan.scene))
 
     def remove(self, job):
         del self.jobs[job]
@@ -77,16 +88,22 @@ class Workers:
     def want(self, slots):
         self.wanted.append(slots)
 
-    def cast(self, job, spans, worker):
-        assert worker in self.slots and job in self.jobs
-        self.tried.update(spans)
-        self.most = max(self.most, len(spans))
-        key = f"{job}.{spans[0][0]}.{sum(self.tried.values())}"
-        self.casts[key] = (spans, worker, Outcome.PENDING)
-        return key
+    def cast(self, batches, worker):
+        assert worker in self.slots
+        assert len({id(self.jobs[job].scene) for job, _ in batches}) == 1
+        self.tried.update((job, *span) for job, span in batches)
+        self.most = max(self.most, len(batches))
+        self.tasks += 1
+        self.casts[f"cast-{self.tasks}"] = (batches, worker, Outcome.PENDING)
+        return f"cast-{self.tasks}"
 
-    def outcome(self, job, key, worker):
-        return self.casts[key][-1]
+    def outcome(self, key, worker):
+        batches, _, outcome = self.casts[key]
+        if isinstance(outcome, JobError) and len({job for job, _ in batches}) > 1:
+            return Outcome.DIVIDE
+        if isinstance(outcome, JobError):
+            raise outcome
+        return outcome
 
     def forget(self, key):
         self.casts.pop(key, None)
@@ -135,10 +152,10 @@ class Stages:
         self._storage, self._workers = storage, workers
         self._following = Counter()  # {job: the scan that the sorter waits for}
 
-    # what the crew asks for
+    # what the driver asks for
 
     def open(self):
-        pass
+        self._storage.prepare()
 
     def look(self, progress):
         changes, self.changes = self.changes, StageChanges()
@@ -181,7 +198,7 @@ class Stages:
         if self.wanted and self.described:
             one = self.described.popleft()
             stop = min(one.scan_count, one.first + self.advice)
-            self.inbox.append(ScanRange(one.first, stop, one.job))
+            self.inbox.append(ScanRange(one.job, one.first, stop))
             if stop < one.scan_count:
                 self.described.appendleft(replace(one, first=stop))
 
@@ -189,13 +206,13 @@ class Stages:
         """Write the parts of an order, or hold them; a task that is not there is reported."""
         there = order.worker in self._workers.slots and order.key in self._workers.casts
         return (
-            [self._part(order.job, *span, name, held_at) for span, name in order.parts]
+            [self._part(job, *span, name, held_at) for job, span, name in order.parts]
             if there
-            else [ColumnsLost(order.key, order.job)]
+            else [ColumnsLost(order.key)]
         )
 
     def _part(self, job, first, stop, name, held_at):
-        data = f"scans {first} to {stop}".encode()
+        data = f"job {job}, scans {first} to {stop}".encode()
         if held_at:
             self.held[name] = data
         else:
@@ -204,8 +221,8 @@ class Stages:
         summaries["hits"] = range(first, stop)
         record = TaskRecord("intersect", "GPU", "a", ("GPU",), 0.0, self.seconds, stop - first)
         return Receipt(
-            first, stop, name, 1, len(data), 1, (), summaries.tobytes(), record, held_at, job,
-        )  # fmt: skip
+            job, first, stop, name, 1, len(data), 1, (), summaries.tobytes(), record, held_at
+        )
 
     def sort(self):
         """Send on what follows, each part for itself."""
@@ -225,35 +242,39 @@ class Stages:
         return left
 
 
+SUMMARY = summary_type(samples_of_scan(SCANS))
+
+
 class Run:
     """A driver with what it talks to."""
 
-    def __init__(self, folder, beside=None, job="0"):
-        place = beside.folder / "parts" / job if beside else folder / "parts"
-        self.folder, self.storage = folder, Storage.at(place, durable=False)
-        self.db = RunDatabase(folder / "run.db", SCANS, durable=False)
-        self.workers = beside.workers if beside else Workers()
-        self.stages = beside.stages if beside else Stages(self.storage, self.workers)
-        self.crew = beside.crew if beside else Crew(self.workers, self.stages)
-        self.frames = []
-        self.committed = []
-        self.driver = self.drive(job)
-        self.all = [*beside.all, self] if beside else [self]
-        if not beside:
-            self.crew.open()
+    def __init__(self, folder):
+        self.storage = Storage.at(folder / "parts", durable=False)
+        self.db = RunDatabase(folder / "run.db", durable=False)
+        self.frames = {}  # {job: its frames}
+        self.committed = {}  # {job: its parts}
+        self.ended = {}  # {job: why it has failed, None if it has not}
+        self.restart()
 
-    def drive(self, job="0"):
-        seat = self.crew.seat(job, PLAN, f"{job}/" if job != "0" else "")
-        return SurveyDriver(
-            seat, SURVEY, self.db, self.storage, None,
-            self.frames.append, self.committed.extend, SCANS,
+    def restart(self):
+        """Begin with new workers and stages."""
+        self.workers = Workers()
+        self.stages = Stages(self.storage, self.workers)
+        self.driver = RunDriver(self.workers, self.stages, self.db, self.storage)
+        self.driver.open()
+
+    def begin(self, number=0, survey=SURVEY, scene=SCENE, *, frames=True, fit=SCANS):
+        parts = self.committed.setdefault(number, [])
+        framed = self.frames.setdefault(number, [])
+        return self.driver.begin(
+            number, scene, survey, fit=fit, on_frame=framed.append if frames else None,
+            read=str, on_parts=parts.extend,
         )  # fmt: skip
 
     def step(self):
-        self.crew.look(self.driver.progress)
-        for run in self.all:
-            run.driver.step()
-        self.crew.wait(0.0)
+        self.driver.step()
+        self.ended |= {job.number: error for job, error in self.driver.take_ended()}
+        self.driver.wait(0.0)
 
     def until(self, condition, *, idle=""):
         """Let everybody work, but for those who are idle, until something is so."""
@@ -271,66 +292,86 @@ class Run:
                 self.stages.sort()
         raise AssertionError("it does not come to that")
 
+    def fails(self, number=0):
+        """Let everybody work until a job fails; returns why."""
+        self.until(lambda: number in self.ended)
+        return str(self.ended[number])
+
     def end(self):
         """Let everybody work to the end, and check that each scan has come once, in order."""
-        self.until(lambda: self.driver.finished)
-        self.crew.leave(self.driver.seat)
-        self.crew.close()
-        assert self.crew.ended
-        self.crew.finish()
-        assert [frame.scan for frame in self.frames] == list(range(SCANS))
-        assert [frame.hits for frame in self.frames] == list(range(SCANS))
-        spans = sorted((part.first, part.stop) for part in self.committed)
-        assert [scan for span in spans for scan in range(*span)] == list(range(SCANS))
-        for part in self.committed:
-            assert self.storage.read(part.name) == f"scans {part.first} to {part.stop}".encode()
-        assert not self.driver.batches and not self.workers.casts and self.workers.released
-        assert not self.workers.jobs and not self.crew.seats
+        self.until(lambda: not self.driver.jobs)
+        self.driver.close()
+        assert self.driver.ended
+        self.driver.finish()
+        done = [number for number, error in self.ended.items() if error is None]
+        for number in done:
+            parts = self.db.under_way[number]
+            scans = list(range(parts.scan_count))
+            if parts.has_frames:
+                assert [frame.scan for frame in self.frames[number]] == scans
+                assert [frame.hits for frame in self.frames[number]] == scans
+            spans = sorted((part.first, part.stop) for part in self.committed[number])
+            assert [scan for span in spans for scan in range(*span)] == scans
+            for part in self.committed[number]:
+                data = self.storage.read(part.name).decode()
+                assert data == f"job {number}, scans {part.first} to {part.stop}"
+        assert not [*self.driver.batches] and not self.workers.casts and self.workers.released
+        assert not self.workers.jobs and not self.driver._announced
 
-    def at(self, place):
-        return self.driver.batches.at(place)
+    def at(self, place, number=None):
+        there = self.driver.batches.at(place)
+        return there if number is None else [b for b in there if b.job.number == number]
 
 
 @pytest.fixture
-def run(tmp_path):
+def empty(tmp_path):
+    """A driver without jobs."""
     run = Run(tmp_path)
     yield run
     run.db.close()
 
 
 @pytest.fixture
+def run(empty):
+    """A driver with one job."""
+    empty.job = empty.begin()
+    return empty
+
+
+@pytest.fixture
 def clock(monkeypatch):
     """A clock for the driver that only goes when it is told to."""
     clock = SimpleNamespace(now=time.monotonic())
-    monkeypatch.setattr(driver, "time", SimpleNamespace(monotonic=lambda: clock.now))
+    for module in (driver, casting, collecting, jobs):
+        monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now))
     return clock
 
 
 def test_undisturbed_each_batch_is_cast_once(run):
     run.end()
-    assert set(run.workers.tried.values()) == {1} and run.driver.offered_again == 0
-    assert run.driver.cast == run.driver.generated == SCANS
+    assert set(run.workers.tried.values()) == {1} and run.job.offered_again == 0
+    assert run.job.cast == run.job.generated == SCANS
     assert run.driver.book.stages["intersect"].items == SCANS
+    assert run.job.seconds == pytest.approx(0.1 * len(run.committed[0]))
 
 
 def test_slots_are_wanted_as_long_as_there_is_work(run):
     run.stages.seconds = 100.0
     run.end()
     wanted = run.workers.wanted
-    assert wanted[0] == SCANS and wanted[-1] == 0
-    assert wanted == sorted(wanted, reverse=True)
+    assert wanted[1] == SCANS and wanted[-1] == 0
+    assert wanted[1:] == sorted(wanted[1:], reverse=True)
 
 
 def test_what_an_earlier_run_has_committed_is_not_cast_again(run):
-    run.until(lambda: len(run.committed) >= 4)
-    done = [(part.first, part.stop) for part in run.committed]
-    framed = len(run.frames)
-    run.crew.leave(run.driver.seat)
-    run.workers.tried.clear()
-    run.stages.__init__(run.storage, run.workers)
-    run.crew = Crew(run.workers, run.stages)
-    run.crew.open()
-    run.driver = run.drive()
+    run.until(lambda: len(run.committed[0]) >= 4)
+    done = [(0, part.first, part.stop) for part in run.committed[0]]
+    framed = len(run.frames[0])
+    run.db.save_frames()
+    run.db.close()
+    run.db = RunDatabase(run.db.path, durable=False)
+    run.restart()
+    run.begin()
     run.end()
     assert framed > 0 and run.workers.tried.keys().isdisjoint(done)
 
@@ -351,7 +392,7 @@ def test_a_batch_whose_worker_has_no_scene_is_offered_again(run):
     batch = run.at(Place.CASTING)[0]
     run.workers.end(batch.key, Outcome.NO_RIG)
     run.end()
-    assert run.workers.tried[batch.first, batch.stop] == 2
+    assert run.workers.tried[0, batch.first, batch.stop] == 2
     assert not batch.deaths
 
 
@@ -365,39 +406,39 @@ def test_the_batches_of_a_collector_that_dies_are_collected_by_another_without_a
 
 
 def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(run, clock):
-    run.until(lambda: run.committed)
+    run.until(lambda: run.committed[0])
     run.until(lambda: any(run.stages.orders.values()), idle="collect")
     order = next(order for orders in run.stages.orders.values() for order in orders)
-    ((span, name),) = order.parts
+    ((_, span, name),) = order.parts
     first = run.stages.collect(order)  # ready, and stopped before it is sent
     for orders in run.stages.orders.values():
         orders.clear()
     clock.now += LATE_S + 1
     run.step()
-    run.until(lambda: span[0] in run.db.parts)
-    assert run.workers.tried[span] == 2
-    before = len(run.committed)
+    run.until(lambda: span[0] in run.job.parts.parts)
+    assert run.workers.tried[0, *span] == 2
+    before = len(run.committed[0])
     written = run.storage.read(name)
     run.storage.write(name, written)  # as its collector does when it wakes up
-    run.stages.inbox += [*first, *first, ColumnsLost(order.key, order.job)]
+    run.stages.inbox += [*first, *first, ColumnsLost(order.key)]
     run.step()
-    assert len(run.committed) == before and run.db.part_of(span[0]).name == name
+    assert len(run.committed[0]) == before and run.job.parts.part_of(span[0]).name == name
     run.end()
-    assert len(run.storage.sizes()) == len(run.committed)
+    assert len(run.storage.sizes()) == len(run.committed[0])
 
 
 @pytest.mark.parametrize("how", ["held", "columns"])
 def test_what_is_lost_on_its_way_is_cast_again(run, how):
     run.until(lambda: any(run.stages.orders.values()), idle="collect")
     order = next(orders for orders in run.stages.orders.values() if orders).popleft()
-    ((span, _),) = order.parts
+    ((_, span, _),) = order.parts
     answers = run.stages.collect(order, held_at=GONE)
     run.stages.held.clear()  # the worker has died
-    run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key, order.job)]
+    run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key)]
     run.step()
-    assert span[0] not in run.db.parts
+    assert span[0] not in run.job.parts.parts
     run.end()
-    assert run.workers.tried[span] == 2
+    assert run.workers.tried[0, *span] == 2
 
 
 def test_parts_of_a_worker_that_does_not_see_the_storage_are_written_by_the_driver(run):
@@ -405,39 +446,40 @@ def test_parts_of_a_worker_that_does_not_see_the_storage_are_written_by_the_driv
     order = next(orders for orders in run.stages.orders.values() if orders).popleft()
     run.stages.inbox += run.stages.collect(order, held_at="tcp://far:1")
     run.step()
-    assert order.parts[0][1] in run.storage.sizes() and not run.stages.held
+    assert order.parts[0][2] in run.storage.sizes() and not run.stages.held
     run.end()
     (note,) = run.driver.notes
     assert note.startswith(f"tcp://far:1 of partition LIDAR cannot see {run.storage.url}")
 
 
 def test_a_sorter_that_dies_gets_again_what_was_not_handed_out(run):
-    run.until(lambda: len(run.frames) >= 10)
-    run.until(lambda: run.db.scans_done >= len(run.frames) + 20, idle="sort")
+    frames = run.frames[0]
+    run.until(lambda: len(frames) >= 10)
+    run.until(lambda: run.job.parts.scans_done >= len(frames) + 20, idle="sort")
     run.stages.die("sort")
     run.step()
-    handed_out = len(run.frames)
+    handed_out = len(frames)
     assert min(s.first for s in run.stages.unsorted) == handed_out
     assert max(s.stop for s in run.stages.unsorted) >= handed_out + 20
     one = bytes(SUMMARY.itemsize)
-    run.stages.inbox += [Summaries(at, at + 1, one, 0, SCANS, "0") for at in (0, handed_out + 1)]
+    run.stages.inbox += [Summaries(0, at, at + 1, one, 0, SCANS) for at in (0, handed_out + 1)]
     run.step()
-    assert len(run.frames) == handed_out, "only the next frame is handed out"
+    assert len(frames) == handed_out, "only the next frame is handed out"
     run.end()
 
 
 def test_a_sorter_that_says_nothing_gets_all_again(run, clock):
-    run.until(lambda: len(run.committed) > 6, idle="sort")
+    run.until(lambda: len(run.committed[0]) > 6, idle="sort")
     run.stages.unsorted.clear()
     clock.now += STALL_S + 1
     run.step()
-    assert [s.first for s in run.stages.unsorted] == [p.first for p in run.db.ordered]
+    assert [s.first for s in run.stages.unsorted] == [p.first for p in run.job.parts.ordered]
     run.end()
 
 
 def test_a_generator_that_is_started_again_repeats_nothing(run):
-    run.until(lambda: run.driver.generated > 20)
-    run.stages.inbox.append(ScanRange(10, 22, "0"))
+    run.until(lambda: run.job.generated > 20)
+    run.stages.inbox.append(ScanRange(0, 10, 22))
     run.stages.die("generate")
     run.end()
     assert set(run.workers.tried.values()) == {1}
@@ -445,43 +487,42 @@ def test_a_generator_that_is_started_again_repeats_nothing(run):
 
 def test_small_batches_are_cast_and_collected_several_at_a_time(run):
     run.stages.advice, run.stages.seconds = 1, TASK_SECONDS / 3.5
-    run.until(lambda: run.committed)
+    run.until(lambda: run.committed[0])
     run.until(lambda: len(run.at(Place.WAITING)) >= 10, idle="cast")
     run.end()
-    assert run.workers.most == 3 and len(run.committed) == SCANS
+    assert run.workers.most == 3 and len(run.committed[0]) == SCANS
     assert set(run.workers.tried.values()) == {1}
 
 
 @pytest.mark.parametrize("stage", ["intersect", "collect"])
 def test_a_scan_that_kills_its_workers_is_found_among_small_batches(run, stage):
     run.stages.advice, run.stages.seconds = 1, 0.001
-    run.until(lambda: len(run.committed) > 5)
-    with pytest.raises(LidarpoolError, match=rf"^scan 40 kills the worker that runs stage {stage}"):
-        run.until(striking(run, stage, 40))
-    assert run.db.missing(0, SCANS)[0] == (40, 41)
+    run.until(lambda: len(run.committed[0]) > 5)
+    run.until(striking(run, stage, 40))
+    assert run.fails().startswith(f"scan 40 kills the worker that runs stage {stage}")
+    assert run.job.parts.missing(0, SCANS)[0] == (40, 41)
 
 
-def striking(run, stage, poison, deaths=None, job=""):
-    """Let a scan kill whoever has it, of a job if one is given."""
+def striking(run, stage, poison, deaths=None, job=0):
+    """Let a scan kill whoever has it; true once its job has failed."""
 
-    def has(spans):
-        return any(first <= poison < stop for first, stop in spans)
+    def has(batches):
+        return any(number == job and span[0] <= poison < span[1] for number, span in batches)
 
     def strike():
         killed = 0
         for key in run.workers.open if stage == "intersect" else ():
-            spans, worker, _ = run.workers.casts[key]
-            if has(spans) and worker in run.workers.slots and key.startswith(job):
+            batches, worker, _ = run.workers.casts[key]
+            if has(batches) and worker in run.workers.slots:
                 run.workers.die(worker)
                 killed += 1
         for name, orders in run.stages.orders.items() if stage == "collect" else ():
-            mine = [order for order in orders if order.job.startswith(job)]
-            if any(has([span for span, _ in order.parts]) for order in mine):
+            if any(has([part[:2] for part in order.parts]) for order in orders):
                 run.stages.die(name)
                 killed += 1
         if deaths is not None:
             deaths.append(killed)
-        return False
+        return job in run.ended
 
     return strike
 
@@ -490,15 +531,15 @@ def striking(run, stage, poison, deaths=None, job=""):
 def test_a_scan_that_kills_its_workers_is_isolated_and_named(run, stage):
     poison, deaths = 23, []
     run.stages.advice = 20
-
-    message = rf"^scan {poison} kills the worker that runs stage {stage}: 3 workers died, one after"
-    with pytest.raises(LidarpoolError, match=message):
-        run.until(striking(run, stage, poison, deaths))
+    run.until(striking(run, stage, poison, deaths))
+    message = f"scan {poison} kills the worker that runs stage {stage}: 3 workers died, one after"
+    assert run.fails().startswith(message)
     # Twice with the whole batch, once alone, once with its piece, and three times by itself.
     pieces = 20 // -(-20 // PIECES)
     assert pieces == 10 and sum(deaths) == 2 + 1 + 1 + 3
-    assert run.db.missing(0, SCANS) == [(poison, poison + 1)]
-    assert [frame.scan for frame in run.frames] == list(range(poison))
+    assert run.job.parts.missing(0, SCANS) == [(poison, poison + 1)]
+    assert [frame.scan for frame in run.frames[0]] == list(range(poison))
+    run.end()  # nothing is left of it
 
 
 def test_a_suspect_that_is_innocent_is_not_divided(run):
@@ -510,7 +551,7 @@ def test_a_suspect_that_is_innocent_is_not_divided(run):
     alone = [b for b in run.at(Place.CASTING) if b.worker == batch.worker]
     assert batch.deaths["intersect"] == 2 and alone == [batch]
     run.end()
-    assert (batch.first, batch.stop) in {(part.first, part.stop) for part in run.committed}
+    assert batch.span in {(part.first, part.stop) for part in run.committed[0]}
 
 
 def test_batches_under_way_are_bounded_whoever_is_slow(run):
@@ -531,14 +572,14 @@ def test_batches_under_way_are_bounded_whoever_is_slow(run):
             run.stages.inbox += run.stages.collect(order)
         for orders in run.stages.orders.values():
             orders.clear()
-    assert run.driver.batches.span <= max(SPAN * most, SCANS) and run.frames == []
+    assert run.driver.batches.span(run.job) <= max(SPAN * most, SCANS) and run.frames[0] == []
 
 
 def test_a_run_that_is_stopped_leaves_nothing(run):
-    run.until(lambda: run.at(Place.CASTING) and run.committed)
-    run.crew.stop("enough")
+    run.until(lambda: run.at(Place.CASTING) and run.committed[0])
+    run.driver.stop("enough")
     assert run.stages.failure == "enough" and not run.workers.casts
-    run.crew.finish()
+    run.driver.finish()
     assert run.workers.released
 
 
@@ -546,6 +587,8 @@ def test_a_run_that_is_stopped_leaves_nothing(run):
 @given(chance=st.randoms(use_true_random=False))
 def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance):
     run = Run(tmp_path_factory.mktemp("run"))
+    for number in range(chance.choice((1, 3))):
+        run.begin(number, frames=chance.random() < 0.7)
     run.stages.advice = chance.choice((1, 4, 7))
     run.stages.seconds = chance.choice((0.1, 0.01))
     late = []  # what collectors have to say that were only stopped
@@ -585,108 +628,8 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
         run.step()
         wake()
         run.end()
+    assert set(run.ended.values()) == {None}
     run.db.close()
-
-
-# -- several surveys on one crew -------------------------------------------------------------------
-
-
-@pytest.fixture
-def two(run, tmp_path):
-    """Return two surveys on one crew."""
-    (tmp_path / "other").mkdir()
-    other = Run(tmp_path / "other", beside=run, job="other")
-    run.all = other.all
-    yield run, other
-    other.db.close()
-
-
-def test_two_surveys_share_workers_stages_and_storage(two):
-    for run in two:
-        run.until(lambda run=run: run.driver.finished)
-    for run in two:
-        assert [frame.scan for frame in run.frames] == list(range(SCANS))
-        assert {part.name for part in run.committed} == run.storage.sizes().keys()
-        assert run.driver.offered_again == 0 and run.driver.generated == SCANS
-
-
-def test_a_survey_takes_no_more_than_it_has_room_for_while_another_wants_scans(two):
-    run, other = two
-    run.stages.advice = 1
-    most = most_under_way(2, 2)
-    for _ in range(5 * most):
-        run.step()
-        run.stages.generate()
-    assert len(run.driver.batches) == most and not run.stages.wanted
-    assert other.driver.seat.wants_scans and other.driver.generated == 0
-    other.until(lambda: other.driver.finished and run.driver.finished)
-
-
-@pytest.mark.parametrize("how", ["failed", "intersect", "collect"])
-def test_a_survey_that_fails_leaves_and_the_other_goes_on(two, how):
-    bad, good = two
-    bad.stages.advice = 1
-    if how != "failed":
-        strike = striking(bad, how, 23, job="0")
-        with pytest.raises(JobError, match=r"^scan 23 kills"):
-            bad.until(strike)
-    else:
-        bad.until(lambda: bad.at(Place.CASTING) and bad.committed)
-        bad.stages.inbox.append(Failed("stage generate failed: scan 59: out of order", "0"))
-        with pytest.raises(JobError, match=r"^stage generate failed: scan 59"):
-            bad.step()
-    bad.crew.leave(bad.driver.seat)
-    assert list(bad.workers.jobs) == ["other"]
-    good.all.remove(bad)
-    good.end()  # nothing is left of the first either
-
-
-def test_of_a_survey_that_has_left_messages_are_dropped_and_its_scans_pass(two):
-    bad, good = two
-    bad.until(lambda: any(bad.stages.orders.values()), idle="collect")
-    late = [bad.stages.collect(o) for orders in bad.stages.orders.values() for o in orders]
-    bad.crew.leave(bad.driver.seat)
-    good.all.remove(bad)
-    good.stages.inbox += chain.from_iterable(late)
-    committed = len(bad.committed)
-    good.end()
-    assert len(bad.committed) == committed and not bad.driver.seat.inbox
-
-
-def test_a_generator_that_is_started_again_is_told_of_all_surveys(two):
-    run, other = two
-    run.until(lambda: run.driver.generated > 20)
-    run.stages.die("generate")
-    run.step()
-    assert [(d.job, d.first) for d in run.stages.described] == [
-        ("0", run.driver.generated), ("other", 0),
-    ]  # fmt: skip
-    run.until(lambda: run.driver.finished and other.driver.finished)
-    assert set(run.workers.tried.values()) == {2}  # scans of each survey
-
-
-def test_a_sorter_that_dies_is_told_of_all_surveys_again(two):
-    run, other = two
-    run.until(lambda: other.db.scans_done > 20, idle="sort")
-    run.stages.die("sort")
-    run.step()
-    assert {s.job for s in run.stages.unsorted} == {"0", "other"}
-    run.until(lambda: run.driver.finished and other.driver.finished)
-    assert len(run.frames) == len(other.frames) == SCANS
-
-
-def test_a_suspect_of_one_survey_is_alone_on_its_worker(two):
-    run, other = two
-    run.stages.advice = 20
-    run.until(lambda: other.at(Place.CASTING), idle="cast")
-    suspect = run.at(Place.CASTING)[0]
-    for _ in range(2):
-        run.workers.die(suspect.worker)
-        run.until(lambda: suspect.place is Place.CASTING)
-    assert suspect.deaths["intersect"] == 2
-    there = [b for one in two for b in one.at(Place.CASTING) if b.worker == suspect.worker]
-    assert there == [suspect]
-    run.until(lambda: run.driver.finished and other.driver.finished)
 
 
 @pytest.mark.parametrize("advice", [1, 7, SCANS])
@@ -697,7 +640,194 @@ def test_a_scene_that_kills_whoever_casts_it_is_told_after_a_few_deaths(run, adv
         for worker in {run.workers.casts[key][1] for key in run.workers.open}:
             run.workers.die(worker)
             deaths.append(worker)
+        return run.ended
 
-    with pytest.raises(JobError, match=r"^GPU workers die whatever they cast first: 3 died, one a"):
-        run.until(strike)
+    run.until(strike)
+    assert run.fails().startswith("GPU workers die whatever they cast first: 3 died, one a")
     assert len(deaths) <= 10
+
+
+# -- several jobs ----------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def two(run):
+    """A driver with two jobs."""
+    run.other = run.begin(1)
+    return run
+
+
+def test_jobs_share_workers_stages_and_storage(two):
+    two.end()
+    parts = [part.name for number in (0, 1) for part in two.committed[number]]
+    assert sorted(parts) == sorted(two.storage.sizes())
+    assert {job.offered_again for job in (two.job, two.other)} == {0}
+
+
+def test_a_job_takes_no_more_than_there_is_room_for_while_another_wants_scans(two):
+    two.stages.advice = 1
+    most = most_under_way(2, 2)
+    for _ in range(5 * most):
+        two.step()
+        two.stages.generate()
+    assert len(two.driver.batches) == most and not two.stages.wanted
+    assert two.other.generated == 0
+    two.end()
+
+
+@pytest.mark.parametrize("how", ["failed", "intersect", "collect", "cast"])
+def test_a_job_that_fails_leaves_and_the_other_goes_on(two, how):
+    two.stages.advice = 1
+    if how == "failed":
+        two.until(lambda: two.at(Place.CASTING) and two.committed[0])
+        two.stages.inbox.append(Failed(0, "generate", "scan 59: out of order"))
+        two.step()
+        assert two.fails() == "stage generate failed: scan 59: out of order"
+    elif how == "cast":
+        two.until(lambda: two.at(Place.CASTING, 0), idle="cast")
+        two.workers.end(two.at(Place.CASTING, 0)[0].key, JobError("stage intersect failed: 3"))
+        two.step()
+        assert two.fails() == "stage intersect failed: 3"
+    else:
+        two.until(striking(two, how, 23))
+        assert two.fails().startswith("scan 23 kills")
+    two.end()  # nothing is left of the first either
+    assert two.ended[1] is None
+
+
+def test_messages_of_a_job_that_has_failed_are_dropped_and_its_scans_pass(two):
+    two.until(lambda: any(two.stages.orders.values()), idle="collect")
+    late = [two.stages.collect(o) for orders in two.stages.orders.values() for o in orders]
+    two.stages.inbox.append(Failed(0, "collect", "its disk is full"))
+    two.step()
+    two.stages.inbox += chain.from_iterable(late)
+    committed = len(two.committed[0])
+    two.end()
+    assert len(two.committed[0]) == committed and two.ended.keys() == {0, 1}
+
+
+def test_a_generator_that_is_started_again_is_told_of_all_jobs(two):
+    two.until(lambda: two.job.generated > 20)
+    two.stages.die("generate")
+    two.step()
+    told = [(d.job, d.first) for d in two.stages.described]
+    assert told == [(0, two.job.generated), (1, 0)]
+    two.end()
+    assert set(two.workers.tried.values()) == {1}
+
+
+def test_a_sorter_that_dies_is_told_of_all_jobs_again(two):
+    two.until(lambda: two.other.parts.scans_done > 20, idle="sort")
+    two.stages.die("sort")
+    two.step()
+    assert {s.job for s in two.stages.unsorted} == {0, 1}
+    two.end()
+
+
+def test_a_suspect_of_one_job_is_alone_on_its_worker(two):
+    two.stages.advice = 20
+    two.until(lambda: two.at(Place.CASTING, 1), idle="cast")
+    suspect = two.at(Place.CASTING, 0)[0]
+    for _ in range(2):
+        two.workers.die(suspect.worker)
+        two.until(lambda: suspect.place is Place.CASTING)
+    assert suspect.deaths["intersect"] == 2
+    there = [b for b in two.at(Place.CASTING) if b.worker == suspect.worker]
+    assert there == [suspect]
+    two.end()
+
+
+def test_jobs_end_without_a_sorter_if_nobody_wants_frames(empty):
+    for number in range(3):
+        empty.begin(number, frames=False)
+    empty.until(lambda: len(empty.ended) == 3, idle="sort")
+    assert not empty.stages.unsorted
+    empty.end()
+
+
+def test_a_job_that_is_committed_ends_at_once(empty):
+    empty.begin(frames=False)
+    empty.until(lambda: empty.ended)
+    empty.begin(frames=False)
+    assert [error for _, error in empty.driver.take_ended()] == [None]
+    assert not empty.stages.described
+
+
+def begin_tiny(run, count, scenes=(SCENE,), fit=1000):
+    """Begin jobs of one batch each, once it is known that these are quickly cast."""
+    run.stages.advice, run.stages.seconds = 5, TASK_SECONDS / 16.5
+    run.begin(count, TINY, frames=False)
+    run.until(lambda: run.ended)
+    for number in range(count):
+        run.begin(number, TINY, scenes[number % len(scenes)], frames=False, fit=fit)
+
+
+def test_tiny_jobs_of_a_scene_share_casting_tasks(empty):
+    begin_tiny(empty, 64)
+    tasks = empty.workers.tasks
+    empty.until(lambda: len(empty.driver.batches) == 64, idle="cast")
+    empty.end()
+    assert empty.workers.most == 16 and empty.workers.tasks - tasks <= 8
+    assert set(empty.workers.tried.values()) == {1} and len(empty.ended) == 65
+
+
+def test_jobs_in_a_task_fit_into_the_memory_of_a_worker(empty):
+    begin_tiny(empty, 64, fit=20)
+    empty.until(lambda: len(empty.at(Place.WAITING)) > 20, idle="cast")
+    empty.end()
+    assert empty.workers.most == 4
+
+
+def test_jobs_of_different_scenes_share_no_tasks(empty):
+    begin_tiny(empty, 40, [SCENE, Scene.seed(), Scene.seed()])
+    empty.until(lambda: len(empty.at(Place.WAITING)) > 20, idle="cast")
+    empty.end()
+    assert empty.workers.most > 1
+
+
+def test_of_jobs_in_a_task_that_fails_only_the_cause_does(empty):
+    begin_tiny(empty, 30)
+    empty.until(lambda: len(empty.driver.batches) == 30, idle="cast")
+
+    def fail():
+        for key in empty.workers.open:
+            if 17 in {number for number, _ in empty.workers.casts[key][0]}:
+                empty.workers.end(key, JobError("scan 3: the mirror is loose"))
+        return 17 in empty.ended
+
+    empty.until(fail)
+    assert str(empty.ended[17]) == "scan 3: the mirror is loose"
+    empty.end()
+    assert [number for number, error in empty.ended.items() if error] == [17]
+    assert empty.workers.tried[17, 0, 5] == 2
+
+
+@pytest.mark.parametrize("stage", ["intersect", "collect"])
+def test_a_scan_that_kills_its_workers_is_found_among_tiny_jobs(empty, stage):
+    begin_tiny(empty, 30)
+    empty.until(lambda: len(empty.driver.batches) == 30, idle="cast")
+    empty.until(striking(empty, stage, 3, job=17))
+    assert empty.fails(17).startswith(f"scan 3 kills the worker that runs stage {stage}")
+    empty.end()
+    assert [number for number, error in empty.ended.items() if error] == [17]
+
+
+def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
+    begun, most = 0, 0
+    empty.stages.advice, empty.stages.seconds = 5, 0.001
+    empty.stages.advise = lambda scans: None
+
+    def begin():
+        nonlocal begun, most
+        while begun < 2000 and empty.driver.has_room:
+            empty.begin(begun, TINY, frames=False)
+            begun += 1
+        most = max(most, len(empty.driver.jobs))
+        for _ in range(20):
+            empty.stages.generate()
+        return len(empty.ended) == 2000
+
+    begin()
+    assert begun >= ANNOUNCED
+    empty.until(begin)
+    assert 32 <= most <= 2 * most_under_way(2, 2, 32)

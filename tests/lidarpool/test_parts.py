@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -22,9 +23,11 @@ from lidarpool.columns.parts import (
     probe_name,
     read_part,
     read_tally,
+    scans_of,
     unpack,
 )
 from lidarpool.columns.table import OPTIONAL, stored
+from lidarpool.pipeline.messages import Receipt, summary_type
 
 COLUMNS = stored(OPTIONAL)
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -37,7 +40,10 @@ def part_of(first, counts, seed=0, columns=COLUMNS):
     counts = np.array(counts, np.int64)
     made = {c.name: rng.integers(0, 200, counts.sum()).astype(c.dtype) for c in columns}
     triangles = np.unique(rng.integers(0, 50, 5)).astype(np.int32)
-    return PartColumns(first, counts, made, triangles, np.arange(1, len(triangles) + 1))
+    hits = counts.astype(np.uint32) * 5
+    samples = rng.random((len(counts), 4, 3), np.float32)
+    tally = np.arange(1, len(triangles) + 1)
+    return PartColumns(first, counts, made, triangles, tally, hits, samples)
 
 
 @settings(max_examples=50)
@@ -61,8 +67,8 @@ def test_what_is_packed_comes_back(first, counts):
 def test_numpy_opens_a_part():
     part = part_of(7, [2, 0, 3])
     with np.load(io.BytesIO(pack(part)), allow_pickle=False) as archive:
-        names = [".scans", ".counts", ".triangles", ".hits", *(c.name for c in COLUMNS)]
-        assert archive.files == names
+        own = [".scans", ".counts", ".triangles", ".hits", ".scan_hits", ".samples"]
+        assert archive.files == [*own, *(c.name for c in COLUMNS)]
         assert archive[".scans"].tolist() == [7, 10]
         assert archive[".counts"].tolist() == [2, 0, 3]
         for column in COLUMNS:
@@ -73,8 +79,21 @@ def test_numpy_opens_a_part():
 def test_columns_that_are_not_contiguous_are_packed_as_they_read():
     part = part_of(0, [4])
     wide = {name: np.repeat(values, 2)[::2] for name, values in part.columns.items()}
-    again = PartColumns(0, part.counts, wide, part.triangles, part.hits)
+    again = replace(part, columns=wide)
     assert bytes(pack(again)) == bytes(pack(part))
+
+
+def test_a_part_says_what_its_receipt_says():
+    part = part_of(7, [2, 0, 3])
+    data = pack(part)
+    receipt = Receipt.of_part(unpack(data), 12, "a.npz", len(data))
+    assert receipt == Receipt.of_part(part, 12, "a.npz", len(data))
+    assert (receipt.job, receipt.first, receipt.stop) == (12, 7, 10)
+    assert (receipt.rows, receipt.hits) == (5, 25)
+    summaries = np.frombuffer(receipt.summaries, summary_type(4))
+    assert summaries["hits"].tolist() == [10, 0, 15]
+    assert summaries["points"].tolist() == [2, 0, 3]
+    assert np.array_equal(summaries["samples"], part.samples)
 
 
 SMALL = part_of(3, [1, 2], columns=COLUMNS[:4])
@@ -116,6 +135,9 @@ def test_a_cut_part_is_noticed_wherever_it_was_cut():
         {".hits": np.zeros(1)},
         {"x": np.array([{}, {}, {}])},
         {".hits": None},
+        {".scan_hits": np.zeros(1)},
+        {".samples": np.zeros((2, 4))},
+        {".samples": np.zeros((3, 4, 3))},
     ],
     ids=str,
 )
@@ -159,12 +181,12 @@ def test_a_part_that_cannot_be_read_is_named(storage, read):
 
 def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
     mark, other = "0123456789abcdef", "fedcba9876543210"
-    part = part_name(mark, 5, 120)
+    part = part_name(mark, 3, 5, 120)
     temporary = f".lidarpool-tmp-{part}-0a1b2c3d"
     own = {part, temporary, probe_name(mark, "0a1b2c3d")}
     foreign = {
         "points.npz", f"{part}.bak", f"copy-{part}", f"{mark}.npz", f"{mark}-notes", f".tmp-{part}",
-        f"{temporary}.npz", part_name(other, 0, 5), part.upper(), f"{part}\n",
+        f"{temporary}.npz", part_name(other, 0, 0, 5), part.upper(), f"{part}\n",
     }  # fmt: skip
     for name in own | foreign:
         storage.write(name, b"x")
@@ -175,6 +197,9 @@ def test_a_run_owns_what_has_its_mark_where_the_folder_has_it_too(storage):
         found = own_files(storage, which)
         assert {*found} == {*own, mark_name(mark)} and found[-1] == mark_name(mark)
     assert own_files(storage, other) == []
+    assert scans_of(part, mark) == (3, 5, 120)
+    assert {scans_of(name, mark) for name in (own | foreign) - {part}} == {None}
+    assert scans_of(part, other) is None
 
 
 def stored_cloud(storage, counts):

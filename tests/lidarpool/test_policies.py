@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
+from types import SimpleNamespace
 
 import pytest
 
 from lidarpool.pipeline.batches import Batch, Batches, Place
-from lidarpool.pipeline.names import COLLECT, INTERSECT
+from lidarpool.pipeline.names import INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
@@ -29,6 +30,7 @@ from lidarpool.pipeline.policies import (
     scans_per_batch,
     slots_wanted,
     verdict,
+    weight,
 )
 from poolpart import Whereabouts
 from poolpart.task_locations import TaskPlace
@@ -36,17 +38,26 @@ from poolpart.task_locations import TaskPlace
 A, B = "tcp://a:1", "tcp://b:1"
 
 
-def batch(number, place=Place.WAITING, worker="", collector="", suspect=""):
+JOB, OTHER, ELSEWHERE = (
+    SimpleNamespace(number=number, scene=scene, fit=100)
+    for number, scene in enumerate(("scene", "scene", "another scene"))
+)
+
+
+def batch(number, place=Place.WAITING, worker="", collector="", suspect="", job=JOB, scans=1):
     deaths = Counter({suspect: SUSPECT_DEATHS} if suspect else {})
-    return Batch(number, number + 1, number, place, 0.0, str(number), worker, collector, deaths)
+    return Batch(
+        job, number, number + scans, number, number, place, 0.0, str(number), worker, collector,
+        deaths,
+    )  # fmt: skip
 
 
 def casting(number, worker, suspect=""):
     return batch(number, Place.CASTING, worker, suspect=suspect)
 
 
-def waiting(count, first=10):
-    return [batch(number) for number in range(first, first + count)]
+def waiting(count, first=10, **of):
+    return [batch(number, **of) for number in range(first, first + count)]
 
 
 def numbers(chosen):
@@ -113,12 +124,33 @@ def test_small_batches_share_tasks_and_wait_for_others_where_nobody_waits_for_th
 
 
 def test_a_task_has_as_many_batches_as_are_worth_it():
-    assert batches_per_task([], 1, 100) == 1
-    assert batches_per_task([0.3, 0.2, 9.0], 1, 100) == 1
-    assert batches_per_task([TASK_SECONDS / 4.5], 1, 100) == 4
-    assert batches_per_task([0.0], 1, 100) == TASK_BATCHES
-    assert batches_per_task([0.0], 20, 100) == 5  # all of them fit into memory
-    assert batches_per_task([0.0], 101, 100) == 1
+    assert batches_per_task([]) == 1
+    assert batches_per_task([0.3, 0.2, 9.0]) == 1
+    assert batches_per_task([TASK_SECONDS / 4.5]) == 4
+    assert batches_per_task([0.0]) == TASK_BATCHES
+
+
+def test_the_batches_of_a_task_fit_into_memory_together():
+    assert weight(batch(0, scans=25), 4) == weight(batch(0), 4) == 1
+    assert weight(batch(0, scans=50), 4) == 2 and weight(batch(0, scans=100), 1) == 1
+    assert sizes(waiting(10, scans=50)) == [2, 2, 2, 2]
+    assert sizes([*waiting(2, scans=75), *waiting(4, first=20)]) == [1, 2]
+    there = waiting(20, scans=50)
+    assert len(numbers(offers(there, {A: 9}, 12, 4))) == 6, "they count twice among all"
+
+
+def test_jobs_of_one_scene_share_tasks_and_others_do_not():
+    there = [batch(n, job=job) for n, job in enumerate((JOB, OTHER, ELSEWHERE) * 4)]
+    tasks = [task for task, _ in offers(there, {A: 1, B: 1}, 99, 4)]
+    assert [[b.first for b in task] for task in tasks] == [
+        [0, 1, 3, 4],
+        [2, 5, 8, 11],
+        [6, 7, 9, 10],
+    ]
+    for one in there:
+        one.divided = one.job is OTHER  # because a task with it has failed
+    tasks = [task for task, _ in offers(there, {A: 1, B: 1}, 99, 4)]
+    assert [{b.job.number for b in task} for task in tasks] == [{0}, {1}, {2}]
 
 
 def test_there_are_at_most_so_many_batches_under_way():
@@ -138,41 +170,10 @@ def test_a_suspect_has_a_worker_for_itself():
     assert offers([casting(0, A), casting(1, B), suspect, *waiting(5)], {A: 1, B: 1}, 99) == []
 
 
-def test_a_suspect_of_another_survey_is_left_a_worker_for_itself():
+def test_the_only_worker_is_left_to_a_suspect():
     suspect = batch(0, suspect=INTERSECT)
-    there = [casting(1, A), casting(2, B), casting(3, B)]
-    slots = {A: 1, B: 2}
-    beside = [suspect, *there]
-    assert {where for _, where in numbers(offers(waiting(9), slots, 20, 1, beside))} == {B}
-    assert offers(waiting(9), {A: 1}, 20, 1, [suspect]) == []
-    # Two surveys with suspects do not wait for each other.
-    mine = batch(7, suspect=INTERSECT)
-    assert numbers(offers([mine], {A: 1}, 20, 1, [suspect])) == [(7, A)]
-    assert numbers(offers(waiting(9), {A: 1, B: 1}, 20, 1, [casting(0, A, INTERSECT)])) == [
-        (10, B), (11, B),
-    ]  # fmt: skip
-    beside = [casting(n, A) for n in (1, 2)]
-    assert offers([mine], {A: 1}, 20, 1, beside) == [], "there are others on the only worker"
-
-
-def test_what_others_have_under_way_counts():
-    beside = [batch(n, Place.COLLECTING, A) for n in range(4)] + waiting(20, first=50)
-    assert len(numbers(offers(waiting(9), {A: 9}, 10, 1, beside))) == 6
-    assert {where for _, where in numbers(offers(waiting(1), {A: 1, B: 1}, 10, 1, [casting(0, A)]))
-            } == {B}  # fmt: skip
-
-
-def test_stage_4_is_left_to_a_suspect_of_another_survey():
-    collectors = {"collect-0": A, "collect-1": B}
-    ready = [batch(n, Place.CAST, A) for n in (1, 2)]
-    suspect = batch(9, Place.CAST, A, suspect=COLLECT)
-    assert handovers(ready, collectors, [suspect]) == []
-    busy = batch(1, Place.COLLECTING, A, "collect-0")
-    assert handovers([suspect], collectors, [busy]) == []
-    assert numbers(handovers([suspect], collectors, ready)) == [(9, "collect-0")]
-    alone = batch(9, Place.COLLECTING, A, "collect-0", suspect=COLLECT)
-    assert handovers(ready, collectors, [alone]) == []
-    assert len(handovers(ready, collectors, [busy])) == 2
+    assert offers([suspect, *[casting(n, A) for n in (1, 2)]], {A: 1}, 20) == []
+    assert numbers(offers([suspect, *waiting(9)], {A: 1}, 20)) == [(0, A)]
 
 
 def test_a_collector_on_the_host_of_the_columns_is_preferred():
@@ -270,14 +271,30 @@ def test_a_batch_is_judged_by_the_deaths_of_those_that_had_it():
 
 def test_pieces_hold_the_scans_of_the_whole_and_keep_its_place_in_the_order():
     batches = Batches()
-    batches.add(0, 5)
-    whole = batches.add(5, 42)
-    batches.add(42, 50)
+    batches.add(JOB, 0, 5)
+    whole = batches.add(JOB, 5, 42)
+    batches.add(JOB, 42, 50)
+    batches.add(OTHER, 5, 42)
     batches.split(whole, Counter(collect=2))
-    pieces = batches.within(5, 42)
+    pieces = batches.within(JOB.number, 5, 42)
     assert [scan for piece in pieces for scan in piece.scans] == list(range(5, 42))
     assert {piece.deaths["collect"] for piece in pieces} == {2}
-    assert batches.span == 3 and whole not in [*batches]
-    for done in batches.within(0, 5):
+    assert batches.waiting[1:-2] == pieces and whole not in [*batches]
+    assert batches.span(JOB) == 4 and batches.span(OTHER) == 1
+    for done in batches.within(JOB.number, 0, 5):
         batches.remove(done)
-    assert batches.span == 2
+    assert batches.span(JOB) == 3
+    batches.postpone(pieces[0])
+    assert batches.waiting[-1] is pieces[0]
+
+
+def test_a_task_is_forgotten_with_its_last_batch():
+    batches = Batches()
+    one, two = (batches.add(job, 0, 5) for job in (JOB, OTHER))
+    for each in (one, two):
+        batches.offered(each, "key", A, 1.0)
+    assert batches.casting == {"key": A} and batches.of_task("key") == [one, two]
+    assert batches.forget_task(one) == "" and batches.of_task("key") == [two]
+    batches.move(one, Place.WAITING, 2.0)
+    assert batches.forget_task(two) == "key" and batches.of_task("key") == []
+    assert batches.at(Place.CASTING) == [two] and batches.waiting == [one]

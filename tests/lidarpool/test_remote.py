@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import pytest
-from tests.lidarpool.test_store import JOB, OTHERS, add, left
+from tests.lidarpool.test_store import OTHERS, add, left, opened
 
 import lidarpool.run.remote
 from lidarpool import LidarpoolError, remove_run
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name
-from lidarpool.run.store import RunStore
 
 
 @pytest.fixture
@@ -22,8 +21,8 @@ def url(tmp_path, monkeypatch):
 @pytest.fixture
 def unfinished(url):
     """URL of a run whose driver died when two of six scans were in the copy of its database."""
-    store = RunStore(JOB, url)
-    store.backend = "numpy"
+    store = opened(url)
+    store.cast_with("numpy", {})
     add(store, 0, 2)
     store.save(now=True)
     add(store, 3, 5)
@@ -32,17 +31,17 @@ def unfinished(url):
 
 
 def test_it_goes_on_from_the_last_copy(unfinished):
-    store = RunStore(JOB, unfinished, resume=True)
-    assert (store.resumed, store.backend, store.notes) == (2, "numpy", [])
-    assert store.db.missing(0, 6) == [(2, 6)]
-    assert add(store, 2, 6)
-    store.db.frames = 6
+    store = opened(unfinished, resume=True)
+    assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
+    assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)], "parts say what is not in the copy"
+    assert add(store, 2, 3) and add(store, 5, 6)
+    store.only.parts.count_frame(5)
     store.save(now=True)
     store.tidy()
     mark = mark_name(store.db.meta["mark"])
-    assert left(unfinished) == {"run.db", "run.owner", mark, *store.points().names}
-    again = RunStore(JOB, unfinished, resume=True)
-    assert again.notes == [] and again.complete and len(again.points().load()) == 18
+    assert left(unfinished) == {"run.db", "run.owner", mark, *store.only.points().names}
+    again = opened(unfinished, resume=True)
+    assert again.notes == [] and again.only.complete and len(again.only.points().load()) == 18
     again.remove()
     assert left(unfinished) == set()
 
@@ -50,13 +49,13 @@ def test_it_goes_on_from_the_last_copy(unfinished):
 def test_it_is_refused_or_dropped(unfinished):
     kept = f"{unfinished} holds an unfinished run, 2 of 6 scans: continue it with --resume"
     with pytest.raises(LidarpoolError, match=kept):
-        RunStore(JOB, unfinished)
+        opened(unfinished)
     with pytest.raises(LidarpoolError, match=f"{unfinished} cannot be continued, .* another scene"):
-        RunStore(OTHERS["scene"], unfinished, resume=True)
+        opened(unfinished, resume=True, job=OTHERS["scene"])
     remove_run(unfinished)
     remove_run(unfinished)
     assert left(unfinished) == set()
-    assert RunStore(OTHERS["scene"], unfinished).resumed == 0
+    assert opened(unfinished, job=OTHERS["scene"]).only.resumed == 0
 
 
 def test_foreign_objects_stay(unfinished):
@@ -73,11 +72,11 @@ def test_foreign_objects_stay(unfinished):
 def test_one_of_another_format(unfinished, monkeypatch):
     monkeypatch.setattr("lidarpool.pipeline.database.FORMAT", 99)
     with pytest.raises(LidarpoolError, match=rf"^{unfinished}/run.db is damaged \(it is of format"):
-        RunStore(JOB, unfinished, resume=True)
+        opened(unfinished)
 
 
 def test_copies_are_made_now_and_then(url, monkeypatch):
-    store = RunStore(JOB, url)
+    store = opened(url)
     first = Storage.at(url).read("run.db")
     add(store, 0, 2)
     store.save()
@@ -89,12 +88,12 @@ def test_copies_are_made_now_and_then(url, monkeypatch):
 
 @pytest.mark.parametrize("how", ["resumed", "dropped"])
 def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
-    early = RunStore(JOB, url)
+    early = opened(url)
     add(early, 0, 2)
     early.save(now=True)
     if how == "dropped":
         remove_run(url)
-    late = RunStore(JOB, url, resume=True)
+    late = opened(url, resume=True)
     add(late, 2, 6)
     late.save(now=True)
     before = left(url)
@@ -106,15 +105,15 @@ def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
     assert not hasattr(caught.value, "__notes__")
     assert left(url) == before
     late.save(now=True)
-    again = RunStore(JOB, url, resume=True)
-    assert again.resumed == (6 if how == "resumed" else 4)
+    again = opened(url, resume=True)
+    assert again.only.resumed == (6 if how == "resumed" else 4)
     with pytest.raises(LidarpoolError, match="this one has ended"), late.kept_on_error():
         late.remove()
     assert left(url) == before
 
 
 def test_storage_that_fails(url, monkeypatch):
-    store = RunStore(JOB, url)
+    store = opened(url)
 
     def fail(*_):
         raise OSError("it is full")
@@ -123,4 +122,4 @@ def test_storage_that_fails(url, monkeypatch):
     with pytest.raises(LidarpoolError, match=f"cannot be kept in {url}: it is full"):
         store.save(now=True)
     with pytest.raises(LidarpoolError, match=rf"Cannot write to {url} \(it is full\)"):
-        RunStore(JOB, url, resume=True)
+        opened(url, resume=True)

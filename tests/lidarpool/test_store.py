@@ -14,14 +14,15 @@ import pytest
 from tests.lidarpool.committing import commit
 
 import lidarpool.run.store
-from lidarpool import LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
+from lidarpool import Campaign, Job, LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name, part_name, probe_name
+from lidarpool.export.jobs import JobRow
 from lidarpool.plan import run_trial
-from lidarpool.run.campaign_store import CampaignStore
-from lidarpool.run.identity import identity_of
-from lidarpool.run.job import Job, make_job
+from lidarpool.run.jobs import OneJob
 from lidarpool.run.store import RunStore
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.shapes import seed_objects
 
@@ -31,9 +32,14 @@ PLANNING = Planning((0, 0), (9, 1), [(5, 0)], 1.0, trials=2, particles=10, itera
 JOB = Job(SCENE, SURVEY)
 
 
-def add(store, first, stop):
+def add(store, first, stop, job=None):
     """Commit a part of scans with three points of each."""
-    return commit(store, first, [3] * (stop - first), [first, stop], [1, 2])
+    return commit(store, first, [3] * (stop - first), [first, stop], [1, 2], job)
+
+
+def opened(place=None, parts=None, *, job=JOB, backend="auto", resume=False):
+    """Store of a survey."""
+    return RunStore(OneJob(job), backend, place, parts, resume=resume)
 
 
 def names(folder):
@@ -59,8 +65,8 @@ def left(place):
 @pytest.fixture
 def unfinished(folder):
     """A folder in which a run has left four of six scans."""
-    store = RunStore(JOB, folder)
-    store.backend = "numpy"
+    store = opened(folder)
+    store.cast_with("numpy", {})
     add(store, 0, 2)
     add(store, 3, 5)
     store.db.close()
@@ -68,39 +74,39 @@ def unfinished(folder):
 
 
 def test_a_run_from_its_beginning_to_its_end(folder):
-    store = RunStore(JOB, folder)
-    assert (store.kept, store.complete, store.resumed) == ("", False, 0)
+    store = opened(folder)
+    assert (store.kept, store.only.complete, store.only.resumed) == ("", False, 0)
     add(store, 2, 6)
-    assert store.kept == "4 of 6 scans" and store.progress().points == 12
+    assert store.kept == "4 of 6 scans" and store.only.progress().points == 12
     add(store, 0, 2)
-    store.db.frames = 6
-    assert store.complete
-    cloud = store.points().load()
+    store.only.parts.count_frame(5)
+    assert store.only.complete
+    cloud = store.only.points().load()
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
-    assert len(store.points()) == 18 == store.db.point_count
+    assert len(store.only.points()) == 18 == store.only.parts.point_count
     for scan in range(6):
-        points = store.points_of_scan(scan)
+        points = store.only.points_of_scan(scan)
         assert set(points.scan) == {scan} and "time" in points.columns
         assert np.array_equal(points.positions, cloud.positions[3 * scan : 3 * scan + 3])
-    hits = store.hit_counts()
+    hits = store.only.hit_counts()
     assert hits.shape == (len(SCENE.faces),)
     assert hits[[0, 2, 6]].tolist() == [1, 3, 2] and hits.sum() == 6
-    rays = store.sample_rays()
+    rays = store.only.sample_rays()
     assert rays.shape[1:] == (2, 3) and set(rays[:, 1, 0]) == {0, 2}
     assert set(map(tuple, rays[:, 0].tolist())) == {(0, 0, 1)}
     mark = store.db.meta["mark"]
-    store.storage.write(part_name(mark, 0, 2), b"of a collector that died")
+    store.storage.write(part_name(mark, 0, 0, 2), b"of a collector that died")
     store.storage.write(probe_name(mark, "0a1b2c3d"), b"of a driver that died")
     store.tidy()
-    assert store.storage.sizes().keys() == {*store.points().names, mark_name(mark)}
+    assert store.storage.sizes().keys() == {*store.only.points().names, mark_name(mark)}
     store.remove()
     assert not folder.exists()
 
 
 def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
-    store = RunStore(JOB)
+    store = opened()
     add(store, 0, 6)
-    points, folder = store.points(), store.place.local()
+    points, folder = store.only.points(), store.place.local()
     del store
     gc.collect()
     assert len(points.load()) == 18
@@ -110,14 +116,13 @@ def test_without_a_folder_all_goes_with_the_last_user_of_the_points():
 
 
 def test_it_is_gone_on_with(unfinished):
-    again = replace(JOB, backend="auto", collectors=5, queue_capacity=3, batch_mb=9, patience_s=1.0)
-    store = RunStore(again, unfinished, resume=True)
-    assert (store.resumed, store.backend, store.notes) == (4, "numpy", [])
-    assert store.db.missing(0, 6) == [(2, 3), (5, 6)]
+    store = opened(unfinished, resume=True)
+    assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
+    assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)]
     assert "were cast with it" in store.advice
     store.db.close()
     with pytest.raises(LidarpoolError, match=r"'embree' is asked for, .* cast with 'numpy'"):
-        RunStore(replace(JOB, backend="embree"), unfinished, resume=True)
+        opened(unfinished, backend="embree", resume=True)
 
 
 OTHERS = {
@@ -131,9 +136,9 @@ OTHERS = {
 def test_another_run_cannot_go_on(other, unfinished):
     for resume in (True, False):
         with pytest.raises(LidarpoolError, match=f"cannot be continued, it is of another {other}"):
-            RunStore(OTHERS[other], unfinished, resume=resume)
+            opened(unfinished, resume=resume, job=OTHERS[other])
     remove_run(unfinished)
-    RunStore(OTHERS[other], unfinished).db.close()
+    opened(unfinished, job=OTHERS[other]).db.close()
 
 
 def test_a_run_with_other_copies_cannot_go_on(folder):
@@ -141,16 +146,17 @@ def test_a_run_with_other_copies_cannot_go_on(folder):
         scattered = {"count": 5, "within": [0, 0, 9, 9]} | scatter
         copies = {"name": "Crate", "box": [1, 1, 1], "scatter": scattered}
         scene = {"ground": {}, "copies": [copies]}
-        return make_job(Scenario.from_data({"scene": scene, "poses": [[0, 0, 1]], "steps": 6}))
+        data = {"scene": scene, "poses": [[0, 0, 1]], "steps": 6}
+        return job_of(build(Scenario.from_data(data)))
 
-    store = RunStore(job(), folder)
-    store.backend = "numpy"
+    store = opened(folder, job=job())
+    store.cast_with("numpy", {})
     add(store, 0, 2)
     store.db.close()
     for other in ({"seed": 1}, {"count": 6}, {"scale": [1, 2]}):
         with pytest.raises(LidarpoolError, match="it is of another scene"):
-            RunStore(job(**other), folder, resume=True)
-    RunStore(job(), folder, resume=True).db.close()
+            opened(folder, resume=True, job=job(**other))
+    opened(folder, resume=True, job=job()).db.close()
 
 
 def with_another_field(thing, value):
@@ -160,54 +166,52 @@ def with_another_field(thing, value):
     return later(**kept, gain=value)
 
 
-@pytest.mark.parametrize("at", ["survey", "noise", "sensor", "scene", "planning", "job"])
+@pytest.mark.parametrize("at", ["survey", "noise", "sensor", "scene", "planning"])
 def test_a_field_that_comes_later_is_part_of_the_identity(at, folder):
     def job(gain):
         base = replace(JOB, planning=PLANNING)
-        if at == "job":
-            return with_another_field(base, gain)
         if at in ("noise", "sensor"):
             inner = with_another_field(getattr(SURVEY, at), gain)
             return replace(base, survey=replace(SURVEY, **{at: inner}))
         return replace(base, **{at: with_another_field(getattr(base, at), gain)})
 
-    store = RunStore(job(1.0), folder)
-    store.backend = "numpy"
+    store = opened(folder, job=job(1.0))
+    store.cast_with("numpy", {})
     add(store, 0, 2)
     store.db.close()
     with pytest.raises(LidarpoolError, match="cannot be continued"):
-        RunStore(job(2.0), folder, resume=True)
-    RunStore(job(1.0), folder, resume=True).db.close()
+        opened(folder, resume=True, job=job(2.0))
+    opened(folder, resume=True, job=job(1.0)).db.close()
 
 
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
-    later = identity_of(JOB) | {"lidarpool": "0.2 (sources 12345678)"}
-    monkeypatch.setattr(lidarpool.run.store, "identity_of", lambda job: later)
+    later = {"lidarpool": "0.2 (sources 12345678)"}
+    monkeypatch.setattr(lidarpool.run.store, "software", lambda: later)
     with pytest.raises(LidarpoolError, match=r"lidarpool \S+ \(sources \w+\), here it is 0\.2"):
-        RunStore(JOB, unfinished, resume=True)
+        opened(unfinished, resume=True)
 
 
 def test_a_run_that_has_kept_nothing_is_in_nobodys_way(folder):
-    RunStore(JOB, folder).db.close()
-    store = RunStore(OTHERS["scene"], folder)
-    assert store.resumed == 0
+    opened(folder).db.close()
+    store = opened(folder, job=OTHERS["scene"])
+    assert store.only.resumed == 0
     store.db.close()
-    RunStore(OTHERS["scene"], folder).db.close()
+    opened(folder, job=OTHERS["scene"]).db.close()
 
 
 def test_trials_are_gone_on_with_too(folder):
     job = replace(JOB, planning=PLANNING)
-    store = RunStore(job, folder)
-    store.db.add_trial(run_trial(PLANNING, 1))
+    store = opened(folder, job=job)
+    store.db.add_trials(0, [run_trial(PLANNING, 1)])
     assert store.kept == "1 of 2 planning trials"
     store.db.close()
-    again = RunStore(job, folder, resume=True)
-    assert [trial.trial for trial in again.db.trials] == [1] and not again.complete
+    again = opened(folder, resume=True, job=job)
+    assert [trial.trial for trial in again.only.parts.trials] == [1] and not again.only.complete
 
 
 def part_of(folder, first):
     """File of the part that begins with a scan."""
-    (found,) = (folder / "parts").glob(f"{'?' * 16}-{first:08d}-*.npz")
+    (found,) = (folder / "parts").glob(f"{'?' * 16}-000000-{first:08d}-*.npz")
     return found
 
 
@@ -229,50 +233,50 @@ def test_a_damaged_part_is_made_again(damage, unfinished):
     before = part.read_bytes()
     part.write_bytes(DAMAGES[damage](before))
     assert part.read_bytes() != before
-    store = RunStore(JOB, unfinished, resume=True)
-    assert (store.resumed, store.db.missing(0, 6)) == (2, [(2, 6)])
+    store = opened(unfinished, resume=True)
+    assert (store.only.resumed, store.only.parts.missing(0, 6)) == (2, [(2, 6)])
     (note,) = store.notes
     assert "scans 3 to 4; " in note and f"{part.name} was damaged" in note
     assert add(store, 3, 5)
     store.tidy()
-    assert {*store.points().names, mark_of(store)} == store.storage.sizes().keys()
-    assert len(store.points().load()) == 12
+    assert {*store.only.points().names, mark_of(store)} == store.storage.sizes().keys()
+    assert len(store.only.points().load()) == 12
     store.db.close()
-    assert RunStore(JOB, unfinished, resume=True).notes == []
+    assert opened(unfinished, resume=True).notes == []
 
 
 def test_a_part_that_is_damaged_meanwhile_is_made_again_by_the_next_run(folder):
-    store = RunStore(JOB, folder)
+    store = opened(folder)
     add(store, 0, 2)
     part = part_of(folder, 0)
     part.write_bytes(part.read_bytes()[:-1])
-    for read in (lambda: store.points().load(), store.hit_counts):
+    for read in (lambda: store.only.points().load(), store.only.hit_counts):
         with pytest.raises(LidarpoolError, match="cannot be used") as caught:
             read()
         assert "Resuming the run (--resume, in Python resume=True) casts its" in str(caught.value)
         assert "anew" not in str(caught.value)
     with pytest.raises(LidarpoolError) as caught, store.kept_on_error():
-        store.points().load()
+        store.only.points().load()
     (note,) = caught.value.__notes__
     assert "continue with --resume" in note
-    again = RunStore(JOB, folder, resume=True)
-    assert again.db.missing(0, 6) == [(0, 6)] and part.name in again.notes[0]
+    again = opened(folder, resume=True)
+    assert again.only.parts.missing(0, 6) == [(0, 6)] and part.name in again.notes[0]
 
 
 def test_a_part_with_the_content_of_another_is_made_again(unfinished):
     other = part_of(unfinished, 0).read_bytes()
     assert len(other) == part_of(unfinished, 3).stat().st_size
     part_of(unfinished, 3).write_bytes(other)
-    store = RunStore(JOB, unfinished, resume=True)
-    assert store.resumed == 2 and "scans 3 to 4; " in store.notes[0]
+    store = opened(unfinished, resume=True)
+    assert store.only.resumed == 2 and "scans 3 to 4; " in store.notes[0]
 
 
 def test_parts_that_are_gone_are_made_again(unfinished):
     for path in (unfinished / "parts").iterdir():
         path.unlink()
     (unfinished / "parts").rmdir()
-    store = RunStore(JOB, unfinished, resume=True)
-    assert store.resumed == 0
+    store = opened(unfinished, resume=True)
+    assert store.only.resumed == 0
     (note,) = store.notes
     assert note.startswith("cast again: scans 0 to 1, scans 3 to 4; ")
     assert note.endswith(f".npz were missing in {unfinished / 'parts'}")
@@ -288,8 +292,8 @@ def test_storage_that_cannot_be_read_is_not_taken_for_damage(unfinished, monkeyp
     with monkeypatch.context() as patch:
         patch.setattr(Storage, "read", refuse)
         with pytest.raises(LidarpoolError, match=r"\.npz cannot be read: Permission denied"):
-            RunStore(JOB, unfinished, resume=True)
-    assert RunStore(JOB, unfinished, resume=True).resumed == 4
+            opened(unfinished, resume=True)
+    assert opened(unfinished, resume=True).only.resumed == 4
 
 
 @pytest.fixture(params=["folder", "memory"])
@@ -300,25 +304,25 @@ def place(request, tmp_path):
 
 
 def test_parts_elsewhere_have_a_folder_of_their_own_and_go_with_the_run(folder, place, tmp_path):
-    theirs = RunStore(JOB, tmp_path / "theirs", place)
+    theirs = opened(tmp_path / "theirs", place)
     add(theirs, 0, 6)
-    store = RunStore(JOB, folder, place)
+    store = opened(folder, place)
     add(store, 0, 6)
     assert names(folder) <= {"run.db", "run.db-journal"}
     store.tidy()
-    assert len(store.points().load()) == 18
+    assert len(store.only.points().load()) == 18
     store.remove()
     assert not folder.exists() and store.storage.sizes() == {}
-    assert len(theirs.points().load()) == 18
+    assert len(theirs.only.points().load()) == 18
 
 
 def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
-    store = RunStore(JOB, anywhere, place)
+    store = opened(anywhere, place)
     add(store, 0, 4)
     store.save(now=True)
     store.db.close()
-    again = RunStore(JOB, anywhere, tmp_path / "other", resume=True)
-    assert again.resumed == 4 and again.storage.url == store.storage.url
+    again = opened(anywhere, tmp_path / "other", resume=True)
+    assert again.only.resumed == 4 and again.storage.url == store.storage.url
     again.db.close()
     remove_run(anywhere)
     assert left(anywhere) == set() == store.storage.sizes().keys()
@@ -326,26 +330,26 @@ def test_a_run_is_gone_on_with_where_its_parts_are(anywhere, place, tmp_path):
 
 def test_places_that_cannot_be(tmp_path):
     with pytest.raises(LidarpoolError, match="make the one that it lies in first"):
-        RunStore(JOB, tmp_path / "none" / "run")
+        opened(tmp_path / "none" / "run")
     with pytest.raises(LidarpoolError, match="give a folder for the run as well"):
-        RunStore(JOB, None, tmp_path / "parts")
+        opened(None, tmp_path / "parts")
 
 
 def test_an_error_tells_how_to_go_on(anywhere):
-    store = RunStore(JOB, anywhere)
+    store = opened(anywhere)
     add(store, 0, 2)
-    store.db.frames = 1
+    store.only.parts.count_frame(0)
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
     (note,) = caught.value.__notes__
     assert note.startswith(f"2 of 6 scans are kept in {anywhere}: continue with --resume")
-    again = RunStore(JOB, anywhere, resume=True)
-    assert (again.resumed, again.db.frames) == (2, 1)
+    again = opened(anywhere, resume=True)
+    assert (again.only.resumed, again.only.parts.frames) == (2, 1)
 
 
 def test_an_error_before_anything_was_kept_leaves_nothing(anywhere):
-    store = RunStore(JOB, anywhere)
-    store.storage.write(part_name(store.db.meta["mark"], 0, 2), b"")
+    store = opened(anywhere)
+    store.storage.write(part_name(store.db.meta["mark"], 0, 0, 2), b"")
     with pytest.raises(ValueError, match="bad") as caught, store.kept_on_error():
         raise ValueError("bad")
     assert not hasattr(caught.value, "__notes__") and left(anywhere) == set()
@@ -359,7 +363,7 @@ def mark_of(store):
 
 
 def new_run(folder):
-    RunStore(OTHERS["scene"], folder).db.close()
+    opened(folder, job=OTHERS["scene"]).db.close()
 
 
 FOREIGN = {"a.npz", "arch.npz.bak", ".tmp-5.npz-1a2b", "notes.txt"}
@@ -368,8 +372,8 @@ FOREIGN = {"a.npz", "arch.npz.bak", ".tmp-5.npz-1a2b", "notes.txt"}
 @pytest.fixture
 def kept_nothing(folder):
     """A folder with a run that ended before anything was committed."""
-    store = RunStore(JOB, folder)
-    store.storage.write(part_name(store.db.meta["mark"], 0, 2), b"of a collector that died")
+    store = opened(folder)
+    store.storage.write(part_name(store.db.meta["mark"], 0, 0, 2), b"of a collector that died")
     store.db.close()
     return folder
 
@@ -391,7 +395,7 @@ def test_foreign_files_among_the_parts_stay(how, request, folder):
     put(folder / "parts")
     (folder / "parts" / "own").mkdir()
     if how == "finished":
-        store = RunStore(JOB, folder)
+        store = opened(folder)
         add(store, 0, 6)
         store.tidy()
         store.remove()
@@ -420,30 +424,26 @@ def test_nothing_behind_a_link_is_deleted(unfinished, tmp_path):
     before = content(elsewhere)
     for use in (
         remove_run,
-        lambda folder: RunStore(JOB, folder, resume=True),
-        lambda folder: RunStore(JOB, folder),
+        lambda folder: opened(folder, resume=True),
+        lambda folder: opened(folder),
     ):
         with pytest.raises(LidarpoolError, match=f"{parts} is a link, and nothing behind"):
             use(unfinished)
     assert content(elsewhere) == before
     parts.unlink()
     elsewhere.rename(parts)
-    assert RunStore(JOB, unfinished, resume=True).resumed == 4
+    assert opened(unfinished, resume=True).only.resumed == 4
 
 
-LINKS = ["jobs", "jobs/x", "jobs/x/parts", "jobs/x/run.db", "parts", "run.db", "run.db-journal"]
-
-
-@pytest.mark.parametrize("where", LINKS)
+@pytest.mark.parametrize("where", ["parts", "run.db", "run.db-journal"])
 @pytest.mark.parametrize("use", [remove_run, "resume", "new"])
 def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):
     """Wherever the link is, and whatever it leads to."""
     theirs = tmp_path / "theirs"
-    other = RunStore(JOB, theirs)
+    other = opened(theirs)
     add(other, 0, 6)
     other.db.close()
-    (theirs / "jobs").mkdir()
-    store = RunStore(JOB, folder)
+    store = opened(folder)
     if use == "resume":
         add(store, 0, 2)
     store.db.close()
@@ -451,48 +451,73 @@ def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):
     link.parent.mkdir(parents=True, exist_ok=True)
     if link.exists():
         link.rename(tmp_path / "kept")
-    target = theirs / link.name if link.name in ("parts", "run.db", "jobs") else theirs
+    target = theirs / link.name
     link.symlink_to(target if target.exists() else theirs / "run.db")
     before = {name: (theirs / name).read_bytes() for name in names(theirs)}
     assert len(before) == 3
-    with pytest.raises(LidarpoolError, match=f"{link} is a link|holds .* run, a job"):
-        use(folder) if callable(use) else RunStore(JOB, folder, resume=use == "resume").remove()
+    with pytest.raises(LidarpoolError, match=f"{link} is a link"):
+        use(folder) if callable(use) else opened(folder, resume=use == "resume").remove()
     assert before == {name: (theirs / name).read_bytes() for name in names(theirs)}
     link.unlink()
     remove_run(folder)
     named = tmp_path / "named"
     named.symlink_to(theirs)
-    assert RunStore(JOB, named, resume=True).resumed == 6, "a link that was named is one's own"
+    assert opened(named, resume=True).only.resumed == 6, "a link that was named is one's own"
+
+
+def campaign(folder, *, height=1.0, resume=False):
+    """Store of a campaign of two jobs, which are made of a file, and the first of them."""
+    file = folder.with_name("height")
+    file.write_text(str(height))
+
+    def make(number, rng):
+        poses = [(number, 0, float(file.read_text()))]
+        return Job(SCENE, Survey(Sensor.grid(layers=2), poses, steps=6))
+
+    jobs = Campaign(make, 2)
+    return RunStore(jobs, place=folder, resume=resume), jobs.job(0)
 
 
 @pytest.mark.parametrize("left", ["a job that is done", "a job under way"])
 def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, unfinished):
-    begin = partial(CampaignStore, {"seed": "1"}, 2, "auto", Storage.at(folder))
     with pytest.raises(LidarpoolError, match="cannot be continued, "):
-        begin()
+        campaign(folder)
     assert len(names(folder)) > 2
     remove_run(folder)
-    campaign = begin()
+    store, job = campaign(folder)
     if left == "a job under way":
-        job = campaign.store_of("0000", JOB)
-        add(job, 0, 2)
-        job.db.close()
+        store.points_of(job)
+        add(store, 0, 2, job)
     else:
-        campaign.db.end_jobs([(0, False, {})])
-    campaign.db.close()
+        store.end([JobRow(0, "0000")])
+    store.db.close()
     before = names(folder)
     for resume in (False, True):
         with pytest.raises(LidarpoolError, match="cannot be continued, "):
-            RunStore(JOB, folder, resume=resume)
+            opened(folder, resume=resume)
     assert names(folder) == before
+
+
+@pytest.mark.parametrize("change", ["none", "another height", "of unknown content"])
+def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, folder):
+    store, job = campaign(folder)
+    points = store.points_of(job)
+    add(store, 0, 2, job)
+    if change != "of unknown content":
+        store.identify(points)
+    store.db.close()
+    again, job = campaign(folder, height=2.0 if change == "another height" else 1.0, resume=True)
+    same = change == "none"
+    assert again.points_of(job).resumed == (2 if same else 0)
+    assert any(name.endswith(".npz") for name in again.storage.sizes()) == same
 
 
 def test_a_link_with_the_name_of_a_part_is_no_part(unfinished, tmp_path):
     part, victim = part_of(unfinished, 0), tmp_path / "victim"
     part.rename(victim)
     part.symlink_to(victim)
-    store = RunStore(JOB, unfinished, resume=True)
-    assert store.resumed == 2 and "was missing" in store.notes[0]
+    store = opened(unfinished, resume=True)
+    assert store.only.resumed == 2 and "was missing" in store.notes[0]
     store.db.close()
     remove_run(unfinished)
     assert victim.exists() and part.is_symlink()
@@ -515,22 +540,22 @@ def change(folder, *statements):
 def test_a_database_that_points_elsewhere(where, kept, request, tmp_path):
     folder = request.getfixturevalue(kept)
     shared = tmp_path / "shared" if where.endswith("place") else None
-    other = RunStore(JOB, tmp_path / "other", shared)
+    other = opened(tmp_path / "other", shared)
     add(other, 0, 6)
     put(tmp_path / "victim")
     place = tmp_path / "victim" if where == "victim" else other.storage.url
     change(folder, f"UPDATE meta SET value = '{place}' WHERE name = 'parts'")
     with pytest.raises(LidarpoolError, match=r"run\.db is damaged .* is not the place of this"):
-        RunStore(JOB, folder, resume=True)
+        opened(folder)
     remove_run(folder)
     assert not folder.exists()
     assert content(tmp_path / "victim").keys() == FOREIGN
-    assert len(other.points().load()) == 18
+    assert len(other.only.points().load()) == 18
 
 
 def test_parts_of_another_mark_stay(unfinished, tmp_path):
     """The folder of the parts was replaced by that of another run."""
-    other = RunStore(JOB, tmp_path / "other")
+    other = opened(tmp_path / "other")
     add(other, 0, 6)
     other.db.close()
     remove_tree(unfinished / "parts")
@@ -545,24 +570,46 @@ def test_a_damaged_database_is_dropped_with_the_parts_of_its_folder(unfinished):
     (unfinished / "run.db").write_bytes(bytes(8192))
     put(unfinished / "parts", ["a.npz"])
     with pytest.raises(LidarpoolError, match="drop the run with --fresh"):
-        RunStore(JOB, unfinished)
+        opened(unfinished)
     assert len(names(unfinished)) == 5
     remove_run(unfinished)
     assert names(unfinished) == {"parts/a.npz"}
 
 
+@pytest.mark.parametrize("harm", ["missing", "cut"])
+def test_a_lost_database_is_made_again_from_the_parts(harm, folder, place):
+    store = opened(folder, place)
+    store.cast_with("numpy", {})
+    add(store, 0, 2), add(store, 3, 5)
+    store.db.close()
+    path = folder / "run.db"
+    path.unlink() if harm == "missing" else path.write_bytes(path.read_bytes()[:6000])
+    before = names(folder)
+    with pytest.raises(LidarpoolError, match="cannot be continued, it is of another scene"):
+        opened(folder, place, resume=True, job=OTHERS["scene"])
+    assert names(folder) == before
+    again = opened(folder, place, resume=True)
+    assert (again.only.resumed, again.backend) == (4, "numpy") and "is made again" in again.notes[0]
+    add(again, 2, 3), add(again, 5, 6)
+    assert set(again.only.sample_rays()[:, 1, 0]) == {0, 2, 3, 5}
+    assert again.only.parts.hits == 12 == again.only.hit_counts().sum()
+
+
 def test_a_database_of_another_program_stays(folder):
-    folder.mkdir()
+    store = opened(folder)
+    add(store, 0, 2)
+    store.db.close()
+    (folder / "run.db").unlink()
     change(folder, "CREATE TABLE mine (a)")
-    for use in (remove_run, new_run):
+    for use in (remove_run, new_run, partial(opened, resume=True)):
         with pytest.raises(LidarpoolError, match=r"run\.db (is not the database|is damaged)"):
             use(folder)
-    assert names(folder) == {"run.db"}
+    assert len(names(folder)) == 3
 
 
 def test_a_run_that_is_going_on_is_not_dropped(folder):
-    store = RunStore(JOB, folder)
+    store = opened(folder)
     add(store, 0, 6)
     with pytest.raises(LidarpoolError, match=f"Another run is using {folder}"):
         remove_run(folder)
-    assert len(store.points().load()) == 18
+    assert len(store.only.points().load()) == 18

@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from lidarpool.run.job import make_job
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.simulator.rig import Rig
 
@@ -25,14 +26,14 @@ def scanned(tmp_path_factory):
     for pattern in ("block*", "rover*", "car.obj"):
         for file in EXAMPLES.glob(pattern):
             shutil.copy(file, folder)
-    scenario = Scenario.load(folder / "block.yaml")
-    job = make_job(scenario, "embree")
+    built = build(Scenario.load(folder / "block.yaml"))
+    job = job_of(built)
     batches = list(Rig(job.scene, job.survey, "embree").cast(0, 72))
     columns = {
         column.name: np.concatenate([column.make(batch) for batch in batches])
         for column in job.survey.stored_columns
     }
-    return scenario, job, columns
+    return built, job, columns
 
 
 def of(job, columns, name):
@@ -41,8 +42,8 @@ def of(job, columns, name):
 
 
 def test_all_sources_are_in_one_scene_and_meshes_are_kept_once(scanned):
-    scenario, job, _ = scanned
-    assert [*scenario.sources] == [
+    built, job, _ = scanned
+    assert [*built.found.sources] == [
         "block.usdc", "block-hills.tif", "rover.urdf", "car.obj", "block-traffic.xml.gz"
     ]  # fmt: skip
     assert job.survey.epsg == 25832

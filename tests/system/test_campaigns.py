@@ -23,7 +23,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 
 import lidarpool.run.campaign
-from lidarpool import Campaign, CampaignJob, LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool import Campaign, Job, LidarpoolError, Scene, Sensor, Survey, simulate
 from lidarpool.base.errors import explained
 from lidarpool.base.storage import Storage
 from lidarpool.export.dataset import DataSet
@@ -91,14 +91,14 @@ def whole(slots: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, byt
 SENSOR = Sensor.grid(rays_per_revolution=90, layers=2, step_deg=4)
 
 
-def make(number: int, rng: np.random.Generator) -> CampaignJob:
+def make(number: int, rng: np.random.Generator) -> Job:
     """A job that differs from the others in its pose."""
     return job(SENSOR, number)
 
 
-def job(sensor: Sensor, number: int, **survey: Any) -> CampaignJob:
+def job(sensor: Sensor, number: int, **survey: Any) -> Job:
     what = Survey(sensor, [(number, 0, 1)], steps=45, keep_every=1, **survey)
-    return CampaignJob(Scene.seed(), what, {"x": number})
+    return Job(Scene.seed(), what, values={"x": number})
 
 
 # -- each job alone -------------------------------------------------------------------------------
@@ -127,8 +127,8 @@ def test_any_number_of_workers_gives_the_same_bytes(files, whole):
 # -- jobs that fail -------------------------------------------------------------------------------
 
 
-def failing(*numbers: int) -> Callable[[int, np.random.Generator], CampaignJob]:
-    def make_or_fail(number: int, rng: np.random.Generator) -> CampaignJob:
+def failing(*numbers: int) -> Callable[[int, np.random.Generator], Job]:
+    def make_or_fail(number: int, rng: np.random.Generator) -> Job:
         if number in numbers:
             raise RuntimeError("no such street")
         return make(number, rng)
@@ -167,8 +167,8 @@ class Breaks(Sensor):
         return super().firings(step)
 
 
-def breaking(where: str) -> Callable[[int, np.random.Generator], CampaignJob]:
-    def make_one_that_breaks(number: int, rng: np.random.Generator) -> CampaignJob:
+def breaking(where: str) -> Callable[[int, np.random.Generator], Job]:
+    def make_one_that_breaks(number: int, rng: np.random.Generator) -> Job:
         breaks = Breaks(SENSOR.beams, head=SENSOR.head, where=where)
         return job(breaks if number == 1 else SENSOR, number)
 
@@ -207,7 +207,7 @@ class Unknown(Sensor):
 def test_jobs_that_cannot_be_sent_to_workers_fail_alone(client, tmp_path, left_over):
     kinds = (Unpicklable, Sensor, Unknown, Unpicklable, Sensor)
 
-    def make_one(number: int, rng: np.random.Generator) -> CampaignJob:
+    def make_one(number: int, rng: np.random.Generator) -> Job:
         return job(kinds[number](SENSOR.beams, head=SENSOR.head), number)
 
     run = Campaign(make_one, 5, keep="folder").run(tmp_path / "ds", client=client)
@@ -281,7 +281,7 @@ def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots, no_pict
 def test_failed_jobs_are_done_again_and_no_others(client, tmp_path):
     there, made = tmp_path / "there", []
 
-    def make_if_there(number: int, rng: np.random.Generator) -> CampaignJob:
+    def make_if_there(number: int, rng: np.random.Generator) -> Job:
         made.append(number)
         if number == 2 and not there.exists():
             raise FileNotFoundError(there)
@@ -353,7 +353,7 @@ def test_a_damaged_job_is_named_and_made_again(files, whole, lidarpool, slots, n
 def test_jobs_of_an_unfinished_campaign_are_looked_at(client, tmp_path):
     there = tmp_path / "there"
 
-    def make_if_there(number: int, rng: np.random.Generator) -> CampaignJob:
+    def make_if_there(number: int, rng: np.random.Generator) -> Job:
         if number == 2 and not there.exists():
             raise FileNotFoundError(there)
         return make(number, rng)

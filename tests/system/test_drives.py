@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from lidarpool import Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
 from lidarpool.scene.scene_file import write_scene
@@ -78,8 +79,9 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     for name in ("city-drive.yaml", "car.obj", "pedestrian.obj"):
         (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
     scenario = Scenario.load(tmp_path / "city-drive.yaml")
-    scene = scenario.build_scene()
-    survey = scenario.survey(scene)
+    built = build(scenario)
+    scene = built.scene
+    survey = built.survey
     assert [carried.name for carried in survey.carried] == ["roof", "left", "right"]
     assert len(scene.actors) == 10
     assert 15e6 < survey.ray_count < 15.2e6
@@ -110,8 +112,9 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster, no_pictures)
     assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
     cloud = read_cloud(out / "cloud.ply")
     scenario = Scenario.load(town / "drive.yaml")
-    scene = scenario.build_scene()
-    survey = scenario.survey(scene)
+    built = build(scenario)
+    scene = built.scene
+    survey = built.survey
     batches = list(Rig(scene, survey, report["backend"]).cast(0, survey.scan_count))
     for column in survey.stored_columns[3:]:
         made = np.concatenate([column.make(batch) for batch in batches])

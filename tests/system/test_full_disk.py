@@ -16,6 +16,7 @@ from distributed import Client
 import lidarpool.report.output as lidarpool_output
 from lidarpool import LidarpoolError, simulate
 from lidarpool.report.output import FILES
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
 SCENARIO = """
@@ -29,12 +30,13 @@ pool: {backend: embree}
 def run(cluster: str) -> Callable[..., Any]:
     """Run the scenario from Python."""
     scenario = Scenario.from_data(yaml.safe_load(SCENARIO))
-    scene = scenario.build_scene()
+    built = build(scenario)
+    scene = built.scene
 
     def run(**options: Any) -> Any:
         with Client(cluster, set_as_default=False) as client:
             return simulate(
-                scene, scenario.survey(scene), scenario.plan(scene), client=client,
+                scene, built.survey, built.planning, client=client,
                 backend="embree", **options,
             )  # fmt: skip
 

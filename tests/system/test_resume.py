@@ -19,6 +19,7 @@ import yaml
 from distributed import Client
 
 from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, remove_run, simulate
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
 pytestmark = pytest.mark.skipif(sys.platform == "win32", reason="forks")
@@ -96,9 +97,10 @@ for point, times in json.loads(sys.argv[2]):
 def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Cloud of the scenario in one go."""
     scenario = Scenario.from_data(yaml.safe_load(SCENARIO))
-    scene = scenario.build_scene()
+    built = build(scenario)
+    scene = built.scene
     with Client(cluster, set_as_default=False) as client:
-        result = simulate(scene, scenario.survey(scene), client=client, backend="numpy")
+        result = simulate(scene, built.survey, client=client, backend="numpy")
     path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"
     result.points.save(path)
     return path.read_bytes()

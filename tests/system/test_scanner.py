@@ -18,6 +18,7 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.columns.table import OPTIONAL
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 
@@ -56,13 +57,14 @@ def test_copies_of_a_scenario_are_those_of_a_run(cluster_client, same_cloud):
     }
     data["scene"]["copies"][0]["scatter"] |= {"within": [-20, -20, 20, 20]}
     scenario = Scenario.from_data(data)
-    scene = scenario.build_scene()
-    survey = scenario.survey(scene)
+    built = build(scenario)
+    scene = built.scene
+    survey = built.survey
     cloud = simulate(scene, survey, client=cluster_client).cloud
     assert len({*cloud["object"].tolist()}) > 50 and {*cloud["class"].tolist()} == {0, 4}
     bin_["at"][0]["position"] = [9, 9, 0]
     options = {"columns": survey.columns, "materials": survey.materials}
-    scanner = Scanner(Scenario.from_data(data).build_scene(), survey.sensor, **options)
+    scanner = Scanner(build(Scenario.from_data(data)).scene, survey.sensor, **options)
     assert not same_cloud(scanner.sweep((0, 0, 2.5)), cloud)
     scanner.move("Bin", Pose((3, 4, 0), 30))
     assert same_cloud(scanner.sweep((0, 0, 2.5)), cloud)

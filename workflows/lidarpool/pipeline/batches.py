@@ -138,7 +138,7 @@ class Batches:
         self.move(batch, Place.CASTING, now)
 
     def forget_task(self, batch: Batch) -> str:
-        """Let a batch have no casting task; returns the task's key if no other needs it, else ""."""
+        """Let a batch have no casting task; returns its key if no other batch needs it, else ""."""
         key, batch.key = batch.key, ""
         left = self._tasks.get(key)
         if left is None:

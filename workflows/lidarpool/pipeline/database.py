@@ -192,14 +192,14 @@ class RunDatabase:
         if (made := self.meta.get("format")) != str(FORMAT):
             raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
         _checked_place(self.meta)
-        for number, failed in self._rows("SELECT number, failed FROM jobs"):
-            self._mark_ended(number, _FAILED if failed else _DONE)
+        # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
+        with closing(self._sql.execute("SELECT number, failed FROM jobs")) as rows:
+            for number, failed in rows:
+                self._mark_ended(number, _FAILED if failed else _DONE)
         self.begun  # noqa: B018 - an error if tables are missing
 
-    def _rows(self, query: str, values: Sequence[Any] = ()) -> Iterator[tuple[Any, ...]]:
-        # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
-        with closing(self._sql.execute(query, values)) as rows:
-            yield from rows
+    def _rows(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
+        return self._sql.execute(query, values).fetchall()
 
     # -- reading -------------------------------------------------------------------------
 
@@ -210,14 +210,15 @@ class RunDatabase:
         job = JobParts(number, scan_count, self._summaries)
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         with self._explained():
-            for first, stop, *counts, cells in self._rows(query, [number]):
+            for first, stop, *counts, cells in self._rows(query, number):
                 if not 0 <= first < stop <= scan_count:
                     raise ValueError(f"a part has scans {first} to {stop} of {scan_count}")
                 name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
-                job.enter(Receipt(number, first, stop, name, *counts, tuple(box), b""))
+                rows, size, hits = counts
+                job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
             query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
-            job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, [number])]
-            for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", [number]):
+            job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, number)]
+            for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
                 job.frames = job.frames_written = int(count)
         self.under_way[number] = job
         return job
@@ -246,19 +247,22 @@ class RunDatabase:
         """Hash of what a job under way is made of; empty if none was kept."""
         with self._explained():
             return "".join(
-                h for (h,) in self._rows("SELECT hash FROM made_of WHERE job = ?", [number])
+                h for (h,) in self._rows("SELECT hash FROM made_of WHERE job = ?", number)
             )
 
     def job_rows(self) -> Iterator[dict[str, Any]]:
         """Yield what was stored of the jobs that have ended, by number; one at a time."""
-        with self._explained():
-            for (data,) in self._rows("SELECT data FROM jobs ORDER BY number"):
+        with (
+            self._explained(),
+            closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
+        ):
+            for (data,) in rows:
                 yield json.loads(data)
 
     def _summaries(self, number: int, firsts: Iterable[int]) -> list[bytes]:
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
         with self._explained():
-            return [self._sql.execute(query, (number, f)).fetchone()[0] for f in firsts]
+            return [self._rows(query, number, first)[0][0] for first in firsts]
 
     # -- writing -------------------------------------------------------------------------
 
@@ -369,14 +373,6 @@ class RunDatabase:
         """Close the file."""
         self._sql.close()
 
-    def _enter(self, part: Receipt) -> None:
-        self.parts[part.first] = part
-        bisect.insort(self._firsts, part.first)
-        self.committed[part.first : part.stop] = True
-        self.scans_done += part.stop - part.first
-        self.point_count += part.rows
-        self.hits += part.hits
-
     def _set(self, name: str, value: str) -> None:
         self._sql.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
 
@@ -442,12 +438,6 @@ def _trial_of(data: dict[str, Any]) -> Trial:
 def parts_folder(mark: str) -> str:
     """Name of the folder of the parts in a place that runs share."""
     return f"run-{mark}"
-
-
-def mark_of_folder(name: str) -> str:
-    """Mark of the run whose `parts_folder` has a name; empty for any other name."""
-    found = re.fullmatch("run-([0-9a-f]{16})", name)
-    return found[1] if found else ""
 
 
 def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:

@@ -26,9 +26,9 @@ from . import policies
 from .casting import Casting
 from .collecting import Collecting
 from .database import RunDatabase
-from .failures import JobError, sending, storing
+from .failures import JobError, sending
 from .jobs import JobState
-from .long_stages import LongStages, StageChanges
+from .long_stages import LongStages
 from .messages import ColumnsLost, Failed, Frame, Message, Receipt, ScanRange, Summaries
 from .names import COLLECT, GENERATE, SORT
 from .rigs import RigPlan
@@ -38,6 +38,7 @@ from .workers import CastingWorkers
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
 WAIT_S = 0.02  # for news, where there is nothing else to do
 CLOSING_S = 0.001  # longest wait while the stages end
+ADVISED_AGAIN = 0.2  # change of the scans in an item of stage 1 that is worth a request
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
 
 
@@ -54,10 +55,12 @@ class RunDriver:
         self._workers, self._stages, self._db, self._storage = workers, stages, db, storage
         self._casting = Casting(workers, stages.collector_count)
         self._collecting = Collecting(stages, storage, db.meta["mark"], self._casting)
+        self.batches = self._casting.batches
         self.jobs: dict[int, JobState] = {}  # those under way
         self.book = TaskBook()  # of stage 2
         self.progress = 0  # a number that grows when something is committed or handed out
         self.later = 0  # scans of jobs that are not begun yet
+        self._advice = 1  # scans that stage 1 was told to put into an item
         self._announced: dict[int, int] = {}  # {job: scans}, in the order of stage 1, until taken
         self._ended: list[tuple[JobState, JobError | None]] = []  # since they were asked for
 
@@ -102,7 +105,7 @@ class RunDriver:
             on_parts,
         )
         self._describe([job])
-        self._sort(job, parts.unframed() if parts.has_frames else [])
+        self._sort_again([job])
         self._end_complete([job])
         return job
 
@@ -111,8 +114,9 @@ class RunDriver:
         """Whether another job should begin, so that stage 1 always has scans to describe."""
         if len(self._announced) < ANNOUNCED:
             return True
-        to_come = sum(job.batches_to_come for job in self.jobs.values())
-        return len(self._casting.batches) + to_come < self._casting.most
+        jobs = [self.jobs[number] for number in self._announced if number in self.jobs]
+        to_come = sum(job.batches_to_come(self._advice) for job in jobs)
+        return len(self.batches) + to_come < self._casting.most
 
     def take_ended(self) -> list[tuple[JobState, JobError | None]]:
         """Return the jobs that are complete, or failed by an error, since the last call."""
@@ -200,7 +204,7 @@ class RunDriver:
                     del self._announced[message.job]
                 if job is not None and not job.condemned:
                     for first, stop in job.take(message.first, message.stop):
-                        self._casting.batches.add(job, first, stop)
+                        self.batches.add(job, first, stop)
             case Failed():
                 if message.stage == GENERATE:
                     self._announced.pop(message.job, None)
@@ -226,8 +230,7 @@ class RunDriver:
             of_jobs.setdefault(job, []).append(receipt)
             self.progress += receipt.stop - receipt.first
         for job, parts in of_jobs.items():
-            if job.parts.has_frames:
-                self._sort(job, parts)
+            self._sort(job, parts)
             if job.on_parts is not None:
                 job.on_parts(parts)
         self._end_complete(of_jobs)
@@ -240,11 +243,12 @@ class RunDriver:
         self._casting.learn(record for _, record in records)
         for receipt, last in records[-1:]:
             job = self.jobs[receipt.job]
-            self._stages.advise(
-                policies.scans_per_batch(
-                    last.seconds, last.items, job.fit, job.in_all, self.slot_count
-                )
+            scans = policies.scans_per_batch(
+                last.seconds, last.items, job.fit, job.in_all, self.slot_count
             )
+            if abs(scans - self._advice) > ADVISED_AGAIN * self._advice:  # it is a request
+                self._advice = scans
+                self._stages.advise(scans)
 
     # -- looking after workers and stages ------------------------------------------------------
 
@@ -257,21 +261,17 @@ class RunDriver:
             left = self.later + sum(job.left for job in self.jobs.values())
             self._workers.want(self._casting.slots_wanted(left))
             self._casting.leave_workers(seen)
-            for job in self.jobs.values():
-                if job.parts.has_frames and time.monotonic() - job.sorted_at > STALL_S:
-                    self._sort(job, job.parts.unframed())
+            stalled = [
+                job for job in self.jobs.values() if time.monotonic() - job.sorted_at > STALL_S
+            ]
+            self._sort_again(stalled)
         changes = self._stages.look(self.progress)
         self._collecting.look(changes)
-        self._restart(changes)
-
-    def _restart(self, changes: StageChanges) -> None:
-        """Give stages that were started all that they need."""
-        if GENERATE in changes.started:
+        if GENERATE in changes.started:  # a stage that was started gets all that it needs
             self._announced.clear()
             self._describe(self.jobs.values())
-        for job in self.jobs.values() if SORT in changes.started else ():
-            if job.parts.has_frames:
-                self._sort(job, job.parts.unframed())
+        if SORT in changes.started:
+            self._sort_again(self.jobs.values())
 
     def _describe(self, jobs: Iterable[JobState]) -> None:
         """Have stage 1 describe what is left of jobs; an absent one is told when it is started."""
@@ -290,12 +290,18 @@ class RunDriver:
         return False
 
     def _sort(self, job: JobState, parts: Sequence[Receipt]) -> None:
-        """Send parts to the sorter; an absent one gets them when it is started."""
-        job.wait_for_sorter()
-        if parts:
+        """Send parts to the sorter if they have frames; an absent one gets them when it starts."""
+        if parts and job.parts.has_frames:
             messages = job.summaries(parts)
             job.trace("handon", SORT, chain.from_iterable(m.scans for m in messages))
             self._stages.send(SORT, messages)
+
+    def _sort_again(self, jobs: Iterable[JobState]) -> None:
+        """Send the sorter all that was not handed out of jobs."""
+        for job in jobs:
+            job.wait_for_sorter()
+            if job.parts.has_frames:
+                self._sort(job, job.parts.unframed())
 
     # -- the end -----------------------------------------------------------------------------
 

@@ -53,6 +53,10 @@ class JobState:
     condemned: list[str] = field(default_factory=list)  # why scans cannot be done
     sorted_at: float = field(default_factory=time.monotonic)  # when the last frames came
 
+    def __post_init__(self) -> None:
+        if not self.left:  # stage 1 need not describe what is committed
+            self.generated = self.survey.scan_count
+
     @property
     def complete(self) -> bool:
         """Whether all is committed, and was handed out if there are frames."""
@@ -75,10 +79,9 @@ class JobState:
         """Whether stage 1 has nothing to do for it any more."""
         return self.generated >= self.survey.scan_count
 
-    @property
-    def batches_to_come(self) -> int:
-        """An estimate of the batches of what stage 1 has to describe yet, if they are large."""
-        return -(-(self.survey.scan_count - self.generated) // self.fit)
+    def batches_to_come(self, scans: int) -> int:
+        """How many batches of so many scans, if they fit, stage 1 has to describe yet."""
+        return -(-(self.survey.scan_count - self.generated) // min(scans, self.fit))
 
     @property
     def description(self) -> Description:

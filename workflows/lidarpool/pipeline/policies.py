@@ -119,7 +119,8 @@ def offers(
     left -= sum(weight(b, per_task) for b in behind)
     backlog = any(b.place is Place.CAST for b in behind)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
-    size = per_task if backlog else min(per_task, -(-len(waiting) // max(1, idle)))
+    spread = -(-_weight(waiting, per_task) // max(1, idle))  # all idle slots get some
+    size = per_task if backlog else min(per_task, spread)
     groups: dict[object, deque[Batch]] = {}  # those that may share a task
     for batch in waiting:
         groups.setdefault(_group(batch), deque()).append(batch)
@@ -153,7 +154,7 @@ def offers(
 
 
 def _group(batch: Batch) -> object:
-    """What the batches of a task have in common."""
+    """Return what the batches of a task have in common."""
     if batch.deaths:
         return batch
     return batch.job.number if batch.divided else batch.job.scene

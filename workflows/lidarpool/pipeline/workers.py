@@ -161,7 +161,7 @@ class CastingWorkers:
         return share(self._partition, data, key=f"{name}-packed-{self._count}", priority=10)
 
     def _brought(self, packed: _Packed, worker: str) -> bytes | Future | None:
-        """What a task brings to a worker; None if it is there."""
+        """Return what a task brings to a worker; None if it is there."""
         if worker in packed.there:
             return None
         packed.sent.add(worker)

@@ -45,7 +45,7 @@ class Output(Generic[R]):
         """Compare what is there with what the store says is done."""
 
     def writer(self, conductor: Conductor[R]) -> Callable[[tuple[str, bytes]], JobWriter] | None:
-        """What has jobs written as soon as they are cast; None if the only job's parts stay."""
+        """Return what has jobs written once they are cast; None if the only job's parts stay."""
         return None
 
     def finish(self, conductor: Conductor[R]) -> R:

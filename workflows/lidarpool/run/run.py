@@ -158,9 +158,8 @@ class Run:
         job, (points, _) = made.job, self._made[made.job.number]
         cluster, jobs = self._cluster, self._store.jobs
         on_frame = self._on_frame
-        if self._writer is None:
-            if job.planning is not None:
-                self._plan(job, points)
+        if self._writer is None and job.planning is not None:
+            self._plan(job, points)
         # Of a campaign's job many follow, so that its batches need not be divided among all.
         left = jobs.count - self._store.db.ended_count
         self._driver.begin(
@@ -192,7 +191,7 @@ class Run:
         partition.want(0)  # from now on its trials wait for workers
 
     def _files_of(self, state: JobState) -> JobFiles:
-        """What a job that is committed is written from."""
+        """Return what a job that is committed is written from."""
         points, sweeps = self._made[state.number]
         job = points.job
         assert sweeps is not None, "of a data set"
@@ -340,6 +339,9 @@ class Run:
         if self._trials is not None:
             done = len(self._store.db.job(0, 0).trials)
             self._store.db.add_trials(0, self._trials.trials[done:])
+        for points, _ in self._made.values():
+            if points.parts.scans_done and not points.complete:
+                self._store.identify(points)
         self._store.save()
 
     def _tell_progress(self, show: Show, seconds: float) -> None:

@@ -121,6 +121,7 @@ class RunStore:
         path = _database(self._folder)
         durable = self.lasting and self._remote is None
         mark, earlier = "", ""  # of a run that has kept nothing, and the place of its parts
+        damage: DamagedError | None = None
         try:
             if self._remote:
                 fetch_database(self._remote.storage, path)
@@ -130,15 +131,18 @@ class RunStore:
                     return db
                 db.close()
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
-        except DamagedError:
-            if not resume:
-                raise
-            path.unlink()
+        except DamagedError as error:
+            damage = error
         except LidarpoolError as error:  # the copy of a database is nobody's business
             raise LidarpoolError(str(error).replace(self._folder.url, self.place.url)) from error
         new = self._marked(parts) if resume and not mark else None
         if new is not None:
+            read_place(path)  # an error if it is another program's
+            self._check_same(here, new["identity"])
             self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
+        elif damage is not None:
+            told = str(damage).replace(self._folder.url, self.place.url)
+            raise LidarpoolError(told) from damage
         elif self.lasting:
             _remove(self.place, _parts_of(self.place, earlier), mark)
         path.unlink(missing_ok=True)
@@ -156,7 +160,7 @@ class RunStore:
             raise
 
     def _marked(self, parts: str | Path | Storage | None) -> dict[str, str] | None:
-        """What the database of this run began with, as the folder of its parts says it."""
+        """Return what the database of this run began with, as the folder of its parts says it."""
         places = [self.place.below(PARTS)]
         if parts is not None:
             shared = Storage.at(parts)
@@ -200,11 +204,7 @@ class RunStore:
 
     def _go_on(self, here: Mapping[str, str], resume: bool) -> None:
         """Check that this run may continue the existing one."""
-        if other := difference(here, json.loads(self.db.meta["identity"])):
-            raise LidarpoolError(
-                f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
-                "give another folder."
-            )
+        self._check_same(here, self.db.meta["identity"])
         if not resume:
             raise LidarpoolError(
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
@@ -214,6 +214,14 @@ class RunStore:
             raise LidarpoolError(
                 f"Backend {self._wanted!r} is asked for, and the scans in {self.place} were "
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
+            )
+
+    def _check_same(self, here: Mapping[str, str], identity: str) -> None:
+        """Check that the run that is there is the same."""
+        if other := difference(here, json.loads(identity)):
+            raise LidarpoolError(
+                f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
+                "give another folder."
             )
 
     # -- reading ---------------------------------------------------------------------------
@@ -277,26 +285,30 @@ class RunStore:
     # -- jobs --------------------------------------------------------------------------------
 
     def points_of(self, job: Job) -> JobPoints:
-        """What is kept of a job that is under way; parts of an earlier run are checked first."""
+        """Return what is kept of a job under way; parts of an earlier run are checked first."""
         if (found := self._points.get(job.number)) is not None:
             return found
         points = self._points[job.number] = JobPoints(self, job)
         if isinstance(self.jobs, OneJob):
+            points.parts.has_frames = True
             return points  # is checked once the run itself is known to be the same
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
-            if self.db.hash_of(job.number) == fingerprint(identity_of(job)):
+            known = self.db.hash_of(job.number)
+            points.identified = bool(known) and known == _hash_of(job)
+            if points.identified:
                 points.check(self._sizes, strays)
-            else:  # files that it is made of have changed
+            else:  # files that it is made of have changed, or a run died before it kept the hash
                 self.db.restart(job.number)
                 self.storage.remove(strays)
+                points.resumed = 0
         return points
 
     def identify(self, points: JobPoints) -> None:
         """Keep what a job is made of, of which parts are committed and others are not yet."""
         if not isinstance(self.jobs, OneJob) and not points.identified:
             points.identified = True
-            self.db.set_hash(points.job.number, fingerprint(identity_of(points.job)))
+            self.db.set_hash(points.job.number, _hash_of(points.job))
 
     def end(self, rows: Sequence[JobRow]) -> None:
         """Commit that jobs have ended."""
@@ -368,18 +380,28 @@ class RunStore:
             if self._remote and self._remote.lost:
                 self.db.close()
                 raise
+            kept = self.kept
             self.close()
-            if self.kept and self._folder.local(FILE).exists():
-                error.add_note(f"{self.kept} are kept in {self.place}: continue with {_RESUME}.")
+            if kept and self._folder.local(FILE).exists():
+                error.add_note(f"{kept} are kept in {self.place}: continue with {_RESUME}.")
             raise
 
     def close(self) -> None:
         """Close the database of an unfinished run; remove one that has committed nothing."""
+        used = self.db.used
         self.db.close()
-        if not self.db.used:
+        if not used:
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
+
+
+def _hash_of(job: Job) -> str:
+    """Hash of what a job is made of; empty if that cannot be told: then it is not resumed."""
+    try:
+        return fingerprint(identity_of(job))
+    except LidarpoolError:
+        return ""
 
 
 def _database(folder: Storage) -> Path:

@@ -1,27 +1,34 @@
-"""Several surveys at once on one crew: each gives what it gives alone, whatever the others do."""
+"""Several jobs of one driver at once: each gives what it gives alone, whatever the others do."""
 
 from __future__ import annotations
 
 import os
 import signal
+import uuid
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from distributed import Client, Worker, WorkerPlugin
 
 import lidarpool.simulator.world
-from lidarpool import Column, Frame, LidarpoolError, Scene, Sensor, Survey, simulate
+from lidarpool import Cloud, Column, Frame, LidarpoolError, Scene, Sensor, Survey
+from lidarpool.base.software import software
 from lidarpool.base.storage import Storage
-from lidarpool.pipeline import Crew, JobError, SurveyDriver
-from lidarpool.pipeline.database import parts_folder
-from lidarpool.run.job import Job
-from lidarpool.run.run import Cluster
-from lidarpool.run.store import RunStore
-from lidarpool.run.watch import Waiting
+from lidarpool.columns.parts import StoredCloud, scans_of, unpack
+from lidarpool.pipeline import (
+    GPU,
+    LIDAR,
+    CastingWorkers,
+    LongStages,
+    Receipt,
+    RunDatabase,
+    RunDriver,
+)
 from lidarpool.scene.actors import box
-from poolpart import worker_identities
+from poolpart import Partition, worker_identities
 
 SEED, ROOM = Scene.seed(), Scene.from_meshes([box("Room", (8, 6, 3))])
 SENSOR = Sensor.grid(rays_per_revolution=3600, layers=8, step_deg=2)
@@ -36,75 +43,97 @@ pytestmark = pytest.mark.usefixtures("small_batches")
 
 
 @pytest.fixture(scope="module")
-def alone(cluster_client):
+def alone(cluster_client, tmp_path_factory):
     """Clouds of the surveys by themselves."""
-    return {
-        name: simulate(scene, survey, client=cluster_client, backend="numpy").cloud
-        for name, (scene, survey) in SURVEYS.items()
-    }
+    clouds = {}
+    for name, survey in SURVEYS.items():
+        together = Together(cluster_client, tmp_path_factory.mktemp("alone"), {name: survey})
+        together.run()
+        clouds[name] = together.cloud(name)
+        together.db.close()
+    return clouds
 
 
 class Together:
-    """Surveys that share a crew, and what became of each."""
+    """Jobs of one driver, and what became of each."""
 
     def __init__(self, client: Client, folder: Path, surveys: dict[str, tuple[Scene, Survey]]):
-        jobs = {name: Job(*of, backend="numpy") for name, of in surveys.items()}
-        self.stores = {
-            name: RunStore(job, folder / name, folder / "parts") for name, job in jobs.items()
-        }
-        self.frames: dict[str, list[int]] = {name: [] for name in jobs}
+        self.surveys, self.numbers = surveys, {name: n for n, name in enumerate(surveys)}
+        self.storage = Storage.at(folder / "parts", durable=False)
+        self.db = RunDatabase(folder / "run.db", durable=False)
+        alike, mark = software("numpy"), self.db.meta["mark"]
+        run = uuid.uuid4().hex[:8]
+        self.driver = RunDriver(
+            CastingWorkers(client, Partition(GPU, client), run, "numpy", alike),
+            LongStages(
+                client, Partition(LIDAR, client), run, alike["lidarpool"], self.storage, mark,
+                queue_capacity=10, collectors=2, patience_s=120.0,
+            ),
+            self.db,
+            self.storage,
+        )  # fmt: skip
+        self.frames: dict[str, list[int]] = {name: [] for name in surveys}
         self.failed: dict[str, str] = {}
-        self.drivers: dict[str, SurveyDriver] = {}
-        first = next(iter(self.stores.values()))
-        self.cluster = Cluster(client, first.job, first, print, Waiting())
-        self.crew: Crew = self.cluster.crew(Storage.at(folder / "parts"), first.db.meta["mark"])
 
-    def run(self, on_frame: Callable[[str, Frame], None] = lambda name, frame: None) -> None:
-        """Do all of them at once."""
-
-        def begun() -> Together:
-            for name, store in self.stores.items():
+    def run(self, on_frame: Callable[[str, Frame], None] | None = lambda name, frame: None) -> None:
+        """Do all of them at once; on any error, everything has been stopped."""
+        driver, names = self.driver, [*self.surveys]
+        try:
+            driver.open()
+            for name, (scene, survey) in self.surveys.items():
 
                 def take(frame: Frame, name: str = name) -> None:
                     self.frames[name].append(frame.scan)
                     on_frame(name, frame)
 
-                folder = f"{parts_folder(store.db.meta['mark'])}/"
-                self.drivers[name] = self.cluster.driver(self.crew, store, take, name, folder)
-            return self
+                driver.begin(
+                    self.numbers[name], scene, survey, fit=1000, in_all=10**6,
+                    on_frame=take if on_frame else None, read=str,
+                )  # fmt: skip
+            while not driver.ended:
+                moved = driver.closed or driver.step()
+                for job, error in driver.take_ended():
+                    if error is not None:
+                        self.failed[names[job.number]] = str(error)
+                if not driver.jobs and not driver.closed:
+                    driver.close()
+                driver.wait(0.0 if moved else 0.02)
+        except BaseException as error:
+            driver.stop(str(error))
+            raise
+        finally:
+            driver.finish()
 
-        self.cluster.run(self.crew, begun, None, lambda: None, lambda *_: None)
+    def cloud(self, name: str) -> Cloud:
+        """Points of a job."""
+        survey = self.surveys[name][1]
+        job = self.db.job(self.numbers[name], survey.scan_count)
+        parts = job.ordered
+        return StoredCloud(
+            self.storage, [p.name for p in parts], [p.first for p in parts],
+            [p.rows for p in parts], survey.stored_columns, job.cells, survey.precision_m,
+            np.zeros(3),
+        ).load()  # fmt: skip
 
-    # what the run steps
-
-    @property
-    def finished(self) -> bool:
-        return not self.drivers
-
-    @property
-    def progress(self) -> int:
-        return sum(store.db.scans_done + store.db.frames for store in self.stores.values())
-
-    def step(self) -> bool:
-        moved = False
-        for name, driver in list(self.drivers.items()):
-            try:
-                moved |= driver.step()
-            except JobError as error:
-                self.failed[name] = str(error)
-            if driver.finished or name in self.failed:
-                self.crew.leave(self.drivers.pop(name).seat)
-            if name in self.failed:  # its orders may still be under way
-                self.stores[name].remove()
-        return moved
-
-    def check(self, alone, same_cloud, *, failed: int = 0) -> None:
-        """Check that the surveys have given what they give alone."""
+    def check(self, alone, same_cloud, *, failed: int = 0, frames: bool = True) -> None:
+        """Check that the jobs have given what they give alone."""
         assert len(self.failed) == failed
         for name, cloud in alone.items():
-            survey = SURVEYS[name][1]
-            assert self.frames[name] == list(range(survey.scan_count)), name
-            assert same_cloud(self.stores[name].points().load(), cloud), name
+            scans = list(range(self.surveys[name][1].scan_count))
+            assert self.frames[name] == (scans if frames else []), name
+            assert same_cloud(self.cloud(name), cloud), name
+        for name in self.storage.sizes():
+            receipt = self.rebuilt(name)
+            job = self.db.under_way[receipt.job]
+            if receipt.first in job.parts and not receipt.job >= len(alone):
+                assert job.parts[receipt.first] == replace(receipt, summaries=b"")
+                assert job.summaries_of([receipt.first]) == [(receipt.first, receipt.summaries)]
+
+    def rebuilt(self, name: str) -> Receipt:
+        """Receipt of a part, made of the part alone."""
+        data = self.storage.read(name)
+        job, _, _ = scans_of(name, self.db.meta["mark"])
+        return Receipt.of_part(unpack(data), job, name, len(data))
 
 
 class CountTrees(WorkerPlugin):
@@ -129,7 +158,7 @@ class CountTrees(WorkerPlugin):
         lidarpool.simulator.world.RayCaster = self.build
 
 
-def test_surveys_of_a_scene_share_its_trees_and_give_the_points_of_each_alone(
+def test_jobs_of_a_scene_share_its_trees_and_give_the_points_of_each_alone(
     client, tmp_path, alone, same_cloud, left_over
 ):
     trees = tmp_path / "trees"
@@ -206,7 +235,7 @@ def test_a_survey_that_fails_leaves_the_others_unharmed(
 ):
     loose = Survey(Loose(SENSOR.beams, SENSOR.head), [(0, 0, 1)], steps=30)
     bad = {"describe": (SEED, loose), "cast": (SEED, with_column(faulty))}
-    together = Together(client, tmp_path, bad | SURVEYS)
+    together = Together(client, tmp_path, SURVEYS | bad)
     together.run()
     assert together.failed["describe"].startswith("stage generate failed: scan")
     assert together.failed["cast"].startswith("stage intersect failed: scan")
@@ -219,7 +248,7 @@ def test_a_survey_that_fails_leaves_the_others_unharmed(
 def test_a_scan_that_kills_its_workers_is_found_and_the_other_surveys_go_on(
     client, tmp_path, alone, same_cloud, left_over
 ):
-    together = Together(client, tmp_path, {"bad": (SEED, with_column(deadly)), **SURVEYS})
+    together = Together(client, tmp_path, {**SURVEYS, "bad": (SEED, with_column(deadly))})
     together.run()
     assert together.failed["bad"].startswith("scan 12 kills the worker that runs stage intersect")
     together.check(alone, same_cloud, failed=1)
@@ -238,17 +267,24 @@ def test_an_error_that_all_share_ends_all(client, tmp_path, monkeypatch, left_ov
     assert left_over(client) == ([], [], [])
 
 
-def test_a_survey_whose_parts_have_no_folder_fails_alone(
-    client, tmp_path, alone, same_cloud, left_over
+def test_tiny_jobs_share_casting_tasks_and_give_the_points_of_each_alone(
+    client, tmp_path, same_cloud, left_over
 ):
-    gone = {"gone": (SEED, Survey(SENSOR, [(0, 0, 1)], steps=900))}
-    together = Together(client, tmp_path, gone | SURVEYS)
-
-    def remove(name: str, frame: Frame) -> None:
-        if name == "gone" and frame.scan == 1:
-            Path(together.stores[name].storage.url).rename(tmp_path / "elsewhere")
-
-    together.run(remove)
-    assert "cannot be kept in" in together.failed["gone"]
-    together.check(alone, same_cloud, failed=1)
+    sensor = Sensor.grid(rays_per_revolution=50, layers=2, step_deg=18)
+    tiny = {
+        str(n): ((ROOM, SEED)[n % 3 == 0], Survey(sensor, [(0.01 * n, 0, 1)], steps=20))
+        for n in range(120)
+    }
+    tiny["77"] = (SEED, with_column(faulty))
+    together = Together(client, tmp_path, tiny)
+    together.run(on_frame=None)
+    assert [*together.failed] == ["77"] and "the mirror is loose" in together.failed["77"]
+    alone = {}
+    for name in ("0", "3", "55", "119"):
+        (tmp_path / name).mkdir()
+        one = Together(client, tmp_path / name, {name: tiny[name]})
+        one.run(on_frame=None)
+        alone[name] = one.cloud(name)
+    for name, cloud in alone.items():
+        assert same_cloud(together.cloud(name), cloud)
     assert left_over(client) == ([], [], [])
