@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidarpool.run.job import Job
 
 from lidarpool import Scene, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.run.connection import local_client
-from lidarpool.run.job import Job
 from lidarpool.run.run import drive
 from lidarpool.run.store import RunStore
 from lidarpool.run.watch import Waiting
@@ -25,7 +25,7 @@ ALL = float("inf")
 @pytest.fixture(scope="module")
 def client():
     """Return the client of a small cluster."""
-    with local_client(gpu_workers=1, lidar_slots=4, other_workers=1) as client:
+    with local_client({"LIDAR": 4}, gpu_workers=1, other_workers=1) as client:
         yield client
 
 

@@ -10,8 +10,7 @@ import pytest
 
 import lidarpool.cli.commands
 from lidarpool.cli.terminal import PlainLines, Terminal
-from lidarpool.run.bars import bars_here
-from lidarpool.run.progress import Progress
+from lidarpool.run.progress import Progress, bars_here
 
 
 def progress(seconds: float, scans: int, trials: int = 0) -> Progress:

@@ -14,8 +14,7 @@ from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.bars import Pace, bars, standing_still
-from ..run.progress import STAGES, Progress, Show
+from ..run.progress import STAGES, Pace, Progress, Show, bars, standing_still
 from ..run.screen import Screen
 from .logs import set_logs
 

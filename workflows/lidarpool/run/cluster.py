@@ -42,10 +42,8 @@ def client_of(
     if options.cluster is not None:
         started = started_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
-    local = local_client(
-        gpu_workers=options.gpu_workers, lidar_slots=needed[LIDAR],
-        other_workers=options.other_workers, planning=OTHER in needed, tls=options.tls,
-    )  # fmt: skip
+    workers = options.gpu_workers, options.other_workers
+    local = local_client(needed, *workers, tls=options.tls)
     return screen.starting(local, "starting the workers", own=True)
 
 
