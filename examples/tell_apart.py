@@ -40,7 +40,7 @@ def street(number, rng):
         noise=lp.Noise(range_m=0.015, detection_range_m=90), visibility_km=values["visibility_km"],
         keep_every=1, columns=["intensity", "class"],
     )  # fmt: skip
-    return lp.CampaignJob(scene, survey, values)
+    return lp.Job(scene, survey, values=values)
 
 
 def features(sweep):

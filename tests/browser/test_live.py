@@ -37,7 +37,6 @@ def live(monkeypatch):
     job = Job(Scene.seed(), survey)
     store = RunStore(job)
     with live_page(port=0, browser=False) as live:
-        live.begun(store)
         yield live, store
 
 
@@ -57,6 +56,8 @@ class Driven:
                 now = replace(store.progress(), seconds=time.monotonic() - begun)
                 live.on_progress(now, list)  # KeyboardInterrupt if somebody has stopped it
                 time.sleep(0.05)
+
+        live.begun(store)
 
         def run():
             try:

@@ -7,7 +7,7 @@ from contextlib import nullcontext
 import numpy as np
 import pytest
 
-from lidarpool import Campaign, CampaignJob, Scene, Sensor, Survey
+from lidarpool import Campaign, Job, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.report.campaign_output import Making, make_dataset
 from lidarpool.run.connection import local_client
@@ -26,7 +26,7 @@ def make(number, rng):
     if number == FAILS:
         raise ValueError("no such place")
     survey = Survey(Sensor.grid(), poses=[(0, 0, height)], steps=36)
-    return CampaignJob(Scene.seed(), survey, values={"height": height})
+    return Job(Scene.seed(), survey, values={"height": height})
 
 
 def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):

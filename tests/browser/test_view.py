@@ -11,8 +11,8 @@ from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import SCAN
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.live.result_page import result_view
 from lidarpool.live.server import page_server
+from lidarpool.live.view import View
 from lidarpool.run.picture_file import Pictured, sensor_ways
 from lidarpool.scene.actors import Actor, box
 
@@ -48,7 +48,7 @@ def view(cloud):
     pictured = Pictured(scene, sensor_ways(survey), hits, rays, None, None, (), survey.duration_ns)
     sweeps = Sweeps.of(survey, scene)
     assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
-    return result_view(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
+    return View(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")
 
 
 @pytest.fixture
@@ -95,7 +95,7 @@ def test_points_in_their_own_colours(new_tab, tmp_path):
     rows["red"], rows["blue"] = 255 * (rows["x"] < 0), 255 * (rows["x"] > 0)
     path = tmp_path / "cloud.ply"
     path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
-    with page_server(result_view(CloudFile(path)).answer, port=0) as page:
+    with page_server(View(CloudFile(path)).answer, port=0) as page:
         tab = opened(new_tab, page)
         tab.tick("shade by depth", on=False)
         tab.key("t")

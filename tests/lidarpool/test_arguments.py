@@ -13,12 +13,12 @@ from lidarpool import (
     Actor,
     Beams,
     Campaign,
-    CampaignJob,
     Cloud,
     Column,
     Gnss,
     Imu,
     Instance,
+    Job,
     LidarpoolError,
     Material,
     Mesh,
@@ -74,10 +74,10 @@ WRONG = {
         (3, "paths is 3"),
         ([], "name one"),
     ],
-    CampaignJob: [
+    Job: [
         ("hall.glb", Survey(poses=AT), "Scene.load('hall.glb')"),
         (Scene.seed(), GRID, "survey is a Sensor"),
-        (Scene.seed(), Survey(poses=AT), ["fog"], "values is ['fog']; it must be a dict"),
+        (Scene.seed(), Survey(poses=AT), ["fog"], "planning is ['fog']; it must be a Planning"),
     ],
     Cloud: [("x", {}, "positions"), (POINTS, [1], "a dict"), ([["a", 0, 0]], {}, "numbers")],
     Column: [

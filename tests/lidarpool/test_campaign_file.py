@@ -14,7 +14,7 @@ import yaml
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from lidarpool import Campaign, CampaignJob, LidarpoolError, Noise, Scene, Survey
+from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Survey
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.campaign import hashes, is_campaign
 from lidarpool.scenario.draws import Draw
@@ -92,7 +92,7 @@ OF_THE_EXAMPLE = {
 
 
 def values(found, name):
-    return [found.describe(number).values.get(name) for number in range(found.count)]
+    return [found.values(number).get(name) for number in range(found.count)]
 
 
 # --- what is varied ----------------------------------------------------------------------------
@@ -110,11 +110,11 @@ def test_each_kind_of_choice_comes_to_where_its_path_leads(campaign):
         "actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}},
         "returns.subrays": {"each": [1, 7, 19]},
     })  # fmt: skip
-    jobs = [found.describe(number) for number in range(40)]
-    assert [job.name for job in jobs[:2]] == ["0000", "0001"]
-    for number, job in enumerate(jobs):
-        assert (job.number, tuple(job.values)) == (number, found.names)
-        made = job.scenario
+    drawn = [found.values(number) for number in range(40)]
+    assert [found.name(number) for number in range(2)] == ["0000", "0001"]
+    for number, own in enumerate(drawn):
+        assert tuple(own) == found.names
+        made = found.scenario(number)
         read = (
             made.weather.visibility_km,
             made.noise.range_m,
@@ -126,9 +126,9 @@ def test_each_kind_of_choice_comes_to_where_its_path_leads(campaign):
             len(made.actors) - 1,
             made.returns.subrays,
         )
-        assert read == tuple(job.values.values())
+        assert read == tuple(own.values())
         assert made.sensors["roof"].mount.position == (0, 0, 2)  # the rest is the base's
-    each = list(zip(*(job.values.values() for job in jobs), strict=True))
+    each = list(zip(*(own.values() for own in drawn), strict=True))
     for column, (low, high) in {0: (0.2, 20), 1: (0, 0.03), 3: (0.5, 1), 5: (1, 2)}.items():
         assert low <= min(each[column]) < max(each[column]) <= high
         assert len({*each[column]}) == 40
@@ -174,11 +174,11 @@ def test_the_values_are_those_of_always():
         *(draw.subset(100, 4), draw.order(6), draw.bits(63)),
     ]
     assert drawn == ALWAYS
-    found = Campaign.load(EXAMPLES / "campaign.yaml").describe(17)
-    assert (found.name, found.split, dict(found.values)) == ("0017", "val", OF_THE_EXAMPLE)
+    found = Campaign.load(EXAMPLES / "campaign.yaml")
+    assert (found.name(17), found.split(17), found.values(17)) == ("0017", "val", OF_THE_EXAMPLE)
     made = Campaign(
         lambda number, rng: job(rng.bit_generator.random_raw() % 2**60), count=9, seed=7
-    ).describe(5)
+    ).job(5)
     assert made.values == {"drawn": 720261597643068392}
 
 
@@ -194,15 +194,15 @@ def test_other_quantities_do_not_change_a_value(campaign):
 
 def test_a_job_is_the_same_in_whatever_order_it_is_asked_for(campaign):
     found = campaign({"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}})
-    first = [fingerprint(found.describe(n).scenario.model_dump()) for n in range(10)]
-    again = [fingerprint(found.describe(n).scenario.model_dump()) for n in reversed(range(10))]
+    first = [fingerprint(found.scenario(n).model_dump()) for n in range(10)]
+    again = [fingerprint(found.scenario(n).model_dump()) for n in reversed(range(10))]
     assert first == again[::-1]
 
 
 def test_rows_of_a_table_become_entries(campaign):
     found = campaign({"actors": {"sample": {"from": "traffic.csv", "count": 2}}}, count=1)
-    van, *rows = found.describe(0).scenario.actors
-    assert (van.name, found.describe(0).values) == ("Van", {"actors": 2})
+    van, *rows = found.scenario(0).actors
+    assert (van.name, found.values(0)) == ("Van", {"actors": 2})
     assert [row.name for row in rows] == ["7", "Car #8"]  # text, though one is a number
     assert [row.semantic_class for row in rows] == [10, None]
     assert rows[1].trajectory.points[1].position == (9, 5, 0)
@@ -219,7 +219,7 @@ def test_rows_of_a_table_become_entries(campaign):
 def test_tables_may_be_written_in_several_ways(campaign, folder, text):
     (folder / "crates.csv").write_text(text)
     found = campaign({"scene.copies": {"sample": {"from": "crates.csv", "count": 1}}})
-    crate = found.describe(0).scenario.scene.copies[1]
+    crate = found.scenario(0).scene.copies[1]
     assert (crate.name, crate.box, crate.at[0].position) == ("A", (1, 2, 3), (1, 2))
 
 
@@ -234,9 +234,9 @@ def test_names_may_be_given_to_values(campaign):
     )
     files = {"in": "hall.glb", "out": "yard.glb"}
     for number in range(12):
-        made = found.describe(number)
-        assert made.scenario.scene.files[0].file == files[made.values["scene"]]
-        assert made.scenario.weather.visibility_km == made.values.get("weather.visibility_km")
+        made, own = found.scenario(number), found.values(number)
+        assert made.scene.files[0].file == files[own["scene"]]
+        assert made.weather.visibility_km == own.get("weather.visibility_km")
     assert values(found, "cloud.columns")[:2] == ['["time"]', '["range", "time"]']
     assert values(found, "weather.visibility_km")[:4] == [None, None, 5, 5]
 
@@ -245,7 +245,7 @@ def test_a_grid_has_each_pair_of_values_once(campaign):
     found = campaign(
         {"steps": {"each": [1, 2, 3]}, "returns.subrays": {"each": [1, 7]}}, count=None
     )
-    pairs = [tuple(found.describe(number).values.values()) for number in range(found.count)]
+    pairs = [tuple(found.values(number).values()) for number in range(found.count)]
     assert pairs == [(1, 1), (2, 1), (3, 1), (1, 7), (2, 7), (3, 7)]
 
 
@@ -256,13 +256,13 @@ def test_bases_are_taken_in_turn(campaign, folder):
     (folder / "other" / "hall.glb").touch()
     found = campaign({"steps": {"each": [1, 2]}}, base=["base.yaml", "other/fog.yaml"], count=None)
     assert found.names == ("base", "steps")
-    jobs = [found.describe(number) for number in range(found.count)]
-    assert [tuple(job.values.values()) for job in jobs] == [
+    assert [tuple(found.values(number).values()) for number in range(found.count)] == [
         ("base.yaml", 1), ("fog.yaml", 1), ("base.yaml", 2), ("fog.yaml", 2),
     ]  # fmt: skip
-    assert [job.scenario.weather.visibility_km for job in jobs] == [None, 1, None, 1]
+    made = [found.scenario(number) for number in range(found.count)]
+    assert [one.weather.visibility_km for one in made] == [None, 1, None, 1]
     # Files are beside the base that names them.
-    assert [*jobs[1].scenario.files] == [folder / "other" / "hall.glb"]
+    assert [*made[1].files] == [folder / "other" / "hall.glb"]
 
 
 def test_a_section_that_the_base_lacks_is_made(campaign, folder):
@@ -272,14 +272,14 @@ def test_a_section_that_the_base_lacks_is_made(campaign, folder):
         "scene.ground.height_m": {"choice": [-1]},
         "poses.0.yaw_deg": {"choice": [90]},
     })  # fmt: skip
-    made = found.describe(0).scenario
+    made = found.scenario(0)
     assert (made.mount.position, made.scene.ground.height_m) == ((0, 0, 3.5), -1)
     assert made.poses[0].pose().yaw_deg == 90
 
 
 def test_a_mesh_file_may_be_the_base(campaign):
     found = campaign({"scene.files.0.scale": {"uniform": [1, 2]}}, base="hall.glb")
-    scales = [found.describe(n).scenario.scene.files[0].scale for n in range(3)]
+    scales = [found.scenario(n).scene.files[0].scale for n in range(3)]
     assert [(value,) * 3 for value in values(found, "scene.files.0.scale")[:3]] == scales
 
 
@@ -288,7 +288,7 @@ def test_a_mesh_file_may_be_the_base(campaign):
 
 def test_each_job_has_its_own_noise(campaign, folder):
     def seeds(found):
-        return [found.describe(number).scenario.noise.seed for number in range(5)]
+        return [found.scenario(number).noise.seed for number in range(5)]
 
     own = seeds(campaign())
     assert len({*own}) == 5 and min(own) > 0
@@ -302,15 +302,15 @@ def test_each_job_has_its_own_noise(campaign, folder):
 
 def test_splits_have_their_shares_in_each_block(campaign):
     found = campaign(splits={"train": 0.8, "val": 0.1, "test": 0.1}, count=200)
-    names = [found.describe(number).split for number in range(200)]
+    names = [found.split(number) for number in range(200)]
     for begin in range(0, 200, 10):
         assert Counter(names[begin : begin + 10]) == {"train": 8, "val": 1, "test": 1}
     assert len({*(names[begin : begin + 10].index("val") for begin in range(0, 200, 10))}) > 4
     more = campaign(splits={"train": 0.8, "val": 0.1, "test": 0.1}, count=2000)
-    assert [more.describe(number).split for number in range(200)] == names
+    assert [more.split(number) for number in range(200)] == names
     odd = campaign(splits={"a": 0.3333333, "b": 0.6666667}, count=1000)
-    assert Counter(odd.describe(number).split for number in range(1000))["a"] == 333
-    assert campaign().describe(0).split == ""
+    assert Counter(odd.split(number) for number in range(1000))["a"] == 333
+    assert campaign().split(0) == ""
 
 
 def test_what_is_kept_and_what_the_card_says(campaign):
@@ -362,22 +362,22 @@ def test_scenarios_as_they_are(folder):
         (folder / name).write_text("noise: {range_m: 0.1}\n")
     paths = [folder / name for name in ("base.yaml", "a/base.yaml", "my hall.yaml", "hall.glb")]
     found = Campaign.of_scenarios(paths, keep="folder", splits={"a": 0.5, "b": 0.5})
-    jobs = [found.describe(number) for number in range(found.count)]
-    assert [job.name for job in jobs] == ["base", "base-2", "my_hall", "hall"]
-    assert {job.split for job in jobs} == {"a", "b"}
-    assert all(not job.values for job in jobs) and found.names == ()
-    assert [job.scenario.model_dump() for job in jobs] == [
+    every = range(found.count)
+    assert [found.name(number) for number in every] == ["base", "base-2", "my_hall", "hall"]
+    assert {found.split(number) for number in every} == {"a", "b"}
+    assert not any(map(found.values, every)) and found.names == ()
+    assert [found.scenario(number).model_dump() for number in every] == [
         Scenario.load(path).model_dump() for path in paths
     ]
-    before = hashes(jobs[3].scenario.files)
+    before = hashes(found.scenario(3).files)
     assert [name for name, _ in before] == ["hall.glb"]
     (folder / "hall.glb").write_bytes(b"another")
-    assert hashes(jobs[3].scenario.files) != before
+    assert hashes(found.scenario(3).files) != before
 
 
 def job(*drawn, **options):
     survey = Survey(poses=[(0, 0, 1)], **options)
-    return CampaignJob(Scene.seed(), survey, {"drawn": int(*drawn)} if drawn else {})
+    return Job(Scene.seed(), survey, values={"drawn": int(*drawn)} if drawn else {})
 
 
 def test_a_function_makes_jobs():
@@ -385,16 +385,17 @@ def test_a_function_makes_jobs():
         noise = Noise(range_m=rng.uniform(0.01, 0.02))
         made = job(noise=noise)
         values = {"number": np.int64(number), "sigma": noise.range_m, "fog": None}
-        return CampaignJob(made.scene, made.survey, values)
+        return Job(made.scene, made.survey, values=values)
 
     found = Campaign(make, count=20, seed=3, keep="kitti", splits={"a": 1})
     assert (found.names, dict(found.choices)) == (("number", "sigma", "fog"), {})
-    jobs = [found.describe(number) for number in (0, 7, 7)]
+    jobs = [found.job(number) for number in (0, 7, 7)]
     assert [made.values["number"] for made in jobs] == [0, 7, 7]
     assert type(jobs[1].values["number"]) is int and "fog" not in jobs[1].values
     assert jobs[1].values == jobs[2].values != jobs[0].values
-    assert jobs[1].name == "0007" and jobs[1].scenario is None and jobs[1].split == "a"
-    seeds = [made.made.survey.noise.seed for made in jobs]
+    assert (jobs[1].number, jobs[1].name, jobs[1].split) == (7, "0007", "a")
+    assert found.scenario(7) is None and found.values(7) == jobs[1].values
+    seeds = [made.survey.noise.seed for made in jobs]
     assert 0 != seeds[0] != seeds[1] == seeds[2]
     other = Campaign(lambda number, rng: make(number + 1, rng), count=20, seed=3)
     assert other.identity["make"] != found.identity["make"]
@@ -402,14 +403,14 @@ def test_a_function_makes_jobs():
 
 def test_noise_of_a_function_that_has_a_seed_is_kept():
     noise = Noise(range_m=1, seed=4)
-    made = Campaign(lambda number, rng: job(noise=noise), count=3).describe(1)
-    assert made.made.survey.noise == noise
+    made = Campaign(lambda number, rng: job(noise=noise), count=3).job(1)
+    assert made.survey.noise == noise
 
 
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda number, rng: 5, "job 1: the function returned 5; it must return a CampaignJob"),
+        (lambda number, rng: 5, "job 1: the function returned 5; it must return a Job("),
         (lambda number, rng: 1 / 0, "job 1: the function raised ZeroDivisionError: division"),
         (lambda number, rng: job(keep_every=0), "job 1: keep_every is 0"),
         (
@@ -417,7 +418,7 @@ def test_noise_of_a_function_that_has_a_seed_is_kept():
             "job 1 has the value 'drawn', which the first has not",
         ),
         (
-            lambda number, rng: CampaignJob(job().scene, job().survey, {"a": [1]}),
+            lambda number, rng: Job(job().scene, job().survey, values={"a": [1]}),
             "job 1 has the value 'a': [1]; values are numbers, text",
         ),
     ],
@@ -425,7 +426,7 @@ def test_noise_of_a_function_that_has_a_seed_is_kept():
 )
 def test_a_function_that_makes_no_job(make, says):
     with pytest.raises(LidarpoolError) as raised:
-        Campaign(make, count=3).describe(1)
+        Campaign(make, count=3).job(1)
     assert says in str(raised.value)
 
 
@@ -526,14 +527,14 @@ def test_a_count_is_needed_where_something_is_drawn(campaign):
 @pytest.mark.parametrize("number", [-1, 40])
 def test_a_job_that_is_not_there(campaign, number):
     with pytest.raises(LidarpoolError, match=r"no job -?\d+: the campaign has jobs 0 to 39"):
-        campaign().describe(number)
+        campaign().job(number)
 
 
 def test_values_that_do_not_fit_together_are_told_with_the_job(campaign):
     found = campaign({"returns.subrays": {"integer": [1, 7]}})  # of which only the ends are
     wrong = next(n for n in range(40) if 1 < Draw(7, n, "returns.subrays").integer(1, 7) < 7)
     with pytest.raises(LidarpoolError) as raised:
-        found.describe(wrong)
+        found.job(wrong)
     assert f"campaign.yaml: job {wrong}: returns.subrays is " in str(raised.value)
     assert "\nIts values are returns.subrays: " in str(raised.value)
 
@@ -609,11 +610,11 @@ def test_which_files_are_campaigns(folder):
 def test_a_campaign_goes_to_another_process(campaign, folder):
     vary = {"actors": {"sample": {"from": "traffic.csv", "count": [0, 2]}}}
     sent = pickle.loads(pickle.dumps(campaign(vary)))
-    assert sent.describe(3).scenario.actors == campaign(vary).describe(3).scenario.actors
-    here = [sorted(job.values.items()) for job in map(campaign(vary).describe, range(5))]
+    assert sent.scenario(3).actors == campaign(vary).scenario(3).actors
+    here = [sorted(own.items()) for own in map(campaign(vary).values, range(5))]
     code = (
         "import sys; from lidarpool import Campaign; c = Campaign.load(sys.argv[1]);"
-        "print([sorted(c.describe(n).values.items()) for n in range(5)])"
+        "print([sorted(c.values(n).items()) for n in range(5)])"
     )
     command = [sys.executable, "-c", code, str(folder / "campaign.yaml")]
     env = {"PYTHONPATH": ":".join(sys.path), "PYTHONHASHSEED": "5"}

@@ -8,6 +8,8 @@ from tests.lidarpool.meshes import NESTED
 
 from lidarpool import Scene
 from lidarpool.base.errors import LidarpoolError
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.instances import Instance
 from lidarpool.scene.mesh import triangle_areas
@@ -160,8 +162,9 @@ def table_of(tmp_path, objects, materials=()):
     write(tmp_path / "a.city.json", city(objects))
     data = {"scene": {"files": ["a.city.json"]}, "materials": list(materials)}
     scenario = Scenario.from_data(data, folder=tmp_path)
-    scene = scenario.build_scene()
-    table = MaterialTable.of(scenario.survey(scene).materials, scene.all_names)
+    built = build(scenario)
+    scene = built.scene
+    table = MaterialTable.of(built.survey.materials, scene.all_names)
     found = zip(scene.names, table.semantic_class, table.reflectance, strict=True)
     return {name: (number, reflectance) for name, number, reflectance in found}
 
@@ -251,6 +254,6 @@ def test_a_tower_is_not_suspected_of_another_unit(tmp_path):
     tall = [[300 * x, 300 * y, 300 * z] for x, y, z in CUBE]
     write(tmp_path / "a.city.json", city({"a": thing(geometry())}, tall))
     scenario = Scenario.load(tmp_path / "a.city.json")
-    notes = scenario.advice(scenario.build_scene())
+    notes = advice(build(scenario))
     assert any("this looks like an object" in note for note in notes)
     assert not any("unit" in note for note in notes)

@@ -39,6 +39,8 @@ from lidarpool import (
 )
 from lidarpool.columns.table import COLOURS
 from lidarpool.live.surface import Surface, colours_for
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene import masks
 from lidarpool.scene.colours import (
@@ -404,7 +406,7 @@ def test_textures_are_the_reflectance(caplog):
 )
 def test_a_scenario_notes_that_nothing_has_colours(asked):
     scenario = Scenario.from_data(asked)
-    noted = any("needs colours" in note for note in scenario.advice(scenario.build_scene()))
+    noted = any("needs colours" in note for note in advice(build(scenario)))
     assert noted == (asked != {"cloud": {}})
 
 
@@ -569,7 +571,7 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
     wrong = {"objects": "*", "material": "asphalt, dry", "reflectance": 0.2}
     scenario = Scenario.from_data({"materials": [{"objects": "*"}, wrong]})
     with pytest.raises(LidarpoolError, match=r"^scenario: materials\[1\]: give either material or"):
-        scenario.survey(Scene.seed())
+        build(scenario)
     table = reflectances()
     assert len(table) >= 30
     assert all(0 < share < 1 for one in table.values() for share in one.shares)

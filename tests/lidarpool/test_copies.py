@@ -8,6 +8,7 @@ import trimesh
 
 from lidarpool import LidarpoolError, Pose, Scanner, load_sensor
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
@@ -36,13 +37,13 @@ def folder(tmp_path):
 
 
 @pytest.fixture
-def build(folder):
+def made(folder):
     """Return a function that makes the scenario and the scene of entries of `copies`."""
 
     def make(*copies, scene=None, **others):
         data = {"scene": {"files": "land.glb", **(scene or {}), "copies": [*copies]}, **others}
         scenario = Scenario.from_data(data, folder=folder)
-        return scenario, scenario.build_scene()
+        return scenario, build(scenario).scene
 
     return make
 
@@ -65,9 +66,9 @@ def height(at):
 TREE = {"name": "Tree", "file": "tree.stl"}
 
 
-def test_a_list_gives_places_turns_and_factors(build):
+def test_a_list_gives_places_turns_and_factors(made):
     turned = {"position": [1, 2, 3], "yaw_deg": 30, "pitch_deg": 5, "scale": [1, 2, 0.5]}
-    _, scene = build(TREE | {"at": [[-3, 4], [5, 6, 7], turned]})
+    _, scene = made(TREE | {"at": [[-3, 4], [5, 6, 7], turned]})
     assert scene.names == ("Hill", "Roof", "Tree", "Tree.2", "Tree.3")
     assert np.allclose(
         places(scene), [[-3, 4, height(np.array([[-3, 4]]))[0]], [5, 6, 7], [1, 2, 3]]
@@ -95,23 +96,23 @@ def test_a_list_gives_places_turns_and_factors(build):
     ],
     ids=["commas", "semicolons, remarks, text", "tabs, other names", "capitals", "no unit"],
 )
-def test_a_table_gives_what_a_list_gives(build, folder, text, more):
+def test_a_table_gives_what_a_list_gives(made, folder, text, more):
     (folder / "trees.csv").write_text(text)
-    _, by_table = build(TREE | {"table": {"file": "trees.csv", **more}})
+    _, by_table = made(TREE | {"table": {"file": "trees.csv", **more}})
     big = {"position": [1, 2, 3], "yaw_deg": 90, "scale": 2}
-    _, by_list = build(TREE | {"at": [big, [4, 5, 6]]})
+    _, by_list = made(TREE | {"at": [big, [4, 5, 6]]})
     assert fingerprint(by_table) == fingerprint(by_list)
 
 
-def test_a_table_without_z_stands_on_the_surface(build, folder):
+def test_a_table_without_z_stands_on_the_surface(made, folder):
     (folder / "trees.csv").write_text("x,y\n1,2\n15,5\n")
-    _, scene = build(TREE | {"table": "trees.csv"})
+    _, scene = made(TREE | {"table": "trees.csv"})
     assert np.allclose(places(scene)[:, 2], [height(np.array([[1, 2]]))[0], 8])
 
 
-def test_scattered_copies_stand_on_what_is_seen_from_above(build):
+def test_scattered_copies_stand_on_what_is_seen_from_above(made):
     scatter = {"count": 300, "surfaces": "Hill", "spacing_m": 0.6, "scale": [0.5, 1.5]}
-    _, scene = build(TREE | {"scatter": scatter})
+    _, scene = made(TREE | {"scatter": scatter})
     at = places(scene)
     assert len(at) == 300 and np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
     assert at[:, 0].max() < 10, "not under the roof"
@@ -125,8 +126,8 @@ def test_scattered_copies_stand_on_what_is_seen_from_above(build):
     assert abs(share - 0.5) < 0.1
 
 
-def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangle(build):
-    _, scene = build(TREE | {"scatter": {"count": 100, "within": [5, -5, 15, 5], "yaw_deg": 0}})
+def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangle(made):
+    _, scene = made(TREE | {"scatter": {"count": 100, "within": [5, -5, 15, 5], "yaw_deg": 0}})
     at = places(scene)
     low, high = at[:, 0] < 10, at[:, 0] > 10
     assert low.sum() > 20 and np.abs(at[low, 2] - height(at[low, :2])).max() < 1e-6
@@ -135,27 +136,27 @@ def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangl
     assert np.array_equal(scene.instances.transforms[:, :, :3], np.tile(np.eye(3), (100, 1, 1)))
 
 
-def test_a_roof_over_all_of_a_surface_does_not_count(build):
+def test_a_roof_over_all_of_a_surface_does_not_count(made):
     scatter = {"count": 50, "surfaces": "Hill", "within": [12, -8, 19, 8]}
-    _, scene = build(TREE | {"scatter": scatter})
+    _, scene = made(TREE | {"scatter": scatter})
     at = places(scene)
     assert np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
 
 
-def test_a_ground_without_files_carries_copies_too(build):
+def test_a_ground_without_files_carries_copies_too(made):
     scatter = {"count": 20, "within": [100, 100, 120, 110]}
     scene_of = {"files": [], "ground": {"height_m": 1.5, "margin_m": 3}}
-    _, scene = build(TREE | {"scatter": scatter}, scene=scene_of)
+    _, scene = made(TREE | {"scatter": scatter}, scene=scene_of)
     assert np.allclose(places(scene)[:, 2], 1.5)
     assert scene.names[-1] == "Ground"
     low, high = scene.object_bounds[-1]
     assert (low[:2] <= [97, 97]).all() and (high[:2] >= [123, 113]).all()
 
 
-def test_the_seed_and_the_name_choose_the_places(build):
+def test_the_seed_and_the_name_choose_the_places(made):
     def at(**more):
         entry = TREE | {"name": more.pop("name", "Tree"), "scatter": {"count": 40, **more}}
-        return places(build(entry)[1], entry["name"])
+        return places(made(entry)[1], entry["name"])
 
     first = at()
     assert np.array_equal(at(), first) and np.array_equal(at(count=60)[:40], first)
@@ -168,7 +169,7 @@ def test_the_seed_and_the_name_choose_the_places(build):
 FIRST = [[-13.69999781, 0.4128094], [-15.08835127, 4.14431452]]
 
 
-def test_materials_and_classes_are_those_of_the_names(build):
+def test_materials_and_classes_are_those_of_the_names(made):
     crate = {"name": "Crate", "box": [1, 1, 1], "at": [[0, 0], [3, 0], [6, 0]], "class": 5}
     materials = [
         {"objects": "*", "reflectance": 0.2, "class": 1},
@@ -176,37 +177,37 @@ def test_materials_and_classes_are_those_of_the_names(build):
         {"objects": "Crate.3", "reflectance": 0.4, "class": 7},
     ]
     tree = TREE | {"at": [[9, 0]], "class": 6}
-    scenario, scene = build(crate, tree, materials=materials)
-    table = MaterialTable.of(scenario.survey(scene).materials, scene.names)
+    scenario, scene = made(crate, tree, materials=materials)
+    table = MaterialTable.of(build(scenario).survey.materials, scene.names)
     assert scene.names[2:] == ("Crate", "Crate.2", "Crate.3", "Tree")
     assert table.semantic_class.tolist() == [1, 1, 5, 5, 7, 6]
     assert table.reflectance.tolist() == [0.2, 0.2, 0.9, 0.9, 0.4, 0.2]
-    scenario, scene = build(crate)
-    table = MaterialTable.of(scenario.survey(scene).materials, scene.names)
+    scenario, scene = made(crate)
+    table = MaterialTable.of(build(scenario).survey.materials, scene.names)
     assert table.semantic_class.tolist() == [0, 0, 5, 5, 5]
 
 
-def test_a_file_is_read_once_for_all_entries(build, monkeypatch):
-    from lidarpool.scenario import scenario as module
+def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
+    from lidarpool.scenario import static_scene as module
 
     read, plain = [], module.load_objects
     monkeypatch.setattr(
         module, "load_objects", lambda path, **more: read.append(path.name) or plain(path, **more)
     )
-    _, scene = build(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]})
+    _, scene = made(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]})
     assert read == ["land.glb", "tree.stl"] and len(scene.instances.parts) == 1
     assert scene.names[2:] == ("Tree", "Bush")
 
 
-def test_copies_are_scanned_where_they_stand(build):
+def test_copies_are_scanned_where_they_stand(made):
     crate = {"name": "Crate", "box": [2, 2, 3], "at": [{"position": [5, 0, 0], "yaw_deg": 45}]}
-    _, scene = build(crate, scene={"files": []})
+    _, scene = made(crate, scene={"files": []})
     scanner = Scanner(scene, load_sensor("velodyne/vlp16"), columns=["range"])
     cloud = scanner.sweep((0, 0, 1))
     assert len(cloud) > 100 and abs(cloud["range"].min() - (5 - 2**0.5)) < 0.01
 
 
-def test_many_copies_can_be_planned_around(build):
+def test_many_copies_can_be_planned_around(made):
     """Each is an obstacle."""
     crate = {
         "name": "Crate",
@@ -214,8 +215,8 @@ def test_many_copies_can_be_planned_around(build):
         "scatter": {"count": 1000, "within": [-20, -10, 10, 10]},
     }
     ends = {"start": [-25, 0], "target": [25, 0], "obstacles": ["Crate*"]}
-    scenario, scene = build(crate, planning=ends)
-    planning = scenario.plan(scene)
+    scenario, _ = made(crate, planning=ends)
+    planning = build(scenario).planning
     assert len(planning.radii) == 1000 and np.allclose(planning.radii, 0.05 * 2**0.5)
 
 
@@ -259,26 +260,26 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_cannot_be_is_told_in_a_line(build, folder, name):
+def test_what_cannot_be_is_told_in_a_line(made, folder, name):
     entry, says = WRONG[name]
     (folder / "a.csv").write_text("x,z\n1,nan\n")
     (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")
     (folder / "yaw.csv").write_text("x,y,yaw\n1,2,90\n")
     (folder / "short.csv").write_text("x;y;yaw_deg\n1;2\n")
     with pytest.raises(LidarpoolError) as raised:
-        build(entry)
+        made(entry)
     assert says in str(raised.value) and len(str(raised.value).splitlines()) == 1
 
 
-def test_nothing_to_stand_on(build):
+def test_nothing_to_stand_on(made):
     with pytest.raises(LidarpoolError, match=r"nothing to stand on: add scene\.files"):
-        build(TREE | {"scatter": {"count": 1}}, scene={"files": []})
+        made(TREE | {"scatter": {"count": 1}}, scene={"files": []})
     with pytest.raises(LidarpoolError, match="give z"):
-        build(TREE | {"at": [[0, 0]]}, scene={"files": []})
+        made(TREE | {"at": [[0, 0]]}, scene={"files": []})
 
 
-def test_lists_stand_on_a_ground_that_reaches_under_them(build):
-    _, scene = build(
+def test_lists_stand_on_a_ground_that_reaches_under_them(made):
+    _, scene = made(
         TREE | {"at": [[5, 5], [50, 5]]}, scene={"files": [], "ground": {"height_m": 1}}
     )
     assert scene.bounds[0, 2] + scene.origin[2] == 1

@@ -11,8 +11,8 @@ from tests.lidarpool.test_echoes import beam_along_x, cast, wall
 
 from lidarpool import LidarpoolError, Material, Returns, datasheet
 from lidarpool.cli.sensor_commands import sensors
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.scene import Scene
 from lidarpool.sensor.models import Detection, Performance, model_names, read_model
 
 RAYS = 20_000
@@ -92,7 +92,7 @@ def test_two_precisions_of_one_energy_are_refused():
 
 
 def carried(**sections):
-    survey = Scenario.from_data({"poses": [[0, 0, 1]], **sections}).survey(Scene.seed())
+    survey = build(Scenario.from_data({"poses": [[0, 0, 1]], **sections})).survey
     return list(zip(survey.noise_each, survey.returns_each, strict=True))
 
 

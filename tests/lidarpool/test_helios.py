@@ -11,6 +11,7 @@ from click.testing import CliRunner
 from lidarpool import LidarpoolError
 from lidarpool.cli.scenario_commands import import_
 from lidarpool.importers.helios import import_survey
+from lidarpool.scenario.build import build
 from lidarpool.sensor.materials import MaterialTable
 from lidarpool.simulator.rig import Rig
 
@@ -77,8 +78,8 @@ def imported(survey, tmp_path):
 
     def run(*given, **named):
         made = import_survey(survey(*given, **named), tmp_path / "out")
-        scene = made.scenario.build_scene()
-        return made, scene, made.scenario.survey(scene)
+        built = build(made.scenario)
+        return made, built.scene, built.survey
 
     return run
 
@@ -406,10 +407,11 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
         survey(device, legs('pulseFreq_hz="1000" scanFreq_hz="30"'), scene, parts=parts),
         tmp_path / "out",
     )
-    built = made.scenario.build_scene()
-    assert built.has_voxels.tolist() == [False, True]
-    assert built.object_bounds[1] == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
-    table = MaterialTable.of(made.scenario.survey(built).materials, built.names)
+    built = build(made.scenario)
+    assert built.scene.has_voxels.tolist() == [False, True]
+    bounds = built.scene.object_bounds[1]
+    assert bounds == pytest.approx(np.array([[3, 4, 5], [4, 5, 7]]), abs=0.021)
+    table = MaterialTable.of(built.survey.materials, built.scene.names)
     assert table.reflectance.tolist() == [0.3, 0.5]
     assert made.left_out[-2:] == [
         "part 1, ladlut: leaf angles are spherical",

@@ -31,6 +31,7 @@ from lidarpool.base.yamlfile import load_yaml
 from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
 from lidarpool.sensor.beams import Mirror
@@ -274,14 +275,14 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
 @pytest.mark.parametrize("entry", ["images", "{format: mcap, layout: images}"])
 def test_a_scenario_keeps_every_return(entry):
     scenario = Scenario.from_data(load_yaml(f"output: {{write: [{entry}]}}"))
-    survey = scenario.survey(scenario.build_scene())
+    survey = build(scenario).survey
     assert survey.keep_every == 1
     assert {"ray", "range"} <= {column.name for column in survey.stored_columns}
     thinned = Scenario.from_data(
         load_yaml(f"{{output: {{write: [{entry}]}}, cloud: {{keep_every: 5}}}}")
     )
     with pytest.raises(LidarpoolError, match=r"keep_every is 5: set cloud\.keep_every to 1"):
-        thinned.survey(scenario.build_scene())
+        build(thinned)
 
 
 @pytest.mark.parametrize("name", ["dual", "all, noise, moving, two sensors"])

@@ -11,7 +11,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.pages import ask
 
-from lidarpool import Campaign, CampaignJob, Scene, Sensor, Survey
+from lidarpool import Campaign, Job, Scene, Sensor, Survey
 from lidarpool.export.jobs import JobRow
 from lidarpool.live.live_page import ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST, live_page
 from lidarpool.report.campaign_output import Making, make_dataset
@@ -29,7 +29,7 @@ def make(number, rng):
     if number == 2:
         raise ValueError("no such wall")
     survey = Survey(Sensor.grid(), poses=[(0, 0, height)], steps=4)
-    return CampaignJob(SCENE, survey, values={"height": height, "side": "left"})
+    return Job(SCENE, survey, values={"height": height, "side": "left"})
 
 
 def progress(done, count, seconds):
@@ -40,7 +40,7 @@ def progress(done, count, seconds):
 
 
 def row(number, **given):
-    more = {"rays": 100, "points": 50, "seconds": 0.5}
+    more = {} if given.get("error") else {"rays": 100, "points": 50, "seconds": 0.5}
     return JobRow(number, f"{number:04}", "", {"height": 1.23456, "side": "left"}, **(more | given))
 
 
@@ -72,7 +72,7 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         told = ask(live.page.url, "jobs")
         assert told["title"] == "Walls"
         assert (told["count"], told["done"], told["failed"]) == (10_000, 4950, 50)
-        assert (told["casting"], told["writing"]) == (16, 4)
+        assert told["busy"] == 20
         assert (told["points"], told["rays"]) == (4950 * 50, 4950 * 100)
         assert (told["rate"], told["left"]) == ("20 jobs/s", "4 min")
         assert told["names"] == ["height", "side"]
@@ -80,7 +80,7 @@ def test_the_page_tells_of_jobs_and_keeps_few_of_them():
         assert told["ended"][0]["values"] == ["1.235", "left"]
         assert [job["error"] for job in told["failures"]] == ["no surface"] * FAILED_MOST
         assert len(told["under_way"]) == UNDER_WAY_MOST
-        assert told["under_way"][4]["share"] == 0.1
+        assert [told["under_way"][4][name] for name in ("stored", "scans")] == [4, 40]
         wait_for_charts(live, 1)
         assert not told["over"]
 

@@ -180,7 +180,7 @@ def test_a_run_is_stopped_as_by_an_interrupt(live):
     live.on_progress(progress(1.0, 1), list)
     request = urllib.request.Request(f"{live.page.url}stop", data=b"")
     urllib.request.urlopen(request, timeout=LONG_S).close()
-    assert news(live)["stopping"]
+    assert news(live)["state"] == "stopping"
     with pytest.raises(KeyboardInterrupt):
         live.on_progress(progress(2.0, 2), list)
 

@@ -33,8 +33,9 @@ from lidarpool.export.navigation import (
     write_instruments,
 )
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.run.campaign import described_job
-from lidarpool.scenario.campaign import CampaignJob, Described
+from lidarpool.scenario.build import build
+from lidarpool.scenario.campaign import Campaign
+from lidarpool.scenario.job import Job
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
 from lidarpool.sensor.trajectory import Stations, matrices, quaternions_of, rotations_of
@@ -395,7 +396,7 @@ def test_scenarios(tmp_path):
     """
     (tmp_path / "scenario.yaml").write_text(text)
     scenario = Scenario.load(tmp_path / "scenario.yaml")
-    navigation = scenario.survey(scenario.build_scene()).navigation
+    navigation = build(scenario).survey.navigation
     assert navigation == Navigation(
         imu=Imu(rate_hz=100, gyroscope_random_walk=2e-5, mount=Pose((0, 0, 0), 10)),
         gnss=Gnss(origin=(48.7, 9.1, 290), drift_horizontal_m=0.5),
@@ -407,9 +408,8 @@ def test_what_does_not_fit():
     with pytest.raises(LidarpoolError, match="jumps between 2 poses"):
         Survey(Sensor.grid(), poses=[(0, 0, 1), (1, 0, 1)], navigation=Navigation(imu=Imu()))
     survey = Survey(poses=[(0, 0, 1)], navigation=Navigation(imu=Imu()))
-    described = Described(0, "00", {}, made=CampaignJob(Scene.seed(), survey))
     with pytest.raises(LidarpoolError, match="single surveys"):
-        described_job(described, ())
+        Campaign(lambda number, rng: Job(Scene.seed(), survey), 1).job(0)
     with pytest.raises(LidarpoolError, match="rate_hz is 0"):
         Imu(rate_hz=0)
     with pytest.raises(LidarpoolError, match="origin is"):

@@ -12,9 +12,9 @@ from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE
 from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
-from lidarpool.live.result_page import open_result, result_page, result_view, view_result
+from lidarpool.live.result_page import open_result, result_page, view_result
 from lidarpool.live.surface import Surface, colours_for
-from lidarpool.live.view import range_image
+from lidarpool.live.view import View, range_image
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
@@ -119,7 +119,7 @@ def places(view, **asked):
 
 
 def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
-    view = result_view(CloudFile(cloud), pictured, title="a room")
+    view = View(CloudFile(cloud), pictured, title="a room")
     state, arrays = told(view, "state")
     assert (state["title"], state["points"]) == ("a room", 10_000)
     assert state["origin"] == ORIGIN.tolist()
@@ -135,7 +135,7 @@ def test_the_page_is_told_of_scene_sensors_rays_and_planning(cloud, pictured):
 
 
 def test_colours_are_those_of_the_legend_whatever_is_shown(cloud, pictured):
-    view = result_view(CloudFile(cloud), pictured)
+    view = View(CloudFile(cloud), pictured)
     whole, arrays = told(view, "points", colour="z", most=ALL)
     some, part = told(view, "points", colour="z", most=ALL, scans="50-59")
     assert some["legend"] == whole["legend"]
@@ -167,7 +167,7 @@ def test_points_are_shown_in_their_own_colours(tmp_path):
 
 
 def test_surfaces_have_the_colours_that_are_asked_for(cloud, pictured):
-    view = result_view(CloudFile(cloud), pictured)
+    view = View(CloudFile(cloud), pictured)
     grey, arrays = told(view, "surface", colour="grey")
     assert arrays["corners"].shape == (12, 3, 3)
     assert "colours" not in arrays  # the page has its own, light or dark
@@ -185,7 +185,7 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
     """The camera is near the way, and towers are cut above it."""
     scene = Scene.from_meshes([box("Ground", (800, 800, 0.1)), box("Tower", (9, 9, 90))])
     drive = seen(scene, [[0, 5, 2], [20, 5, 2]], moves=True)
-    state, _ = told(result_view(CloudFile(cloud), drive), "state")
+    state, _ = told(View(CloudFile(cloud), drive), "state")
     assert 20 < state["cut"] < 40
     assert np.ptp(state["box"], axis=0).max() < 200 < np.ptp(state["bounds"], axis=0).max()
 
@@ -193,7 +193,7 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
 def test_around_an_object_a_picture_of_all_holds_it_and_the_sensors_not_a_box_of_both(cloud):
     scene = Scene.from_meshes([box("Duck", (2, 2, 2))])
     places = np.array([[9, 0, 1.0], [-9, 0, 1], [0, 0, 9]])
-    state, arrays = told(result_view(CloudFile(cloud), seen(scene, places)), "state")
+    state, arrays = told(View(CloudFile(cloud), seen(scene, places)), "state")
     corners = arrays["corners"]
     assert np.array_equal([corners[:8].min(axis=0), corners[:8].max(axis=0)], scene.bounds)
     assert np.array_equal(corners[8:], places)
@@ -206,7 +206,7 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     track = Track([0, 2], [[1, 1, 0], [5, 1, 0]], [[0, 0, 0, 1], [0, 0, half, half]])
     cart = replace(box("Cart", (1, 1, 1)), colours=Colours.plain(np.uint8([[[9, 8, 7]]]), 12))
     scene = replace(scene, actors=(Actor(cart, track),))
-    view = result_view(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
+    view = View(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
     state, arrays = told(view, "state")
     assert (state["actors"], state["statics"]) == ([{"name": "Cart"}], 2)
     assert len(state["actor_colours"]) == 1
@@ -294,7 +294,7 @@ def test_a_range_image_of_a_sensor_that_looks_down_is_a_row_across_its_way():
 def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, pictured):
     scene = Scene.from_meshes([box("Wall", (1, 8, 8))])
     survey = Survey(Sensor.grid(layers=4), poses=[(-5, 0, 1)], coordinates="sensor")
-    view = result_view(CloudFile(cloud), pictured, Sweeps.of(survey, scene))
+    view = View(CloudFile(cloud), pictured, Sweeps.of(survey, scene))
     state, arrays = told(view, "state")
     assert (state["scene"], "axes of their sensor" in state["note"]) == (None, True)
     assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
@@ -325,7 +325,7 @@ def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
 
 
 def test_what_a_column_is_filtered_by_is_told(cloud, pictured):
-    view = result_view(CloudFile(cloud), pictured)
+    view = View(CloudFile(cloud), pictured)
     assert told(view, "column", name="object")[0] == {"labels": [["room", 0]]}
     scans = told(view, "column", name="scan")[0]
     assert (scans["low"], scans["high"], scans["whole"]) == (0, 99, True)
@@ -341,7 +341,7 @@ def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):
     rows["object"], rows["cause"] = np.arange(6) % 2 - 1, 1 - np.arange(6) % 2
     (tmp_path / "air.ply").write_bytes(header(row, 6) + rows.tobytes())
     file = CloudFile(tmp_path / "air.ply")
-    for view in (result_view(file, pictured), open_result(tmp_path / "air.ply")):
+    for view in (View(file, pictured), open_result(tmp_path / "air.ply")):
         causes = [["surface", 0], ["air", 1]]
         assert told(view, "column", name="cause")[0] == {"labels": causes}
         assert told(view, "column", name="object")[0]["labels"][0] == ["no surface", -1]
@@ -352,7 +352,7 @@ def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):
 
 
 def test_a_point_is_told_in_words_and_world_coordinates(cloud, pictured):
-    view = result_view(CloudFile(cloud), pictured)
+    view = View(CloudFile(cloud), pictured)
     point, _ = told(view, "point", row=2)
     assert point["place"] == [view.points.values(axis, np.array([2]))[0] for axis in "xyz"]
     assert point["columns"] == [["scan", "0"], ["channel", "2"], ["object", "room"]]
@@ -363,11 +363,10 @@ def test_a_point_is_told_in_words_and_world_coordinates(cloud, pictured):
 def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkeypatch):
     asked = []
 
-    def interrupt(_):
+    def look():
         asked.append(capsys.readouterr().err)
-        raise KeyboardInterrupt
 
-    monkeypatch.setattr("lidarpool.live.result_page.time.sleep", interrupt)
+    monkeypatch.setattr("lidarpool.live.result_page.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
     view_result(cloud.parent, port=0, browser=False)
     (said,) = asked
@@ -376,7 +375,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
 
 
 def test_questions_come_by_http(cloud, pictured):
-    with result_page(result_view(CloudFile(cloud), pictured), port=0, browser=False) as page:
+    with result_page(View(CloudFile(cloud), pictured), port=0, browser=False) as page:
         told = ask(page.url, "points", colour="z", most=100)
         assert told["count"] == 10_000
         assert told["arrays"]["positions"].shape == (100, 3)

@@ -12,6 +12,8 @@ import pytest
 import trimesh
 from trimesh import creation
 
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
 from lidarpool.scenario.placing import inside_note, place, poses_around
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.city import city
@@ -182,7 +184,7 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
     (tmp_path / "b.stl").write_bytes(creation.icosphere(3, 5.0).export(file_type="stl"))
     data = {"scene": {"files": ["b.stl"]}, "poses": [[0, 0, 0]]}
     given = Scenario.from_data(data, folder=tmp_path)
-    assert "only the backs of its surfaces" in given.advice(given.build_scene())[-1]
+    assert "only the backs of its surfaces" in advice(build(given))[-1]
 
 
 @pytest.mark.parametrize("far", [0.2, 5.0])
@@ -208,9 +210,8 @@ def test_the_unit_of_a_long_object_is_asked_for(tmp_path, file, length, noted):
     capsule = creation.capsule(length * 0.8, length * 0.1)
     (tmp_path / file).write_bytes(capsule.export(file_type=file[-3:]))
     read = Scenario.load(tmp_path / file)
-    scene = read.build_scene()
-    read.survey(scene)
-    notes = " ".join(read.advice(scene))
+    built = build(read)
+    notes = " ".join(advice(built))
     assert "looks like an object" in notes and ("give the file's unit (mm?)" in notes) == noted
 
 
@@ -219,14 +220,14 @@ def test_files_of_our_own_need_no_unit_and_no_axes(tmp_path, suffix):
     scene = terrain(2_000, 0, 1000.0)
     write_scene(tmp_path / f"own{suffix}", scene)
     read = Scenario.load(tmp_path / f"own{suffix}")
-    assert read.advice(read.build_scene()) == []
+    assert advice(build(read)) == []
 
 
 def test_the_axes_of_several_objs_are_one_note(tmp_path):
     for name in "ab":
         (tmp_path / f"{name}.obj").write_text(creation.icosphere(2).export(file_type="obj"))
     read = Scenario.from_data({"scene": {"files": ["a.obj", "b.obj"]}}, folder=tmp_path)
-    (note,) = [note for note in read.advice(read.build_scene()) if "axes" in note]
+    (note,) = [note for note in advice(build(read)) if "axes" in note]
     assert note.startswith("a.obj states no axes and is taken as Z-up") and "\n" not in note
     assert "set up_axis: y" in note and note.endswith("; 1 more file, too")
 

@@ -11,6 +11,8 @@ from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.cli.commands import cli
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene import rasters
 from lidarpool.scene.meshfile import load_meshes
@@ -303,7 +305,7 @@ def epsg_of(folder, *files, **cloud):
     scenario = Scenario.from_data(
         {"scene": {"files": [*files]}, "cloud": {"precision_m": 0.001, **cloud}}, folder=folder
     )
-    return scenario.survey(scenario.build_scene()).epsg
+    return build(scenario).survey.epsg
 
 
 def test_the_scene_has_one_coordinate_system(tmp_path):
@@ -328,13 +330,14 @@ def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
     assert "file        hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
     assert "note: hill.tif has 2 bands: the first is taken for heights\n" in checked.output
     scenario = Scenario.load(tmp_path / "hill.tif")
-    scene = scenario.build_scene()
+    built = build(scenario)
+    scene = built.scene
     # In the middle, 1, 2 and 3 m above the ground.
     np.testing.assert_allclose(
-        [pose.position for pose in scenario.placing(scene).poses],
+        [pose.position for pose in built.placing.poses],
         [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
-    assert scenario.survey(scene).epsg == 2056 and scenario.advice(scene)[1:] == []
+    assert built.survey.epsg == 2056 and advice(built)[1:] == []
     at = np.array([X0 + 60, Y0 - 60, 110]) - scene.origin
     cloud = Scanner(scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
@@ -343,7 +346,7 @@ def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
     heights[20:40, 20:40] = np.nan
     write(tmp_path / "hole.tif", heights)
     scenario = Scenario.load(tmp_path / "hole.tif")
-    scene = scenario.build_scene()
-    at = np.array(scenario.placing(scene).poses[0].position)
+    scene = build(scenario).scene
+    at = np.array(built.placing.poses[0].position)
     assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
     assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)

@@ -12,7 +12,9 @@ from tests.lidarpool.test_moving import made, stored_positions
 
 from lidarpool import Actor, LidarpoolError, Pose, Scene, Survey, Track, load_robot, load_sensor
 from lidarpool.base.fingerprint import fingerprint
-from lidarpool.run.job import make_job
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
@@ -479,7 +481,8 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
         "materials": [{"objects": "*"}, {"objects": "Rover/*wheel", "reflectance": 0.1}],
     }  # fmt: skip
     scenario = Scenario.from_data(data, folder=folder)
-    scene = scenario.build_scene()
+    built = build(scenario)
+    scene = built.scene
     actors = {actor.name: actor for actor in scene.actors}
     assert [name for name in actors if name.startswith("Rover/")][:2] == [
         "Rover/base_link", "Rover/front_left_wheel",
@@ -490,7 +493,7 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert actors["Box"].trajectory.pose(0, 1e9) == Pose((1.0, 0.0, 0.0))
     turret = actors["Rover/shoulder_block"].trajectory.pose(0, 1e9)
     assert np.allclose([*turret.position, turret.yaw_deg], [1.3, 0, 0.4, np.degrees(0.5)])
-    survey = scenario.survey(scene)
+    survey = built.survey
     (carried,) = survey.carried
     assert np.allclose(carried.mount.position, (-0.36, 0, 1.076))
     assert carried.mount.yaw_deg == pytest.approx(90)
@@ -498,9 +501,9 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
     assert kinds["Rover/rear_left_wheel"].reflectance == 0.1
     assert {kinds[name].semantic_class == 7 for name in actors if "Rover/" in name} == {True}
     assert kinds["Arm/base_link"].semantic_class != 7
-    notes = scenario.advice(scene)
+    notes = advice(built)
     assert "Rover: link lidar is left out: a sensor is mounted on it" in notes
-    assert scenario.sources["rover.urdf"].startswith(
+    assert built.found.sources["rover.urdf"].startswith(
         "14 links, 6,592 triangles; 9 of its joints move"
     )
 
@@ -522,7 +525,7 @@ def test_scenarios_that_do_not_fit_their_robot(folder, change, words):
     data = {key: value for key, value in data.items() if value is not None}
     with pytest.raises(LidarpoolError, match=words):
         scenario = Scenario.from_data(data, folder=folder)
-        scenario.survey(scenario.build_scene())
+        build(scenario)
 
 
 def test_a_robot_in_a_loop_is_placed_link_by_link(ground):
@@ -548,11 +551,11 @@ def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
         },
         folder=folder,
     )
-    job = make_job(scenario, "numpy")
+    job = job_of(build(scenario))
     for actor in job.scene.actors:
         assert actor.trajectory.presence_ns == pytest.approx((0.2e9, 0.6e9))
 
 
 def test_a_robot_as_a_scene_is_told_where_it_belongs(folder):
     with pytest.raises(LidarpoolError, match=r"rover\.urdf is a robot: name it as the file of one"):
-        Scenario.from_data({"scene": "rover.urdf"}, folder=folder).build_scene()
+        build(Scenario.from_data({"scene": "rover.urdf"}, folder=folder))

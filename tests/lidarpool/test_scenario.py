@@ -14,6 +14,8 @@ from trimesh.exchange.gltf import export_glb
 
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor import Noise, Returns, Sensor, Survey
 from lidarpool.sensor.materials import MaterialTable
@@ -44,8 +46,9 @@ def crate(tmp_path):
 
 def everything(loaded):
     """Build all that a scenario describes."""
-    scene = loaded.build_scene()
-    return scene, loaded.survey(scene), loaded.plan(scene)
+    built = build(loaded)
+    scene = built.scene
+    return scene, built.survey, built.planning
 
 
 @pytest.mark.parametrize("source", ["python", "file", "empty sections"])
@@ -75,7 +78,7 @@ def test_a_model_and_a_unit_of_it(tmp_path):
     (tmp_path / "s.yaml").write_text(
         "sensor: {calibration: unit.csv, rate_hz: 20, max_range_m: 60, step_deg: 30}\nsteps: 12\n"
     )
-    survey = Scenario.load(tmp_path / "s.yaml").survey(Scenario().build_scene())
+    survey = build(Scenario.load(tmp_path / "s.yaml")).survey
     sensor = survey.sensor
     assert (sensor.name, sensor.max_range_m) == ("Hesai PandarXT-32, unit.csv", 60)
     assert survey.ray_count == 3 * 32 * 1000, "one turn from each pose"
@@ -83,7 +86,7 @@ def test_a_model_and_a_unit_of_it(tmp_path):
         "{name: Mine, sources: {}, firings_per_turn: 90, beams: {elevation_deg: [0]}}"
     )
     mine = Scenario.from_data({"sensor": {"model": "mine.yaml"}}, folder=tmp_path)
-    assert mine.survey(Scenario().build_scene()).ray_count == 3 * 90
+    assert build(mine).survey.ray_count == 3 * 90
 
 
 def test_the_warehouse_example_with_a_mesh_beside_it(tmp_path):
@@ -115,19 +118,20 @@ def test_mesh_files_are_placed(scenario, crate):
           ground: {height_m: -4, margin_m: 1}
         """
     )
-    scene = loaded.build_scene()
+    built = build(loaded)
+    scene = built.scene
     assert scene.names == ("crate", "crate.2", "crate.3", "crate.4", "Ground")
     sizes = np.ptp(scene.object_bounds, axis=1)
     np.testing.assert_allclose(sizes[:4], [[2, 4, 6], [0.02, 0.06, 0.04], [2, 6, 8], [2, 4, 6]])
     np.testing.assert_allclose(scene.object_bounds[3].mean(axis=0), [7, 8, 9])
     np.testing.assert_allclose(scene.object_bounds[4], [[-2, -4, -4], [11.01, 11, -4]])
-    assert loaded.plan(scene) is None
+    assert built.planning is None
 
 
 def test_seed_beside_files(scenario, crate):
     (crate.parent / "meshes").mkdir()
     crate.rename(crate.parent / "meshes" / "crate.stl")
-    scene = scenario("scene: {preset: seed, files: meshes/crate.stl}").build_scene()
+    scene = build(scenario("scene: {preset: seed, files: meshes/crate.stl}")).scene
     assert scene.names[-2:] == ("Bowl", "crate")
 
 
@@ -263,7 +267,7 @@ def test_all_faults_are_told_at_once(scenario, tmp_path):
 
 def test_all_files_that_cannot_be_read_are_told_at_once(scenario):
     with pytest.raises(LidarpoolError) as raised:
-        scenario("scene: [no.glb, nor.stl]").build_scene()
+        build(scenario("scene: [no.glb, nor.stl]"))
     assert str(raised.value).count("does not exist") == 2
 
 
@@ -274,16 +278,20 @@ def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):
         made.add_geometry(trimesh.creation.box((1, 2, 1)), node_name=f"N{size}", transform=place)
     (tmp_path / "m.glb").write_bytes(made.export(file_type="glb"))
     read = scenario("scene: m.glb")
-    scene = read.build_scene()
+    built = build(read)
+    scene = built.scene
     assert scene.names == ("N1",)
-    assert "m.glb scales N0 to zero: left out" in read.advice(scene)[0]
+    assert "m.glb scales N0 to zero: left out" in advice(built)[0]
 
 
 @pytest.mark.parametrize(
     ("idle", "used"),
     [
         ("cloud: {waveform_samples: 40}", "output: {write: [laz]}"),
-        ("weather: {fog_lidar_ratio_sr: 65}", "weather: {fog_lidar_ratio_sr: 9, visibility_km: 1}"),
+        (
+            "weather: {fog_lidar_ratio_sr: 65}",
+            "weather: {fog_lidar_ratio_sr: 9, visibility_km: 1}\nnoise: {detection_range_m: 6}",
+        ),
         (
             "noise: {detection_range_m: 6, stray_light: 1}",
             "materials: [{objects: '*', retro: true}]",
@@ -293,10 +301,10 @@ def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):
 )
 def test_settings_without_effect_are_in_the_advice(scenario, idle, used):
     read = scenario(idle)
-    (note,) = read.advice(read.build_scene())
+    (note,) = advice(build(read))
     assert idle.split("{")[1].split(": ")[-2].split(", ")[-1] in note
     both = scenario(used if used[:5] == idle[:5] else f"{idle}\n{used}")
-    assert both.advice(both.build_scene()) == []
+    assert advice(build(both)) == []
 
 
 def test_an_imu_on_a_linear_trajectory_is_in_the_advice(scenario):
@@ -310,7 +318,7 @@ def test_an_imu_on_a_linear_trajectory_is_in_the_advice(scenario):
             f"navigation: {{{instrument}: {{}}}}\n"
             f"trajectory: {{interpolation: {kind}, points: [{way}]}}"
         )
-        notes = " ".join(read.advice(read.build_scene()))
+        notes = " ".join(advice(build(read)))
         assert ("interpolation: smooth" in notes) == told
 
 
@@ -363,7 +371,7 @@ def test_materials_returns_noise_and_weather_become_those_of_the_survey():
             "weather": {"visibility_km": 2},
         }
     )
-    survey = scenario.survey(scenario.build_scene())
+    survey = build(scenario).survey
     assert survey.returns == Returns("dual", 7)
     assert survey.noise == Noise(0.02, seed=3)
     assert survey.visibility_km == 2
@@ -392,11 +400,10 @@ def mesh_file(path, size, height, **asset):
 )
 def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, expected):
     made = Scenario.load(mesh_file(tmp_path / "hall.stl", (8, 6, height), height / 2))
-    scene = made.build_scene()
-    survey = made.survey(scene)
+    survey = build(made).survey
     assert [pose.position[2] for pose in survey.poses] == pytest.approx(expected)
     assert (survey.keep_every, survey.precision_m) == (1, 0.001)
-    default = Scenario().survey(Scenario().build_scene())
+    default = build(Scenario()).survey
     assert (default.keep_every, default.precision_m) == (5, 0.01)
 
 
@@ -415,7 +422,7 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
     width, height, depth = size[0], size[1], size[2]
     mesh_file(tmp_path / "hall.glb", (width, height, depth), 0, generator=generator, version="2.0")
     made = Scenario.from_data({"scene": {"files": [entry]}}, folder=tmp_path)
-    told = [note for note in made.advice(made.build_scene()) if "up_axis" in note]
+    told = [note for note in advice(build(made)) if "up_axis" in note]
     assert len(told) == bool(says)
     if says:
         assert says in told[0] and "set up_axis: z in scene.files" in told[0]
@@ -424,7 +431,7 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
 def test_a_start_is_a_time_of_yaml_or_text(scenario):
     for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
         loaded = scenario(f"cloud: {{epsg: 25832, start: {text}}}")
-        survey = loaded.survey(loaded.build_scene())
+        survey = build(loaded).survey
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
     with pytest.raises(LidarpoolError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")

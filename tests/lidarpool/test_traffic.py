@@ -13,8 +13,10 @@ from tests.lidarpool.casting import cast_between
 from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor
 from lidarpool.columns.cloud import Cloud
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.run.job import make_job
 from lidarpool.run.picture_file import Pictured
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import Actor, box
 from lidarpool.simulator.rig import Rig
@@ -152,7 +154,8 @@ def scenario(folder, text=FCD, traffic=(), **sections):
 
 def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     read = scenario(tmp_path)
-    scene = read.build_scene()
+    built = build(read)
+    scene = built.scene
     assert [actor.name for actor in scene.actors] == ["car (a.1)", "Person (p)", "car (a.1)"]
     assert scene.all_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
     first, person, again = (actor.trajectory for actor in scene.actors)
@@ -167,9 +170,9 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     place, turn = person.poses(0, np.array([1.5e9]))
     np.testing.assert_allclose(place + turn @ [0.2, 0, 0], [[0, 0.5, 0.5]], atol=1e-9)
     np.testing.assert_allclose(again.poses(0, np.array([3e9]))[1][0, :2, 0], [0.5**0.5] * 2)
-    assert read.sources["fcd.xml"].startswith("3 actors during the survey, of 3 vehicles")
+    assert built.found.sources["fcd.xml"].startswith("3 actors during the survey, of 3 vehicles")
 
-    job = make_job(read, "embree")
+    job = job_of(build(read))
     found = made(job.survey, job.scene, "embree")
     for number, semantic_class, (begin, end) in ((2, 10, (0, 1)), (3, 7, (1, 2)), (4, 10, (3, 4))):
         own = found["object"] == number
@@ -184,7 +187,7 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
     # What comes after the survey is not read: here the end of the file is missing.
     text = FCD.replace("</fcd-export>", f"<!--{'x' * 3_000_000}--><")
     read = scenario(tmp_path, text, traffic, steps=36)
-    (car,) = read.build_scene().actors
+    (car,) = build(read).scene.actors
     assert car.trajectory.presence_ns == pytest.approx((-0.2e9, 0.8e9))
     assert car.trajectory.positions[0].tolist() == pytest.approx(
         [140 - 2 * 0.5**0.5, 5 - 2 * 0.5**0.5, 7]
@@ -192,7 +195,7 @@ def test_traffic_is_moved_in_time_and_place_and_read_no_further_than_needed(tmp_
 
     (tmp_path / "fcd.xml.gz").write_bytes(gzip.compress(FCD.encode()))
     packed = scenario(tmp_path, traffic={"file": "fcd.xml.gz"})
-    assert len(packed.build_scene().actors) == 3
+    assert len(build(packed).scene.actors) == 3
 
 
 RAMP = "o Ramp\nv 0 0 0\nv 18.5 0 1.85\nv 18.5 9 1.85\nv 0 9 0\nf 1 2 3\nf 1 3 4\n"
@@ -210,7 +213,7 @@ def test_traffic_stands_on_surfaces_and_is_absent_beside_them(tmp_path):
         tmp_path, f"<fcd-export>{steps}</fcd-export>", {"surfaces": "Ramp"},
         scene={"files": "ramp.obj"}, steps=36 * 140,
     )  # fmt: skip
-    (car,) = read.build_scene().actors
+    (car,) = build(read).scene.actors
     # Its middle is 2 m behind the front, and on the ramp until x is 18.5.
     np.testing.assert_allclose(car.trajectory.presence_ns, (1e9, 10.25e9), atol=0.26e9)
     places, turns = car.trajectory.poses(0, np.array([3.1e9]))
@@ -232,8 +235,9 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
         )
 
     downhill = read(points)
-    scene = downhill.build_scene()
-    path = downhill.survey(scene).path
+    built = build(downhill)
+    scene = built.scene
+    path = built.survey.path
     assert path.duration_ns == 8e9
     places, turns = path.poses(0, np.array([0, 1.3e9, 8e9]))
     np.testing.assert_allclose(places[:, 2] + scene.origin[2] - z, [2.1, 1.84, 0.5], atol=1e-6)
@@ -241,26 +245,27 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
     np.testing.assert_allclose(turns[:, :, 1], np.tile([0, -1, 0], (3, 1)), atol=1e-6)
     stops = ((0, 18), (3, 10), (5, 10), (8, 2))
     stop = [{"time_s": t, "position": [x + at, y + 5, 0.3]} for t, at in stops]
-    path = read(stop, interpolation="smooth").survey(scene).path
+    path = build(read(stop, interpolation="smooth")).survey.path
     poses = path.times_s[1:-1, None] * 1e9 + [-10, 10]
     speeds = path.velocities(0, poses.ravel())[0].reshape(-1, 2, 3)
     np.testing.assert_allclose(speeds[:, 0], speeds[:, 1], atol=1e-5)
     assert not path.velocities(0, np.linspace(3e9, 4.9e9, 20))[0].any()
     points[1]["position"] = [x + 30, y + 5, 0]
     points.insert(1, {"time_s": 4, "position": [x + 10, y + 5, 0.3]})
-    assert read(points, duration_s=3).survey(scene).path.duration_ns == 3e9
+    assert build(read(points, duration_s=3)).survey.path.duration_ns == 3e9
     with pytest.raises(LidarpoolError, match=r"leaves its surfaces \(Ramp\)"):
-        read(points).survey(scene)
+        build(read(points))
     with pytest.raises(LidarpoolError, match=r"trajectory\.beyond is for actors"):
         read(points, beyond="hold")
 
 
 def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_path):
     read = scenario(tmp_path)
-    scene = read.build_scene()
+    built = build(read)
+    scene = built.scene
     first, _, again = (actor.mesh for actor in scene.actors)
     assert first.vertices is again.vertices
-    survey = read.survey(scene)
+    survey = built.survey
     result = SimpleNamespace(
         scene=scene, survey=survey, hit_counts=np.arange(scene.counters), trials=(),
         sample_rays=np.zeros((0, 2, 3)), planning=None, plan=None,
@@ -289,7 +294,7 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
 )
 def test_unusable_data_is_refused(tmp_path, text, told):
     with pytest.raises(LidarpoolError, match=rf"fcd\.xml is not usable as floating .*{told}"):
-        scenario(tmp_path, text).build_scene()
+        build(scenario(tmp_path, text))
 
 
 def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
@@ -303,7 +308,7 @@ def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
             {"objects": "car (a.1)", "reflectance": 0.1},
         ],
     )
-    job = make_job(read, "embree")
+    job = job_of(build(read))
     names = job.scene.all_names
     assert names[2:] == ("car (a.1)", "walker (a.1)", "car (a.1).2")
     table = Surfaces(job.scene, tuple(job.survey.materials)).materials
@@ -318,20 +323,20 @@ def test_who_rides_in_a_vehicle_is_no_actor(tmp_path):
         '<person id="w" x="9" y="9" angle="90" type="walker"/></timestep>'
         for k in range(3)
     )
-    actors = scenario(tmp_path, f"<fcd-export>{rows}</fcd-export>").build_scene().actors
+    actors = build(scenario(tmp_path, f"<fcd-export>{rows}</fcd-export>")).scene.actors
     assert [actor.name for actor in actors] == ["car (b)", "Person (w)"]
 
 
 def test_what_is_wrong_with_traffic_is_told(tmp_path):
     nobody = scenario(tmp_path, traffic={"offset_s": 300})
-    assert any("no vehicle or person is in the" in n for n in nobody.advice(nobody.build_scene()))
+    assert any("no vehicle or person is in the" in n for n in advice(build(nobody)))
     with pytest.raises(LidarpoolError, match=r"traffic\.surfaces"):
         scenario(tmp_path, traffic={"surfaces": []})
     with pytest.raises(LidarpoolError, match=r"type 'car', but no entry .* add one, such as"):
-        scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}).build_scene()
+        build(scenario(tmp_path, traffic={"vehicles": SHAPES[:1]}))
     with pytest.raises(LidarpoolError, match="give either file or box"):
         scenario(tmp_path, traffic={"vehicles": [{"types": "*"}]})
     with pytest.raises(LidarpoolError, match=r"no\.xml' does not exist|no\.xml.*No such file"):
-        scenario(tmp_path, traffic={"file": "no.xml"}).build_scene()
+        build(scenario(tmp_path, traffic={"file": "no.xml"}))
     with pytest.raises(LidarpoolError, match="surfaces names 'Street'"):
-        scenario(tmp_path, traffic={"surfaces": "Street"}).build_scene()
+        build(scenario(tmp_path, traffic={"surfaces": "Street"}))

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 
 from lidarpool.base import allowance
 from lidarpool.base.errors import LidarpoolError
+from lidarpool.scenario.advice import advice
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene import nodes, usd
 from lidarpool.scene.instances import Instance
@@ -184,7 +186,7 @@ def test_moving_prims_are_actors(tmp_path):
              "points": [{"time_s": t, "position": [0, 0, 0], "yaw_deg": 0} for t in (0, 9)]}}]},
         folder=tmp_path,
     )  # fmt: skip
-    scene = scenario.build_scene()
+    scene = build(scenario).scene
     assert [actor.name for actor in scene.actors] == ["Car", "Wheel", "Van"]
 
 
@@ -229,9 +231,10 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     assert lines == ["m.usda moves Car: taken where they are at first, and still"]
     assert bounds(objects)[0, 0] == 1
     scenario = Scenario.load(path)
-    scene = scenario.build_scene()
+    built = build(scenario)
+    scene = built.scene
     assert not scene.actors and scene.bounds[0, 0] == 1
-    assert "nothing stands in the scene" in scenario.advice(scene)[0]
+    assert "nothing stands in the scene" in advice(built)[0]
     uneven = Transform.place(scale=(1, 2, 1))
     with pytest.raises(LidarpoolError, match="'Car' moves, and its placement scales it unevenly"):
         Scene.load(path, transform=uneven)
@@ -251,7 +254,7 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
 
     def names(**more):
         files = [{"file": "scenes/m.usda"} | more]
-        return Scenario.from_data({"scene": {"files": files}}, folder=tmp_path).build_scene().names
+        return build(Scenario.from_data({"scene": {"files": files}}, folder=tmp_path)).scene.names
 
     with pytest.raises(LidarpoolError, match=r"name a folder .* by assets in scene\.files"):
         names()

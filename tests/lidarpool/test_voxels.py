@@ -22,7 +22,8 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.run.job import make_job
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import one_mesh
 from lidarpool.scene.mesh import Mesh, Voxels
@@ -422,14 +423,15 @@ planning: {enabled: false}
 """
     )
     scenario = Scenario.load(path)
-    scene = scenario.build_scene()
+    built = build(scenario)
+    scene = built.scene
     assert dict(zip(scene.names, scene.has_voxels.tolist(), strict=True)) == {
         "oak": True, "Oak": True, "Ground": False
     }  # fmt: skip
     assert scene.object_bounds[0] == pytest.approx(np.array([[4, -1, 1], [6, 1, 4]]), abs=0.021)
-    (line,) = scenario.sources.values()
+    (line,) = built.found.sources.values()
     assert "2 x 2 x 3 voxels" in line
-    job = make_job(scenario)
+    job = job_of(build(scenario))
     plain = Scene.from_meshes([box("Ground", (0, 0, 0), (1, 1, 1))])
     assert cast_bytes(job.scene, job.survey) > cast_bytes(plain, job.survey)
 

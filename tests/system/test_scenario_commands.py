@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 from lidarpool.cli.commands import cli
+from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
 
@@ -42,7 +43,7 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     made = Scenario.load("a/b/scenario.yaml")
     files = [(entry.file, entry.unit) for entry in made.scene.files]
     assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
-    assert len(made.build_scene().names) == 2
+    assert len(build(made).scene.names) == 2
     assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"
     rest = {"scene": {"files", "preset"}, "cloud": True, "poses": True}

@@ -108,5 +108,5 @@ def test_files_of_copies_are_found_from_the_new_folder(hall, lidarpool):
     outcome = lidarpool("stations", "hall.yaml", "--sensor", "vlp16", "--count", "1")
     assert outcome.code == 0, outcome.err
     written = Scenario.load(hall / "hall-stations" / "stations.yaml")
-    assert build(written, plans=False).scene.names[-2:] == ("Crate", "Crate.2")
+    assert build(written).scene.names[-2:] == ("Crate", "Crate.2")
     assert written.scene.copies[0].semantic_class == 4

@@ -129,12 +129,13 @@ class Result(RunResult):
             Whether to open a browser where there is a desktop.
         """
         from ..columns.cloud_file import CloudFile
-        from ..live.result_page import result_page, result_view, wait_for_interrupt
+        from ..live.result_page import result_page, wait_for_interrupt
+        from ..live.view import View
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.own)
             sweeps = None if self.points.sweeps is None else self.points.sweeps()
-            view = result_view(file, self._pictured, sweeps)
+            view = View(file, self._pictured, sweeps)
             stack.enter_context(result_page(view, port=port, browser=browser))
             if cell_display() is None:
                 wait_for_interrupt()

@@ -29,10 +29,9 @@ def legend_of(colouring: Colouring) -> Legend:
     title += f": {colouring.meaning}" if colouring.meaning else ""
     if colouring.logarithmic:
         marks = [f"{at:.2g}" for at in (low, (low * high) ** 0.5, high)]
-        return scale_legend(title, marks, colouring.scale[::15])
-    # As many digits as a bar of this span needs, and never -0.
-    digits = int(np.clip(np.ceil(1 - np.log10(high - low)), 0, 6)) if high > low else 2
-    marks = [f"{round(at, digits) + 0.0:,.{digits}f}" for at in (low, (low + high) / 2, high)]
+    else:  # as many digits as a bar of this span needs, and never -0
+        digits = int(np.clip(np.ceil(1 - np.log10(high - low)), 0, 6)) if high > low else 2
+        marks = [f"{round(at, digits) + 0.0:,.{digits}f}" for at in (low, (low + high) / 2, high)]
     return scale_legend(title, marks, colouring.scale[::15])
 
 

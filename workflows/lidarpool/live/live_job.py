@@ -6,6 +6,7 @@ import threading
 from collections import deque
 from collections.abc import Sequence
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -15,16 +16,15 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import read_part
-from ..columns.table import SCAN
 from ..export.sweeps import Sweeps
 from ..pipeline import Frame, Receipt
 from ..plan import best
 from ..run.job_points import JobPoints
 from ..run.picture_file import Pictured
 from ..run.result import RunResult
-from .points import HeldPoints, no_points
+from .points import HeldPoints
 from .server import Answer
-from .view import IN_SENSOR_AXES, View
+from .view import View
 
 LIVE_POINTS = 150_000  # in the browser at a time
 PARTS_NOTED = 64  # parts that wait to be read; of more, every second is skipped
@@ -39,25 +39,23 @@ class LiveJob:
     sample of the whole result replaces them, so skipped parts do not matter.
     """
 
-    def __init__(
-        self, store: JobPoints, title: str = "lidarpool", name: str = "", most: int = LIVE_POINTS
-    ) -> None:
-        self.name, self._title, self._store, self._most = name, title, store, most
-        self._job = store.job
-        self._points = store.points()  # knows what a part holds
+    def __init__(self, points: JobPoints, name: str = "", most: int = LIVE_POINTS) -> None:
+        self.name, self._points_of, self._most = name, points, most
+        self._job = points.job
+        self._points = points.points()  # knows what a part holds
         self._waiting: list[str] = []  # names of parts
         self._lock = threading.Lock()
         self._random = np.random.default_rng(0)
         self._share = 1.0  # of the points of a part that are taken
         self._counts = np.zeros(self._job.scene.counters, np.int64)
         self._hits = 0  # of the parts that were read
-        self.cloud: Cloud | None = None
+        self.cloud = replace(self._points, names=(), rows=()).load()  # none, with their columns
         self.frames: deque[Frame] = deque(maxlen=FRAMES_SHOWN)  # the last ones
         self._view: View | None = None  # until somebody asks
         self._making = threading.Lock()
         self._whole = False  # all parts were read
         self._ends = 0  # how often something came at the run's end that the page must ask for
-        self.add(store.parts.ordered)
+        self.add(points.parts.ordered)
 
     # -- the run's side ------------------------------------------------------------------
 
@@ -99,7 +97,7 @@ class LiveJob:
         """Read some of the waiting parts, without those that cannot be read: the run says so."""
         with self._lock:
             names, self._waiting = self._waiting[:PARTS_AT_ONCE], self._waiting[PARTS_AT_ONCE:]
-            clouds = [] if self.cloud is None else [self.cloud]
+            clouds = [self.cloud]
             for name in names:
                 with suppress(LidarpoolError):
                     part = read_part(self._points.storage, name)
@@ -107,7 +105,7 @@ class LiveJob:
                     self._hits += int(part.hits.sum())
                     rows = np.flatnonzero(self._random.random(len(part)) < self._share)
                     clouds.append(self._points.cloud_of(part, rows))
-            if not names or not clouds:
+            if not names:
                 return
             cloud = Cloud.joined(clouds)
             while len(cloud) > self._most:
@@ -119,7 +117,7 @@ class LiveJob:
     def hit_counts(self) -> Floats:
         """Hits by counters of the scene, scaled up to all hits if some parts were not read."""
         with self._lock:
-            return np.asarray(self._counts * (self._store.parts.hits / max(self._hits, 1)))
+            return np.asarray(self._counts * (self._points_of.parts.hits / max(self._hits, 1)))
 
     @property
     def view(self) -> View:
@@ -131,17 +129,15 @@ class LiveJob:
 
     def _made(self) -> View:
         job, (pictured, drawn) = self._job, Pictured.before(self._job)
-        held = no_points((SCAN, *job.survey.stored_columns))
-        if self.cloud is not None:
-            held = HeldPoints(self.cloud)
         sweeps = Sweeps.of(job.survey, job.scene) if self._whole else None
-        note = "" if job.survey.coordinates == "world" else IN_SENSOR_AXES
-        hits = lambda: drawn.hits(self.hit_counts())  # noqa: E731
-        return View(self._title, held, pictured, sweeps, hits, note)
+        title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
+        view = View(HeldPoints(self.cloud), pictured, sweeps, title=title)
+        view.hits = lambda: drawn.hits(self.hit_counts())
+        return view
 
     def _show(self) -> None:
         with self._making:
-            if self._view is not None and self.cloud is not None:
+            if self._view is not None:
                 self._view.show(HeldPoints(self.cloud))
 
     def news(self) -> Answer:
@@ -163,7 +159,7 @@ class LiveJob:
 
     def _planned(self) -> Floats | None:
         """Return the planned path, once all trials have ended."""
-        planning, trials = self._job.planning, self._store.parts.trials
+        planning, trials = self._job.planning, self._points_of.parts.trials
         if planning is None or len(trials) < self._job.trials:
             return None
         return best(trials, planning).path

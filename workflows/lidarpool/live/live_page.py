@@ -13,6 +13,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from copy import deepcopy
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,15 +30,14 @@ from ..report.campaign_figures import Figures
 from ..report.campaign_pictures import draw_results, draw_varied
 from ..run.job_points import JobPoints
 from ..run.page import JobNow, Page
-from ..run.progress import STAGES, Pace, Progress, in_words, standing_still
+from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
 from ..run.result import RunResult
 from .live_job import LiveJob
+from .result_page import wait_for_interrupt
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
 
-LIST = "jobs.html"
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
-READING_SHARE = 0.06  # of a core, for points of the only job
-LOOKING_SHARE = 0.05  # of a core, for points of one of many jobs
+READING_SHARE = 0.05  # of a core, for points
 LOOK_EVERY_S = 5.0  # at most, for the points of another job
 LIST_EVERY_S = 0.5  # jobs under way
 ASK_EVERY_S = 2.0  # how busy the partitions are
@@ -63,7 +63,7 @@ class LivePage(Page):
         self._under_way: Sequence[JobNow] = ()
         self._ask_at = self._list_at = 0.0
         self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
-        self._reading, self._looking = Share(READING_SHARE), Share(LOOKING_SHARE)
+        self._reading = Share(READING_SHARE)
         self._sums = Counter(done=0, failed=0, points=0, rays=0)
         self._ended: deque[dict[str, Any]] = deque(maxlen=ENDED_MOST)
         self._failures: deque[dict[str, Any]] = deque(maxlen=FAILED_MOST)
@@ -75,7 +75,7 @@ class LivePage(Page):
         """Show the only job: what is committed from now on, and the scans of an earlier run."""
         if points.kept:
             self._progress = points.progress()
-        self._jobs = {0: LiveJob(points, self._title)}
+        self._jobs = {0: LiveJob(points)}
         self._state = "starting: workers, each with its own Python"
 
     def follow(self, partitions: Mapping[str, Partition]) -> None:
@@ -96,17 +96,14 @@ class LivePage(Page):
         if self.stopped.is_set():
             raise KeyboardInterrupt
         self._progress, now = progress, time.monotonic()
-        done, whole, over = progress.jobs_done, progress.jobs, False
-        if whole:
-            over = done == whole
-            rate = self._pace.rate(progress.seconds, done)
-            words = f"{in_words(rate)} jobs/s" if rate >= 1 else f"{in_words(60 * rate)} jobs/min"
-        else:
-            done, whole = progress.collected, progress.scans
-            rate = self._pace.rate(progress.seconds, done)
-            words = f"{in_words(rate)}/s"
-        if rate:
-            self._rate, self._left = words, self._pace.left(progress.seconds, done, whole)
+        counts, unit = (progress.collected, progress.scans), ""
+        if progress.jobs:
+            counts, unit = (progress.jobs_done, progress.jobs), " jobs"
+        if rate := self._pace.rate(progress.seconds, counts[0]):
+            each, rate = ("min", 60 * rate) if unit and rate < 1 else ("s", rate)
+            self._rate = f"{in_words(rate)}{unit}/{each}"
+            self._left = self._pace.left(progress.seconds, *counts)
+        over = 0 < progress.jobs == progress.jobs_done
         if now >= self._list_at or over:
             self._list_at = now + LIST_EVERY_S
             self._under_way = under_way()
@@ -122,25 +119,22 @@ class LivePage(Page):
 
     def ended(self, row: JobRow) -> None:
         """Count a job, and list it among the last ones."""
-        told = {"name": row.name, "values": self._words(row.values)}
-        if row.error:
-            self._sums["failed"] += 1
-            self._failures.append(told | {"error": row.error})
-        else:
-            self._sums.update(done=1, points=row.points, rays=row.rays)
-            self._ended.append(told | {"points": row.points, "seconds": row.seconds})
+        told = {name: getattr(row, name) for name in ("name", "error", "points", "seconds")}
+        told["values"] = self._words(row.values)
+        (self._ended if row.done else self._failures).append(told)
+        ended = "done" if row.done else "failed"
+        self._sums.update({ended: 1, "points": row.points, "rays": row.rays})
         self._charts.add(row)
 
     def look(self, row: JobRow, points: JobPoints) -> None:
         """Read points of a job, if a browser shows them and there is time for it."""
-        watched = time.monotonic() - self._looked_for <= WATCHED_S and self._looking.due
+        watched = time.monotonic() - self._looked_for <= WATCHED_S and self._reading.due
         if self._count > 1 and self._jobs and not watched:
             return
-        with self._looking.taken(LOOK_EVERY_S):
-            title = f"job {row.name} - lidarpool" if self._count > 1 else self._title
-            job = self._jobs.get(row.number) or LiveJob(points, title, row.name)
+        with self._reading.taken(LOOK_EVERY_S):
+            job = self._jobs.get(row.number) or LiveJob(points, row.name)
             job.read_all()
-            if job.cloud is not None:
+            if len(job.cloud):
                 jobs = self._jobs | {row.number: job}
                 self._jobs = {number: jobs[number] for number in [*jobs][-VIEWS_KEPT:]}
 
@@ -151,9 +145,8 @@ class LivePage(Page):
         if self._progress is not None:
             points = self._progress.points if result is None else len(result.points)
             self._progress = replace(self._progress, seconds=seconds, points=points)
-        self._under_way, self._busy, self._rate, self._left = (), {}, "", ""
+        self._under_way, self._busy, self._left = (), {}, ""
         self._state, self._over = "done", True
-        self._charts.finish()
 
     def stay(self, cloud: Path | None = None) -> None:
         """Keep the page until Ctrl-C or its button.
@@ -163,9 +156,7 @@ class LivePage(Page):
         if cloud is not None:
             self._jobs[0].show_file(cloud)
         click.echo(f"the live page stays at {self.page.url}; Ctrl-C ends it", err=True)
-        with suppress(KeyboardInterrupt):
-            while not self.stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
-                pass
+        wait_for_interrupt(self.stopped)
 
     # -- the page's side -----------------------------------------------------------------
 
@@ -174,47 +165,49 @@ class LivePage(Page):
         if what == "jobs":
             if asked.get("newest"):
                 self._looked_for = time.monotonic()
-            return self._run() | self._list(), {}
+            return self._news(), {}
         if what == "charts":
-            return {"svg": self._charts.drawn()}, {}
+            return {"svg": self._charts.drawn(self._over)}, {}
         found = re.fullmatch(r"(?:job/(\d+)/)?(\w+)", what)
         if found is None:
             raise KeyError(what)
         number, question = int(found[1] or 0), found[2]
         if self._count > 1:
-            with self._looking.taken():
+            with self._reading.taken():
                 return self._jobs[number].view.answer(question, asked, abandoned)
-        if number not in self._jobs and question == "state":
-            return self._run() | self._list(), {}  # until it has begun
+        if question == "state" and number not in self._jobs:  # it has not begun
+            return self._news(), {}
         return self._of_only(self._jobs[number], question, asked, abandoned)
 
     def _of_only(self, job: LiveJob, question: str, *asked: Any) -> Answer:
         """Answer a question of the viewer of the only job, which is shown while it goes on."""
-        points = {"points": 0 if self._progress is None else self._progress.points}
+        points = {"points": (self._progress and self._progress.points) or self._sums["points"]}
         if question == "news":
             if self._reading.due and not self._over:
                 with self._reading.taken():
                     job.gather()
             header, arrays = job.news()
-            return self._run() | header | points, arrays
+            return self._news() | header | points, arrays
         header, arrays = job.view.answer(question, *asked)
         if question == "state":
-            sampled = not isinstance(job.view.points, CloudFile)
-            header |= {"live": True, "sampled": sampled} | points
+            header |= {"live": True, "sampled": not isinstance(job.view.points, CloudFile)} | points
         return header, arrays
 
-    def _run(self) -> dict[str, Any]:
-        """Return what the list and the viewer of the only job tell of the run."""
-        progress, state = self._progress, self._state
+    def _news(self) -> dict[str, Any]:
+        progress, under_way, jobs = self._progress, self._under_way, self._jobs
+        state, newest = self._state, next(reversed(jobs), None)
         if not self._over:
             if self.stopped.is_set():
                 state = "stopping"
             elif progress is not None:
                 state = standing_still(progress) or state
-        return {
+        return dict(self._sums) | {
+            "title": self._title,
+            "names": list(self._names),
             "state": state,
             "over": self._over,
-            "stopping": self.stopped.is_set(),
+            "count": self._count,
+            "time": "" if progress is None else time_in_words(progress.seconds),
             "seconds": None if progress is None else progress.seconds,
             "rate": self._rate,
             "left": self._left,
@@ -224,31 +217,14 @@ class LivePage(Page):
                 if progress is not None and getattr(progress, total)
             ],
             "slots": [[f"{name}, slots busy", *slots] for name, slots in self._busy.items()],
-        }
-
-    def _list(self) -> dict[str, Any]:
-        under_way, jobs = self._under_way, self._jobs
-        newest, writing = next(reversed(jobs), None), sum(job.writing for job in under_way)
-        return dict(self._sums) | {
-            "title": self._title,
-            "names": list(self._names),
-            "count": self._count,
-            "casting": len(under_way) - writing,
-            "writing": writing,
+            "busy": len(under_way),
             "under_way": [
-                {
-                    "name": job.name,
-                    "values": self._words(job.values),
-                    "points": job.points,
-                    "seconds": job.seconds,
-                    "share": 1.0 if job.writing else job.stored / max(job.scans, 1),
-                    "writing": job.writing,
-                }
+                vars(job) | {"values": self._words(job.values)}
                 for job in under_way[:UNDER_WAY_MOST]
             ],
             "failures": [*reversed(list(self._failures))],
             "ended": [*reversed(list(self._ended))],
-            "charts": self._charts.version,
+            "charts": self._charts.version(self._over),
             "newest": None if newest is None else [newest, jobs[newest].name],
         }
 
@@ -294,50 +270,34 @@ class Charts:
 
     def __init__(self, names: Sequence[str], count: int) -> None:
         self._figures, self._count = Figures(names), count
-        self._rows: deque[JobRow] = deque()  # that are not counted: the run waits for no drawing
-        self._lock = threading.Lock()
+        self._lock, self._drawing = threading.Lock(), threading.Lock()
         self._share = Share(DRAWING_SHARE)
-        self._drawn, self._svg, self._finished = 0, "", False
+        self._drawn, self._svg = 0, ""
 
     def add(self, row: JobRow) -> None:
         """Count a job."""
-        self._rows.append(row)
-        if self._lock.acquire(blocking=False):
-            try:
-                self._take()
-            finally:
-                self._lock.release()
-
-    def _take(self) -> None:
-        while self._rows:
-            self._figures.add(self._rows.popleft())
-
-    def finish(self) -> None:
-        """Let all jobs be drawn."""
-        self._finished = True
-
-    @property
-    def version(self) -> int:
-        """Number of jobs that `drawn` draws, or has drawn if it is not yet time to draw again."""
-        jobs, is_due = self._figures.jobs, self._share.due and self._figures.done
-        return jobs if self._finished or (is_due and jobs < self._count) else self._drawn
-
-    def drawn(self) -> str:
-        """Draw them, if it is time, as elements of HTML."""
         with self._lock:
-            self._take()
-            if self.version != self._drawn:
-                self._drawn = self._figures.jobs
+            self._figures.add(row)
+
+    def version(self, over: bool) -> int:
+        """Return how many jobs `drawn` draws, or has drawn if it is not yet time to do it again."""
+        jobs, is_due = self._figures.jobs, self._share.due and self._figures.done
+        return jobs if over or (is_due and jobs < self._count) else self._drawn
+
+    def drawn(self, over: bool) -> str:
+        """Draw them, if it is time, as elements of HTML."""
+        with self._drawing:
+            if self.version(over) != self._drawn:
+                with self._lock:  # shortly: the run waits for no drawing
+                    figures = deepcopy(self._figures)
+                self._drawn = figures.jobs
                 with self._share.taken(), suppress(LidarpoolError):
-                    self._svg = _drawn(self._figures, self._finished)
+                    pages = [draw_varied(figures)]
+                    if over or pages[0] is None:
+                        pages.append(draw_results(figures))
+                    drawn = (f"<figure>{page.svg()}</figure>" for page in pages if page is not None)
+                    self._svg = "".join(drawn)
             return self._svg
-
-
-def _drawn(figures: Figures, complete: bool) -> str:
-    pages = [draw_varied(figures)]
-    if complete or pages[0] is None:
-        pages.append(draw_results(figures))
-    return "".join(f"<figure>{page.svg()}</figure>" for page in pages if page is not None)
 
 
 @contextmanager
@@ -350,7 +310,7 @@ def live_page(
     browser: bool = True,
 ) -> Iterator[LivePage]:
     """Serve the page of a run while the body runs; see `announced`."""
-    live, index = LivePage(jobs, names, title), VIEWER if jobs == 1 else LIST
+    live, index = LivePage(jobs, names, title), VIEWER if jobs == 1 else "jobs.html"
     with (
         page_server(live.answer, port, live.stopped.set, index=index) as live.page,
         announced(live.page, f"live page: {live.page.url}", browser),

@@ -62,12 +62,6 @@ class HeldPoints:
         return 0, len(self)
 
 
-def no_points(table: Sequence[Column]) -> HeldPoints:
-    """Stand for the points before there are any."""
-    columns = {column.name: np.empty(0, column.dtype) for column in table}
-    return HeldPoints(Cloud(np.empty((0, 3)), columns, own=tuple(table)))
-
-
 @dataclass(frozen=True)
 class Filter:
     """Filter: points whose columns are within limits, (column, lowest, highest) each."""

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
+from threading import Event
 
 import click
 
@@ -18,25 +18,9 @@ from ..pipeline.database import FILE
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.store import RUN_FOLDER
 from .server import PORT, PageServer, announced, page_server
-from .view import IN_SENSOR_AXES, View
+from .view import View
 
 CLOUD = "cloud.ply"
-
-
-def result_view(
-    file: CloudFile,
-    pictured: Pictured | None = None,
-    sweeps: Sweeps | None = None,
-    note: str = "",
-    title: str = "lidarpool",
-) -> View:
-    """Return what a page shows of a result, with what is known of it beside its points.
-
-    Points in the axes of their sensors do not fit the scene, which is left out then.
-    """
-    if sweeps is not None and sweeps.coordinates != "world":
-        pictured, note = None, note or IN_SENSOR_AXES
-    return View(title, file, pictured, sweeps, note=note)
 
 
 @contextmanager
@@ -49,11 +33,12 @@ def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterat
             yield page
 
 
-def wait_for_interrupt() -> None:
-    """Keep a page open until Ctrl-C."""
+def wait_for_interrupt(stopped: Event | None = None) -> None:
+    """Keep a page open until Ctrl-C, or until its user has stopped it."""
+    stopped = stopped or Event()
     with suppress(KeyboardInterrupt):
-        while True:
-            time.sleep(1.0)
+        while not stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+            pass
 
 
 def view_result(path: Path, *, port: int, browser: bool = True) -> None:
@@ -72,7 +57,7 @@ def open_result(path: Path) -> View:
     """
     title = f"{path.resolve().name} - lidarpool"
     if not path.is_dir():
-        return result_view(CloudFile(path), title=title)
+        return View(CloudFile(path), title=title)
     cloud, scene, beside = path / CLOUD, path / PICTURE_FILE, path / SWEEPS_FILE
     if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
         raise LidarpoolError(
@@ -90,4 +75,4 @@ def open_result(path: Path) -> View:
     except LidarpoolError as error:
         note = f"The cloud is shown without all that belongs to it. {error}"
     file = CloudFile(cloud, pictured.own if pictured else ())
-    return result_view(file, pictured, sweeps, note, title)
+    return View(file, pictured, sweeps, note, title)

@@ -7,7 +7,7 @@ import numpy as np
 from ..base.arrays import AnyArray, Floats, Floats32, Ints
 from ..columns.table import OBJECT
 from ..render.colouring import colours_of
-from ..render.hits import hit_colours
+from ..render.hits import HITS_TITLE, hit_colours
 from ..render.surface import apart
 from ..render.theme import mapped
 from ..scene.drawn import simplified
@@ -16,7 +16,6 @@ from .legend import Legend, as_bytes, legend_of, scale_legend
 
 MOST_TRIANGLES = 300_000  # 50 bytes each, whenever their colours have changed
 MOST_PIECES = 60_000  # that large ones are divided into, where hits are shown
-TITLE = "hits per square metre; grey: none"
 _INWARDS = 1e-4  # of the scene's diagonal
 _MOST_INWARDS_OF = 200.0  # metres: some centimetres are enough for any scene
 
@@ -86,7 +85,7 @@ class Surface:
         arrays: dict[str, AnyArray] = {
             "corners": corners, "objects": self._objects[owner], "colours": as_bytes(colours),
         }  # fmt: skip
-        return arrays, scale_legend(TITLE, marks) if hits.any() else None
+        return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
 
 
 def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:

@@ -21,7 +21,7 @@ from ..export.sweeps import Sweeps
 from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb, word_of
 from ..render.theme import mapped, object_colours
-from ..run.picture_file import Pictured, SensorWay, ways_of
+from ..run.picture_file import PLACES_MOST, Pictured, SensorWay, ways_of
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..sensor.trajectory import presence_ns
 from .legend import Legend, as_bytes, legend_of
@@ -29,15 +29,11 @@ from .points import Eye, Filter, PointFinder, Points, Scans, corners_of, positio
 from .server import Answer, Arguments
 from .surface import Surface, colours_for
 
-Bounds = tuple[Floats, Floats]  # the local origin, (3,), and a box (2, 3) from there
-
 MOST_POINTS = 20_000_000  # in an answer
 MOST_RAYS = 150  # more rays would hide the surfaces
 _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
 _MOST_NAMES = 2000  # in a menu
-_ACTOR_PLACES = 1000
-_PLACES = 1000  # of a sensor that a picture of all holds
 _IMAGE_WIDTH, _IMAGE_ROWS = 1024, 128  # most columns; rows of sensors with few or many channels
 _NO_GAPS = 0.9  # columns of a range image, as a share of a sensor's steps of azimuth
 _FEW, _MANY = 4, 512
@@ -49,15 +45,18 @@ IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does n
 
 @dataclass(eq=False)
 class View:
-    """A survey on a page, or a cloud alone."""
+    """A survey on a page, or a cloud alone.
 
-    title: str
+    The scene is left out of a result whose points are in the axes of their sensors.
+    """
+
     points: Points
     pictured: Pictured | None = None
     sweeps: Sweeps | None = None
+    note: str = ""  # a remark on what is shown
+    title: str = "lidarpool"
     # Returns those of each triangle, those of actors after the others; by default as pictured.
     hits: Callable[[], AnyArray] | None = None
-    note: str = ""  # a remark on what is shown
 
     def __post_init__(self) -> None:
         self.version = 0  # of the points
@@ -66,7 +65,11 @@ class View:
         if (pictured := self.pictured) is not None:
             self.rays = pictured.sample_rays
             self.path = None if pictured.plan is None else pictured.plan.path
-        self.origin, self._bounds = self._around()
+            if pictured.coordinates != "world":
+                self.note = self.note or IN_SENSOR_AXES
+        if self.sweeps is not None and self.sweeps.coordinates != "world":
+            self.pictured, self.note = None, self.note or IN_SENSOR_AXES
+        self.origin, self._bounds, self._held = self._around()
         rest = {column.name: column for column in self.points.table if column not in POSITION}
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
         self._coloured = with_rgb(self.columns)
@@ -124,21 +127,22 @@ class View:
             return (*self.sweeps.objects, *self.sweeps.actors)
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
-    def _around(self) -> Bounds:
-        """Local origin and the box of all that is shown."""
-        if self.pictured is None:
-            return _of_points(self.points)
-        scene, ways = self.pictured.scene, self.pictured.sensors
-        places = np.concatenate([scene.bounds, *(way.positions for way in ways)])
-        low, high = places.min(axis=0), places.max(axis=0)
-        places = np.concatenate([[low, high], self._ends(low[2])])
-        return scene.origin, np.stack([places.min(axis=0), places.max(axis=0)])
+    def _around(self) -> tuple[Floats, Floats, Floats]:
+        """Local origin, box of all that is shown, and what a picture of all has to hold, (k, 3).
 
-    def _ends(self, level: float) -> Floats:
-        """Start and target of the planning (2, 3), if there is any, at a height."""
-        planning = None if self.pictured is None else self.pictured.planning
-        ends = [] if planning is None else [planning.start, planning.target]
-        return np.array([[*end, level] for end in ends]).reshape(-1, 3)
+        That is corners of the scene, sensors, and both ends of the planning. The box of these is
+        larger: around an object it would be mostly empty.
+        """
+        if self.pictured is None:
+            origin, box = _of_points(self.points)
+            return origin, box, corners_of(box)
+        scene, planning = self.pictured.scene, self.pictured.planning
+        ways = [way.positions for way in self.pictured.sensors]
+        held = np.concatenate([corners_of(scene.bounds), *ways])
+        if planning is not None:
+            level = held[:, 2].min()
+            held = np.vstack([held, [*planning.start, level], [*planning.target, level]])
+        return scene.origin, np.stack([held.min(axis=0), held.max(axis=0)]), held
 
     # -- answers -------------------------------------------------------------------------
 
@@ -158,7 +162,8 @@ class View:
         """Tell all but points and surfaces."""
         near = around_ways(self._bounds, ways_of(self.sensors, self._actors, self._duration_ns))
         box = self._bounds if near is None else near
-        arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": self._corners(near)}
+        corners = self._held if near is None else corners_of(near)
+        arrays: dict[str, AnyArray] = {"rays": self.rays_shown, "corners": corners}
         for number, way in enumerate(self.sensors):
             arrays[f"sensor{number}_times"] = way.times_ns / _NS
             arrays[f"sensor{number}_places"] = way.positions
@@ -168,9 +173,12 @@ class View:
             arrays[f"mesh{number}_corners"] = mesh.vertices[mesh.faces].astype(np.float32)
             if mesh.colours is not None:  # at the corners
                 arrays[f"mesh{number}_colours"] = mesh.colours.means().repeat(3, axis=0)
-        each = samples_each(self._actors, _ACTOR_PLACES)
+        each = samples_each(self._actors, PLACES_MOST)
         for number, actor in enumerate(self._actors):
-            arrays |= _actor_arrays(f"actor{number}", actor, self._duration_ns, each)
+            times, places, turns = actor.samples(self._duration_ns, each)
+            arrays[f"actor{number}_times"] = times / _NS
+            arrays |= {f"actor{number}_places": places, f"actor{number}_turns": turns}
+            arrays[f"actor{number}_there"] = np.array(presence_ns(actor.trajectory)) / _NS
         if self.sweeps is not None:
             arrays["sweep_scans"] = self.sweeps.scans.astype(np.float64)
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
@@ -203,19 +211,6 @@ class View:
             "note": self.note,
         }  # fmt: skip
         return header, arrays
-
-    def _corners(self, near: Floats | None) -> Floats:
-        """Corners of the scene or of the part that is looked at, then sensors, (k, 3), local.
-
-        A picture of all has to hold them. The box of scene and sensors is larger: around an object
-        it would be mostly empty.
-        """
-        pictured = self.pictured
-        if near is not None or pictured is None:
-            return corners_of(self._bounds if near is None else near)
-        corners = [corners_of(pictured.scene.bounds)]
-        corners += [way.positions[:: len(way.positions) // _PLACES + 1] for way in self.sensors]
-        return np.concatenate([*corners, self._ends(self._bounds[0, 2])])
 
     @property
     def rays_shown(self) -> Floats32:
@@ -404,7 +399,7 @@ def range_image(
     return image
 
 
-def _of_points(points: Points) -> Bounds:
+def _of_points(points: Points) -> tuple[Floats, Floats]:
     """Origin in whole metres near the points, and their box without a few outliers."""
     places = positions(points, PointFinder(points, np.zeros(3)).find(_SAMPLE)[0])
     if not len(places):
@@ -412,17 +407,6 @@ def _of_points(points: Points) -> Bounds:
     box = np.percentile(places, [0.5, 99.5], axis=0)
     origin = np.where(np.abs(box[0]) > 10_000, np.round(box[0]), 0.0)
     return origin, box - origin
-
-
-def _actor_arrays(name: str, actor: Actor, duration_ns: float, count: int) -> dict[str, AnyArray]:
-    """Poses of an actor over time."""
-    times, places, turns = actor.samples(duration_ns, count)
-    return {
-        f"{name}_times": times / _NS,
-        f"{name}_places": places,
-        f"{name}_turns": turns,
-        f"{name}_there": np.array(presence_ns(actor.trajectory)) / _NS,
-    }
 
 
 def _scans(text: str) -> Scans:

@@ -440,6 +440,12 @@ def parts_folder(mark: str) -> str:
     return f"run-{mark}"
 
 
+def mark_of_folder(name: str) -> str:
+    """Mark of the run whose `parts_folder` has a name; empty for any other name."""
+    found = re.fullmatch("run-([0-9a-f]{16})", name)
+    return found[1] if found else ""
+
+
 def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:
     """Mark and place of parts of a database's values; ValueError if they are not of a run."""
     mark, place = meta["mark"], meta.get("parts", "")

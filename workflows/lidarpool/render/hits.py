@@ -13,6 +13,7 @@ from ..scene.scene import Scene
 from .colouring import TURBO
 from .theme import UNSEEN, rgb
 
+HITS_TITLE = "hits per square metre; grey: none"  # of the scale
 _LEVELS = 24  # of a grid whose cells are half as wide each time
 _ENOUGH = 12  # hits from which a density is estimated; points in a cell of the grid
 _MOST_ROUNDS = 12

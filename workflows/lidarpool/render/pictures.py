@@ -16,7 +16,7 @@ from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of, values_of
-from .hits import hit_colours
+from .hits import HITS_TITLE, hit_colours
 from .page import LEGEND_ROWS, Page, whole_of, without_common_prefix
 from .shot import Shot
 
@@ -89,7 +89,7 @@ def draw_hits(
     most = min(len(sample_rays), MOST_OF_MOVING if shot.paths else MOST_RAYS)
     rays = np.linspace(0, len(sample_rays) - 1, most).astype(int)
     page.lines(axes, shot, sample_rays[rays].astype(np.float64), 0.45, 0.5)
-    page.colour_bar(TURBO, LogNorm(*limits), "hits per square metre; grey: none")
+    page.colour_bar(TURBO, LogNorm(*limits), HITS_TITLE)
     page.title("Hits", f"{counted(round(hit_counts.sum()), 'hit')} · {shot.when}", shot.models)
     return page
 

@@ -125,6 +125,9 @@ class Figures:
         for row in jobs:
             self.add(row)
 
+    def __getstate__(self) -> dict[str, Any]:
+        return self.__dict__ | {"_digest": None}  # a copy, as for charts, has no digest
+
     def add(self, row: JobRow) -> None:
         """Count one more job."""
         self.jobs += 1

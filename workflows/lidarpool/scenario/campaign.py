@@ -30,7 +30,7 @@ from .draws import Draw
 from .job import Job, job_of
 from .paths import FieldPath, find_field, held, put
 from .scenario import Scenario
-from .sections import PoolSection
+from .sections import PoolSection, file_states
 from .static_scene import SceneCache
 from .tables import Row, read_rows
 from .validation_errors import validation_errors
@@ -661,10 +661,9 @@ def hashes(files: Iterable[Path]) -> list[tuple[str, str]]:
     Files that mesh files refer to (images, buffers) are not read.
     """
     found = set()
-    for path in files:
-        with suppress(OSError, ValueError):  # which the reader of the file tells
-            state = path.stat()
-            found.add((path.name, _hash(path, state.st_mtime_ns, state.st_size)))
+    for state in file_states(files):
+        with suppress(OSError):
+            found.add((state[0].name, _hash(*state)))
     return sorted(found)
 
 

@@ -50,7 +50,8 @@ class CarriedSection(SensorSection):
 
     def sensor(self, folder: Path) -> Sensor:
         """Make the sensor, which starts at its own time; errors as of `SensorSection`."""
-        return replace(super().sensor(folder), start_ns=self.start_s * 1e9)
+        made = super().sensor(folder)
+        return replace(made, start_ns=self.start_s * 1e9) if self.start_s else made
 
 
 class TimedPose(PoseSection):

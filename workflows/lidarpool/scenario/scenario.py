@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
@@ -275,11 +276,7 @@ class Scenario(Section):
         for section in (self.sensor, *self.sensors.values()):
             files += [section.calibration]
             files += [section.model] if section.has_own_model else []
-        out = []
-        for file in dict.fromkeys(file for file in files if file):
-            with suppress(LidarpoolError):  # of a user who is not known
-                out.append(self.path(file))
-        return tuple(out)
+        return self.paths(file for file in files if file)
 
     @property
     def folder(self) -> Path:
@@ -297,6 +294,14 @@ class Scenario(Section):
             return self._folder / Path(file).expanduser()
         except RuntimeError as error:
             raise LidarpoolError(f"the file {file!r} cannot be found: {error}") from error
+
+    def paths(self, files: Iterable[str]) -> tuple[Path, ...]:
+        """Paths of files, each once, without those of users who are not known."""
+        out = []
+        for file in dict.fromkeys(files):
+            with suppress(LidarpoolError):
+                out.append(self.path(file))
+        return tuple(out)
 
     @property
     def links(self) -> set[str]:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -388,32 +391,30 @@ class SensorSection(Section):
         """Whether its model is a file of the user's."""
         return self.model is not None and self.model.endswith((".yaml", ".yml"))
 
+    def _found(self, folder: Path) -> str | Path | None:
+        """Return its model, a user's file from a folder."""
+        if self.model is None or not self.has_own_model:
+            return self.model
+        return folder / Path(self.model).expanduser()
+
     def sensor(self, folder: Path) -> Sensor:
-        """Return the lidar, its files from a folder; LidarpoolError if they cannot be used."""
-        given = {
+        """Return the lidar, its files from a folder; LidarpoolError if they cannot be used.
+
+        Equal sections have the same one, unless their files have changed.
+        """
+        limits = {
             name: value
             for name in ("rate_hz", "min_range_m", "max_range_m")
             if (value := getattr(self, name)) is not None
         }
         if self.model is None and self.calibration is None:
             azimuths = self.columns or self.rays_per_revolution
-            fov = self.vertical_fov_deg
-            return Sensor.grid(azimuths, self.layers, fov, self.step_deg, **given)
+            return _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
         model = self._found(folder)
-        unit = self.calibration
-        return load_sensor(
-            model,
-            calibration=None if unit is None else folder / Path(unit).expanduser(),
-            columns=self.columns,
-            step_deg=self.step_deg,
-            **given,
-        )
-
-    def _found(self, folder: Path) -> str | None:
-        """Its model, a user's file from a folder."""
-        if self.model is None or not self.has_own_model:
-            return self.model
-        return str(folder / Path(self.model).expanduser())
+        unit = None if self.calibration is None else folder / Path(self.calibration).expanduser()
+        states = file_states(file for file in (model, unit) if isinstance(file, Path))
+        given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}
+        return _loaded(states, model=model, **given, **limits)
 
     def mounted(
         self,
@@ -438,6 +439,24 @@ class SensorSection(Section):
             given = {field: getattr(section, field) for field in section.model_fields_set}
             own[part] = replace(own[part], **given)
         return replace(carried, **own)
+
+
+def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
+    """Return times and sizes of files that are there: others once a file has changed."""
+    states = []
+    for path in files:
+        with suppress(OSError, ValueError):  # which reading the file reports
+            found = path.stat()
+            states.append((path, found.st_mtime_ns, found.st_size))
+    return tuple(states)
+
+
+_grid = lru_cache(Sensor.grid)
+
+
+@lru_cache
+def _loaded(_: object, **given: Any) -> Sensor:
+    return load_sensor(**given)
 
 
 _GRID = {  # {field of a grid: its default}

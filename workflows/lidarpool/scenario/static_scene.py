@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from contextlib import suppress
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any, NamedTuple
@@ -10,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.errors import LidarpoolError, Mistakes, prefixed
+from ..base.errors import Mistakes, prefixed
 from ..base.words import counted
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.instances import Instance
@@ -21,7 +20,7 @@ from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
 from .copies import copies_of
 from .scenario import Scenario
-from .sections import MeshFile, SceneSection, ShapeSection
+from .sections import MeshFile, SceneSection, ShapeSection, file_states
 from .standing import Standing
 
 
@@ -66,16 +65,12 @@ class SceneCache:
 def _key(scenario: Scenario) -> object:
     """Return what a static scene is made of: equal for scenarios that may share it."""
     section = scenario.scene
-    names = [entry.file for entry in section.files]
+    names: list[str] = [entry.file for entry in section.files]
     for copies in section.copies:
         names += [one.file for one in (copies.file, copies.table) if one is not None]
-    states = []
-    for name in names:
-        with suppress(OSError, LidarpoolError):  # which reading the file reports
-            found = scenario.path(name).stat()
-            states.append((name, found.st_mtime_ns, found.st_size))
-    read_by = str(scenario.folder), scenario.coloured, scenario.cloud.epsg
-    return section.model_dump_json(), *read_by, tuple(states)
+    states = file_states(scenario.paths(names))
+    read_by = scenario.folder, scenario.coloured, scenario.cloud.epsg
+    return section.model_dump_json(), *read_by, states
 
 
 def read_static_scene(scenario: Scenario) -> StaticScene:

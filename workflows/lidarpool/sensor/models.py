@@ -239,6 +239,7 @@ class SensorModel(_Part):
         return self.firings_per_turn if columns is None else columns, rate
 
 
+@cache
 def model_names() -> tuple[str, ...]:
     """Names of the models that come with the package, in order."""
     return tuple(sorted(

@@ -8,7 +8,6 @@ const SETTLED_MS = 1500; // after its page is loaded, the viewer of a job has dr
 
 const $ = (id) => document.getElementById(id);
 const whole = (value) => Math.round(value).toLocaleString("en");
-const several = (value, what) => `${whole(value)} ${what}${value === 1 ? "" : "s"}`;
 
 // 12,345 up to six digits, then 1.23 M
 function short(value) {
@@ -20,27 +19,19 @@ function short(value) {
 
 const inSeconds = (value) => `${value >= 100 ? whole(value) : value.toPrecision(2)} s`;
 
-function duration(seconds) {
-  if (seconds < 100) return `${whole(seconds)} s`;
-  const minutes = Math.round(seconds / 60);
-  return minutes < 100 ? `${minutes} min` : `${whole(Math.floor(minutes / 60))} h ${String(minutes % 60).padStart(2, "0")} min`;
-}
-
 // -- the run -----------------------------------------------------------------------------
 
 function showRun(told) {
   document.title = `${told.over ? "" : `${Math.floor((100 * (told.done + told.failed)) / told.count)}% `}${told.title} - lidarpool`;
   $("title").textContent = told.title;
   $("state").textContent = told.state;
-  $("count").replaceChildren(element("b", { textContent: whole(told.done) }), ` of ${several(told.count, "job")} done`);
-  const busy = told.casting + told.writing;
-  $("bar").replaceChildren(...[["done", told.done], ["failed", told.failed], ["busy", busy]].map(
+  $("count").replaceChildren(element("b", { textContent: whole(told.done) }), ` of ${whole(told.count)} jobs done`);
+  $("bar").replaceChildren(...[["done", told.done], ["failed", told.failed], ["busy", told.busy]].map(
     ([className, jobs]) => element("i", { className, style: { width: `${(100 * jobs) / told.count}%` } }),
   ));
   const entries = [
-    ["failed", whole(told.failed), "failed", told.failed > 0], ["under way", told.over ? "" : whole(busy), "busy"],
-    ["rate", told.rate], ["left", told.left], ["time", told.seconds ? duration(told.seconds) : ""],
-    ["points", short(told.points)], ["rays", short(told.rays)],
+    ["failed", whole(told.failed), "failed", told.failed > 0], ["under way", told.over ? "" : whole(told.busy), "busy"],
+    ["rate", told.rate], ["left", told.left], ["time", told.time], ["points", short(told.points)], ["rays", short(told.rays)],
   ];
   $("figures").replaceChildren(...entries.filter(([, value]) => value !== "").map(([name, value, className, bad]) => {
     const mark = className ? [element("i", { className })] : [];
@@ -67,10 +58,9 @@ function showJobs(told) {
   const line = (job, state, points, seconds) => element(
     "tr", {}, cell(job.name), state, cell(points), cell(seconds), ...job.values.map((value) => cell(value)),
   );
-  const busy = told.casting + told.writing;
   const underWay = told.under_way.map((job) => {
     const state = cell(job.writing ? "writing" : "casting", "text");
-    state.append(meter(job.share));
+    state.append(meter(job.writing ? 1 : job.stored / Math.max(job.scans, 1)));
     return line(job, state, whole(job.points), inSeconds(job.seconds));
   });
   const failed = told.failures.flatMap((job, k) => {
@@ -82,7 +72,7 @@ function showJobs(told) {
   const ended = told.ended.map((job) => line(job, cell("done", "text"), whole(job.points), inSeconds(job.seconds)));
   const last = (jobs, listed) => (jobs > listed ? `the last ${listed} of ${whole(jobs)}` : whole(jobs));
   const bodies = [
-    ...group("Under way", busy > underWay.length ? `the first ${underWay.length} of ${whole(busy)}` : whole(busy), width, underWay),
+    ...group("Under way", told.busy > underWay.length ? `the first ${underWay.length} of ${whole(told.busy)}` : whole(told.busy), width, underWay),
     ...group("Failed", last(told.failed, told.failures.length), width, failed),
     ...group("Done", last(told.done, told.ended.length), width, ended),
   ];

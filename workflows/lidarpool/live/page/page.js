@@ -2,7 +2,7 @@
 import { ask } from "./ask.js";
 import { button, dual, element, iconButton, legend, menu, number, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
-import { count, follow, pause, replace, stop } from "./run.js";
+import { count, follow, replace, stop } from "./run.js";
 
 const FIRST_LOOK = 200_000; // points that are asked for first
 const REST_MS = 250; // for which the camera stands still before points are asked for
@@ -199,7 +199,7 @@ function showSweeps(asked, key) {
 
 // -- the panel ---------------------------------------------------------------------------
 
-const panel = {};
+const panel = { progress: element("div", { id: "progress" }) };
 
 const onlyObject = (name) => {
   const limits = chosen.filter.find(([column]) => column === name);
@@ -291,7 +291,6 @@ function later(act, ms = 120) {
 function buildPanel() {
   const columns = state.columns.map((column) => column.name);
   panel.facts = element("div", { id: "facts" });
-  panel.progress = element("div", { id: "progress" });
   const head = element(
     "header", {}, element("h1", { textContent: document.title, title: document.title }),
     iconButton("link", "Copy the link to this view", copyLink),
@@ -745,18 +744,10 @@ async function news(told) {
 }
 
 function tellRun(told) {
-  const left = told.left && `${told.left} left`, since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
-  const pace = told.rate && `, ${told.rate}  ${left}`;
+  const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
+  const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
   const head = element("div", {}, element("b", { textContent: told.state }), since, pace);
   replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(count));
-}
-
-function followRun() {
-  panel.progress.after(element("div", { id: "stop" }, stop));
-  follow("news", () => ({}), NEWS_MS, news).catch((error) => {
-    failed(error);
-    panel.progress.replaceChildren(); // it goes on no more
-  });
 }
 
 function keys(event) {
@@ -790,12 +781,14 @@ function mouse() {
 
 async function begin() {
   document.documentElement.classList.toggle("plain", new URLSearchParams(location.search).has("plain"));
+  const told = await follow("state", () => ({}), NEWS_MS, (it) => {
+    if (it.columns) return true;
+    $("panel").replaceChildren(panel.progress, stop); // its only job has not begun
+    tellRun(it);
+    say(it.failures[0]?.error ?? "", true);
+    return false;
+  });
   say("Reading …");
-  let told;
-  while (!(told = await ask("state")).columns) { // a run whose only job has not begun
-    say(told.failures[0]?.error ?? told.state);
-    await pause(NEWS_MS);
-  }
   picture.resize();
   picture.frame(told.box, told.arrays.corners, told.bounds); // the size of sensors depends on it
   takeState(told);
@@ -824,7 +817,13 @@ async function begin() {
     requestAnimationFrame(frame);
   };
   requestAnimationFrame(frame);
-  if (state.live) followRun();
+  if (state.live) {
+    panel.progress.after(stop);
+    follow("news", () => ({}), NEWS_MS, news).catch((error) => {
+      failed(error);
+      panel.progress.replaceChildren(); // it goes on no more
+    });
+  }
   refresh();
   showImages();
   await loadSurface();

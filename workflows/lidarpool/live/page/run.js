@@ -5,10 +5,7 @@ import { element } from "./controls.js";
 export const stop = element("button", { type: "button", className: "stop", textContent: "Stop" });
 stop.onclick = () => fetch("stop", { method: "POST" });
 
-export const pause = (ms) => new Promise((done) => setTimeout(done, document.hidden ? 4 * ms : ms));
-
 export const meter = (share) => element("span", { className: "meter" }, element("b", { style: { width: `${100 * share}%` } }));
-
 export const count = ([label, done, whole]) => element(
   "div", { className: "count" }, element("span", { textContent: label }),
   element("span", { textContent: `${done.toLocaleString("en")} / ${whole.toLocaleString("en")}` }), meter(whole ? done / whole : 0),
@@ -20,14 +17,15 @@ export function replace(box, ...children) {
   if (made.innerHTML !== box.innerHTML) box.replaceChildren(...made.childNodes);
 }
 
-// Asks again and again, until the server has ended.
+// Asks again and again, until the server has ended or `show` returns true, and returns the last answer.
 export async function follow(what, asked, ms, show) {
+  stop.hidden = false;
   try {
     for (;;) {
       const told = await ask(what, asked());
-      stop.textContent = told.over ? "Close" : told.stopping ? "Stopping" : "Stop";
-      await show(told);
-      await pause(ms);
+      stop.textContent = told.over ? "Close" : told.state === "stopping" ? "Stopping" : "Stop";
+      if (await show(told)) return told;
+      await new Promise((done) => setTimeout(done, document.hidden ? 4 * ms : ms));
     }
   } finally {
     stop.hidden = true;
