@@ -227,10 +227,10 @@ def test_returns_go_before_what_the_sensor_states():
 @pytest.mark.parametrize(
     ("make", "says"),
     [
-        (lambda: Returns(divergence_mrad=[1, 2, 3]), "one angle, or two"),
+        (lambda: Returns(divergence_mrad=[1, 2, 3]), "or two such"),
         (lambda: Returns(divergence_mrad=[1, -2]), "it must be 0 to 1000"),
         (lambda: Optics(divergence_mrad="wide"), "divergence_mrad is 'wide'"),
-        (lambda: Returns(beam_profile="round"), "it must be one of even, gaussian"),
+        (lambda: Returns(beam_profile="round"), "it must be 'even' or 'gaussian'"),
         (lambda: Optics(exit_diameter_m=-0.1), "exit_diameter_m is -0.1"),
     ],
 )

@@ -274,7 +274,7 @@ def test_a_section_that_the_base_lacks_is_made(campaign, folder):
     })  # fmt: skip
     made = found.scenario(0)
     assert (made.mount.position, made.scene.ground.height_m) == ((0, 0, 3.5), -1)
-    assert made.poses[0].pose().yaw_deg == 90
+    assert made.poses[0].yaw_deg == 90
 
 
 def test_a_mesh_file_may_be_the_base(campaign):
@@ -441,13 +441,13 @@ WRONG = {
     "no entry": ({"scene.files.3.file": {"choice": ["a"]}}, "has 1 entry, counted from 0, and no"),
     "no list": ({"poses.0.yaw_deg": {"uniform": [1, 2]}}, "the base has no poses"),
     "in a number": ({"steps.x": {"uniform": [1, 2]}}, "steps has no fields of its own"),
-    "low": ({KM: {"uniform": [0, 2]}}, f"{KM} can be 0.0; input should be greater"),
-    "high": ({KM: {"log_uniform": [1, 1e7]}}, "can be 10000000.0; input should be less"),
-    "tail": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "can be -5.0; input should be"),
+    "low": ({KM: {"uniform": [0, 2]}}, f"{KM} can be 0.0; it must be 0.001 to"),
+    "high": ({KM: {"log_uniform": [1, 1e7]}}, "can be 10000000.0; it must be"),
+    "tail": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "can be -5.0; it must be 0 to"),
     "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Give limits."),
     "far": ({KM: {"normal": {"mean": 1, "std": 1, "limits": [9, 10]}}}, "at least 1% of the"),
-    "not whole": ({"steps": {"uniform": [1, 9]}}, "steps can be 1.0; input should be a valid int"),
-    "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m can be 'a'; input should be"),
+    "not whole": ({"steps": {"uniform": [1, 9]}}, "steps can be 1.0; it must be a whole"),
+    "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m can be 'a'; it must be"),
     "model": (
         {"sensors.roof.model": {"choice": ["velodyne/vlp15"]}},
         "Did you mean 'velodyne/vlp16",
@@ -461,9 +461,9 @@ WRONG = {
     "log of 0": ({KM: {"log_uniform": [0, 1]}}, "both above 0"),
     "two kinds": ({KM: {"uniform": [1, 2], "choice": [1]}}, "give one of uniform, log_uniform"),
     "none": ({KM: {}}, "give one of uniform, log_uniform"),
-    "a value": ({KM: 3}, "say how it is chosen"),
+    "a value": ({KM: 3}, "it must be how it is chosen"),
     "misspelt": ({KM: {"unifrom": [1, 2]}}, "Did you mean 'uniform'?"),
-    "no values": ({KM: {"choice": []}}, "give a list of values"),
+    "no values": ({KM: {"choice": []}}, "is []; it must be a list of values"),
     "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "as many weights as"),
     "zeros": ({KM: {"choice": [1, 2], "weights": [0, 0]}}, "must not all be 0"),
     "twice": (
@@ -560,7 +560,7 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
     assert "campaign.yaml: vary, of fog.yaml: sensors of the base has no 'roof'" in str(
         raised.value
     )
-    with pytest.raises(LidarpoolError, match=r"vary, of fog\.yaml: steps can be 0; input should"):
+    with pytest.raises(LidarpoolError, match=r"vary, of fog\.yaml: steps can be 0; it must"):
         campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
 
 

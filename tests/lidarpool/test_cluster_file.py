@@ -67,7 +67,7 @@ WRONG = {
         "not a partition of a survey.*mean 'GPU'",
     ),
     "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
-    "many": (GOOD.replace("workers: 5", "workers: 999999999"), "less than or equal to 10000"),
+    "many": (GOOD.replace("workers: 5", "workers: 999999999"), "it must be 0 to 10000"),
     "a number to adapt to": (GOOD.replace("workers: 5", "adapt: 8"), "partitions.OTHER.adapt is 8"),
     "a swapped range": (
         GOOD.replace("workers: 5", "adapt: [8, 0]"),

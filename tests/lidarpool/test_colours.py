@@ -562,11 +562,11 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
         ({"material": "asphalt, dry", "reflectance": 0.2}, "either material or reflectance"),
         ({"reflectance": "texture", "transparent": "pass"}, "give a number"),
         ({"scale": 2.0}, "give reflectance texture"),
-        ({"reflectance": "textures"}, "it must be a number or one of texture"),
+        ({"reflectance": "textures"}, "it must be 0 to 1, or texture"),
     ):
         with pytest.raises(LidarpoolError, match=why):
             Material("*", **arguments)
-    with pytest.raises(LidarpoolError, match=r"\[0\].reflectance: given is 'white'; it must"):
+    with pytest.raises(LidarpoolError, match=r"\[0\].reflectance is 'white'; it must"):
         Scenario.from_data({"materials": [{"objects": "*", "reflectance": "white"}]})
     wrong = {"objects": "*", "material": "asphalt, dry", "reflectance": 0.2}
     scenario = Scenario.from_data({"materials": [{"objects": "*"}, wrong]})

@@ -224,8 +224,8 @@ WRONG = {
     "neither": ({"name": "A", "at": [[0, 0]]}, "give either file or box."),
     "no place": (TREE, "give one of at, table and scatter."),
     "two": (TREE | {"at": [[0, 0]], "table": "a.csv"}, "give one of at, table and scatter."),
-    "short": (TREE | {"at": [[0]]}, "at least 2 items"),
-    "text": (TREE | {"at": ["here"]}, "given is 'here'"),
+    "short": (TREE | {"at": [[0]]}, "at least 2 entries"),
+    "text": (TREE | {"at": ["here"]}, "is 'here'; it must be"),
     "outside": (
         TREE | {"at": [[0, 0], [99, 1], [99, 2]]},
         "copies[0]: below x 99, y 1 nothing of the scene's files or ground faces up to stand on "
@@ -239,7 +239,7 @@ WRONG = {
         TREE | {"scatter": {"count": 200, "spacing_m": 5}},
         "of 200 found room on * within x -20 to 20, y -10 to 10: take fewer",
     ),
-    "many": (TREE | {"scatter": {"count": 1_000_001}}, "less than or equal to 1000000"),
+    "many": (TREE | {"scatter": {"count": 1_000_001}}, "it must be 1 to 1000000"),
     "no file": (TREE | {"table": "none.csv"}, "none.csv is not a usable table of copies"),
     "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'; it has x, z"),
     "nan": (

@@ -314,11 +314,11 @@ GOOD = "name: A\nsources: {}\n"
 VELODYNE = "num_lasers: 2\nlasers: [{laser_id: 0, vert_correction: 0.1, rot_correction: 0.2}"
 OWN = "name: Own\nsources: {}\n"
 BAD = {
-    "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m: this is not a field"),
+    "field.yaml": (GOOD + "firing_us: 5\nrage_m: [0, 1]", "rage_m is not a field"),
     "light.yaml": (GOOD + "firing_us: 5\noptics: {wavelength_nm: 0.9}", "wavelength_nm.*200"),
     "both.yaml": (GOOD + "firing_us: 5\nfirings_per_turn: 5", "either firing_us or"),
-    "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion: Inp"),
-    "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us: Input should be"),
+    "mirror.yaml": (GOOD + "firing_us: 5\nmirror: {motion: x, width_deg: 9}", "mirror.motion is"),
+    "zero.yaml": (GOOD + "firing_us: 0\nbeams: {elevation_deg: [0]}", "firing_us is .* above 0"),
     "short.yaml": (GOOD + "firing_us: 5\nbeams: {elevation_deg: [0, 1], time_us: [0]}", "Beams"),
     "range.yaml": (GOOD + "firing_us: 5\nrange_m: [80, 1]", "the shortest, then the longest"),
     "optic.yaml": (GOOD + "firing_us: 5\noptics: {wavelenght_nm: 9}", "mean 'wavelength_nm'"),

@@ -78,7 +78,7 @@ def test_an_actor_is_refused_held_or_absent_beyond_its_trajectory():
     for beyond in ("hold", "absent"):
         places, _ = passing(beyond).trajectory.poses(0, times)
         assert places[:, 0].tolist() == pytest.approx([-2, -2, 2])
-    with pytest.raises(LidarpoolError, match="start_s is nan s"):
+    with pytest.raises(LidarpoolError, match="start_s is nan; it must be a finite number"):
         Track([0, 1], [[0, 0, 0], [1, 0, 0]], start_s=np.nan, beyond="absent")
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from distributed import Client
 
-from ..base.arguments import checked
 from ..base.declared import declared
 from ..base.storage import Storage
+from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
 from ..live.pages import page_of

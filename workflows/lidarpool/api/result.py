@@ -14,8 +14,8 @@ from pathlib import Path
 from tempfile import TemporaryDirectory, mkdtemp
 from typing import TYPE_CHECKING
 
-from ..base.arguments import checked
 from ..base.notebook import cell_display
+from ..base.validation import checked
 from ..base.words import counted
 from ..run.result import RunResult
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from distributed import Client
 
-from ..base.arguments import checked
+from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..live.pages import page_of
 from ..pipeline import Frame

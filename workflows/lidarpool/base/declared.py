@@ -11,7 +11,15 @@ from collections.abc import Callable
 from dataclasses import fields
 from typing import Annotated, Any
 
-from pydantic import BeforeValidator, Field, GetPydanticSchema, Strict
+from pydantic import (
+    BeforeValidator,
+    Field,
+    GetPydanticSchema,
+    Strict,
+    ValidationError,
+    WrapValidator,
+)
+from pydantic_core import PydanticCustomError
 
 Share = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
@@ -46,6 +54,23 @@ def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: 
     return BeforeValidator(
         lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
     )
+
+
+def allowed(words: str) -> WrapValidator:
+    """Say what a field of several kinds takes, in one line instead of pydantic's for each."""
+
+    def validated(value: Any, handler: Callable[[Any], Any]) -> Any:
+        try:
+            return handler(value)
+        except ValidationError:
+            raise must_be(words) from None
+
+    return WrapValidator(validated)
+
+
+def must_be(words: str) -> PydanticCustomError:
+    """Return an error of a validator that says what is allowed; the value is said before it."""
+    return PydanticCustomError("allowed", "it must be {words}", {"words": words})
 
 
 def is_text(value: Any) -> bool:

@@ -23,9 +23,9 @@ from typing import IO, Any
 from .errors import LidarpoolError
 
 _PIECE = 1 << 20  # bytes in memory of a file that is checked
-_TEMPORARY = ".lidarpool-tmp-"
+TEMPORARY = ".lidarpool-tmp-"  # begins the name of an unfinished file
 WRITING = ".lidarpool-writing-"  # begins the name of a folder of unfinished files
-_LEFT = re.compile(rf"(?:{re.escape(_TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
+_LEFT = re.compile(rf"(?:{re.escape(TEMPORARY)}(.+)-|{re.escape(WRITING)})[0-9a-f]{{8}}")
 
 
 def target_of(name: str) -> str:
@@ -168,7 +168,7 @@ class Storage:
 
     def claim(self) -> None:
         """Make the folder; LidarpoolError if files cannot be written and removed there."""
-        name = f"{_TEMPORARY}{secrets.token_hex(4)}"
+        name = f"{TEMPORARY}{secrets.token_hex(4)}"
         try:
             self.prepare()
             self.write(name, b"")
@@ -213,7 +213,7 @@ class Storage:
 
     @contextmanager
     def _replacing(self, target: Path) -> Iterator[IO[bytes]]:
-        temporary = target.with_name(f"{_TEMPORARY}{target.name}-{secrets.token_hex(4)}")
+        temporary = target.with_name(f"{TEMPORARY}{target.name}-{secrets.token_hex(4)}")
         try:
             with temporary.open("xb") as file:
                 yield file

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 
 
@@ -22,6 +23,12 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
 def counted(number: float, what: str, several: str = "") -> str:
     """Return number and noun: «1 worker», «1,200 workers»."""
     return f"{number:,} {what if number == 1 else several or what + 's'}"
+
+
+def natural(name: str) -> list[tuple[int, str]]:
+    """Sort key: GPU-2 before GPU-10."""
+    pieces = re.split(r"(\d+)", name)
+    return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]
 
 
 def as_text(name: bytes) -> str:

@@ -154,9 +154,8 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    file, out = options.cluster, options.out
+    file, out, formats = options.cluster, options.out, job.outputs
     assert out is not None, "commands write"
-    formats = [one for one in job.outputs if one.format != "ply"]
     mistakes, notes = Mistakes(), []
     with mistakes.noted():
         notes += _look_at_folder(out)
@@ -187,9 +186,8 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
             notes += filter(None, [gpu_note(everybody, casting, backend)])
     else:
         workers = default_workers(CPU_COUNT, len(visible_gpus()))
-        there = {
-            GPU: options.gpu_workers or workers[GPU], OTHER: options.other_workers or workers[OTHER]
-        }  # fmt: skip
+        there = {GPU: options.gpu_workers or workers[GPU]}
+        there[OTHER] = options.other_workers or workers[OTHER]
         there[LIDAR] = required[LIDAR]  # one worker with as many threads
         memory = MEMORY_LIMIT
         with mistakes.noted():

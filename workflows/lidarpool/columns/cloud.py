@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..base import ports
-from ..base.arguments import as_array, checked, checked_fields
 from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
+from ..base.validation import as_array, checked, checked_fields
 from .table import TABLE, Column
 from .waveforms import WAVEFORM, Waveforms
 

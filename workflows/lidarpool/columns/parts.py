@@ -15,7 +15,6 @@ import zipfile
 from bisect import bisect_right
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -94,8 +93,8 @@ class PartColumns:
     hits: Ints  # (k,): all their hits
     # (scans,) and (scans, samples, 3): hits of each scan, and ends of some of its rays, metres,
     # local coordinates, NaN where there are fewer; empty in a part that is not stored.
-    scan_hits: UInts32 = field(default_factory=partial(np.zeros, 0, np.uint32))
-    samples: Floats32 = field(default_factory=partial(np.zeros, (0, 0, 3), np.float32))
+    scan_hits: UInts32 = field(default_factory=lambda: np.zeros(0, np.uint32))
+    samples: Floats32 = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
 
     def __len__(self) -> int:
         return int(self.counts.sum())

@@ -12,9 +12,9 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..base.arguments import checked_fields
 from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from ..base.words import did_you_mean
 from .waveforms import WAVEFORM, column_type
 

@@ -42,9 +42,9 @@ VERSION = 1  # of INDEX_FILE
 _REQUESTS = 8  # to an object store at a time
 _AHEAD = 16  # jobs that are looked at ahead
 _LISTED = 32  # folders whose files are known at a time, some of which all jobs share
-# Files of jobs, in all formats, and that by which workers see whether they see the place.
+# Files of jobs, in all formats.
 OF_JOBS = re.compile(
-    r"[0-9a-f]{16}-dataset|\.jobs/[^/]+\.json|(sweeps|boxes)/[^/]+\.npz|bags/[^/]+\.mcap|"
+    r"\.jobs/[^/]+\.json|(sweeps|boxes)/[^/]+\.npz|bags/[^/]+\.mcap|"
     r"jobs/[^/]+/(cloud\.ply|(sweeps|boxes)\.npz)|"
     rf"points/job=\d+/{FORMATS['parquet'].inside}|images/[^/]+/{FORMATS['images'].inside}|"
     rf"{FORMATS['kitti'].inside}|{FORMATS['nuscenes'].inside}"

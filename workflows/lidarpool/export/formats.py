@@ -13,9 +13,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, flush
+from ..base.validation import checked_fields
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
 from .folder import staging

@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ..base.archives import open_archive
-from ..base.arguments import checked
 from ..base.arrays import AnyArray, Floats, Floats32, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
+from ..base.validation import checked
 from ..base.words import did_you_mean
 from ..sensor.trajectory import matrices, quaternions_of
 from .boxes import type_of

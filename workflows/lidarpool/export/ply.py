@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arguments import checked
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
+from ..base.validation import checked
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type

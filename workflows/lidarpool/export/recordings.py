@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import struct
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
@@ -21,7 +20,7 @@ from ..base.allowance import check_fits
 from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..base.errors import LidarpoolError, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.words import did_you_mean, printable
+from ..base.words import did_you_mean, natural, printable
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
@@ -162,7 +161,7 @@ def open_recording(
             return _of_data_set(path, name, sensor, light)
         if (path / "metadata.yaml").exists():
             return _of_bag(path, name, sensor, light)
-        if files := sorted(path.glob("*.pcd"), key=_natural):
+        if files := sorted(path.glob("*.pcd"), key=lambda file: natural(file.name)):
             return _of_pcd(files, name, light)
     elif kind == ".ply":
         return _of_ply(path, name, sensor, light)
@@ -361,9 +360,3 @@ def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> s
         advice = "choose one (--sensor-a, --sensor-b)" if known else "record one"
         raise LidarpoolError(f"{listed}: {advice}.")
     raise LidarpoolError(f"{listed}, not {wanted!r}." + did_you_mean(wanted, known))
-
-
-def _natural(path: Path) -> list[tuple[int, str]]:
-    """Sort key: 9.pcd before 10.pcd."""
-    pieces = re.split(r"(\d+)", path.name)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]

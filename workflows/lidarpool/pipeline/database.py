@@ -165,6 +165,7 @@ class RunDatabase:
         self.path, self._durable = path, durable
         self.meta: dict[str, str] = {}
         self.under_way: dict[int, JobParts] = {}  # {number of a job: what is committed of it}
+        self._begun: set[int] = set()  # numbers of jobs with rows in `_OF_JOBS`
         self.ended_count = 0
         self._ended = bytearray()  # of each job: 0, _DONE or _FAILED
         with self._explained():
@@ -196,7 +197,8 @@ class RunDatabase:
         with closing(self._sql.execute("SELECT number, failed FROM jobs")) as rows:
             for number, failed in rows:
                 self._mark_ended(number, _FAILED if failed else _DONE)
-        self.begun  # noqa: B018 - an error if tables are missing
+        for table in _OF_JOBS:
+            self._begun.update(job for (job,) in self._rows(f"SELECT DISTINCT job FROM {table}"))
 
     def _rows(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
         return self._sql.execute(query, values).fetchall()
@@ -207,7 +209,17 @@ class RunDatabase:
         """Return what is committed of a job that has not ended; kept until it has."""
         if (found := self.under_way.get(number)) is not None:
             return found
-        job = JobParts(number, scan_count, self._summaries)
+        job = self.under_way[number] = JobParts(number, scan_count, self._summaries)
+        if number in self._begun:
+            try:
+                self._read(job)
+            except BaseException:
+                del self.under_way[number]
+                raise
+        return job
+
+    def _read(self, job: JobParts) -> None:
+        number, scan_count = job.number, job.scan_count
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
         with self._explained():
             for first, stop, *counts, cells in self._rows(query, number):
@@ -220,20 +232,16 @@ class RunDatabase:
             job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, number)]
             for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
                 job.frames = job.frames_written = int(count)
-        self.under_way[number] = job
-        return job
 
     @property
     def begun(self) -> list[int]:
         """Numbers of the jobs that have not ended and of which something is committed."""
-        query = "SELECT DISTINCT job FROM parts UNION SELECT DISTINCT job FROM trials"
-        with self._explained():
-            return sorted(number for (number,) in self._rows(query))
+        return sorted(self._begun)
 
     @property
     def used(self) -> bool:
         """Whether anything is committed, or was."""
-        return "forgot" in self.meta or bool(self.ended_count or self.begun)
+        return "forgot" in self.meta or bool(self.ended_count or self._begun)
 
     def ended(self, number: int) -> bool:
         """Whether a job has ended."""
@@ -297,6 +305,7 @@ class RunDatabase:
                 self._sql.executemany("INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 self._write_frames()
             for receipt in new:
+                self._begun.add(receipt.job)
                 self.under_way[receipt.job].enter(receipt)
         return new
 
@@ -323,6 +332,7 @@ class RunDatabase:
                 # To the bit: a float is written with the digits that identify it.
                 [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
             )
+        self._begun.add(number)
         self.under_way[number].trials += trials
 
     def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
@@ -330,14 +340,13 @@ class RunDatabase:
 
         A job may have ended before.
         """
-        ended: dict[int, bool] = {}
+        ended = {number: (failed, json.dumps(data)) for number, failed, data in jobs}
+        rows = [(number, *row) for number, row in ended.items()]
         with self._transaction():
-            for number, failed, data in jobs:
-                row = (number, failed, json.dumps(data))
-                self._sql.execute("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", row)
-                self._delete(number, _OF_JOBS)
-                ended[number] = failed
-        for number, failed in ended.items():
+            self._sql.executemany("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", rows)
+            self._delete(ended)
+        self._begun -= ended.keys()
+        for number, (failed, _) in ended.items():
             self._mark_ended(number, _FAILED if failed else _DONE)
             self.under_way.pop(number, None)
 
@@ -354,7 +363,8 @@ class RunDatabase:
     def restart(self, number: int) -> None:
         """Drop all that is committed of a job that has not ended."""
         with self._transaction():
-            self._delete(number, _OF_JOBS)
+            self._delete([number])
+        self._begun.discard(number)
         if (job := self.under_way.get(number)) is not None:
             job.clear()
 
@@ -376,9 +386,11 @@ class RunDatabase:
     def _set(self, name: str, value: str) -> None:
         self._sql.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
 
-    def _delete(self, number: int, tables: Iterable[str]) -> None:
-        for table in tables:
-            self._sql.execute(f"DELETE FROM {table} WHERE job = ?", (number,))
+    def _delete(self, numbers: Iterable[int]) -> None:
+        """Delete what is committed of some jobs."""
+        there = [(number,) for number in numbers if number in self._begun]
+        for table in _OF_JOBS:
+            self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", there)
 
     def _mark_ended(self, number: int, state: int) -> None:
         if not 0 <= number < JOBS_MOST:

@@ -242,13 +242,14 @@ class RunDriver:
             self.jobs[receipt.job].learn(record)
         self._casting.learn(record for _, record in records)
         for receipt, last in records[-1:]:
-            job = self.jobs[receipt.job]
-            scans = policies.scans_per_batch(
-                last.seconds, last.items, job.fit, job.in_all, self.slot_count
-            )
-            if abs(scans - self._advice) > ADVISED_AGAIN * self._advice:  # it is a request
-                self._advice = scans
-                self._stages.advise(scans)
+            job, seconds, scans = self.jobs[receipt.job], last.seconds, last.items
+            if receipt.stop == job.survey.scan_count and scans < self._advice:
+                # The rest of a job says how fast it was cast, and nothing about larger ones.
+                seconds, scans = seconds * self._advice / scans, self._advice
+            wanted = policies.scans_per_batch(seconds, scans, job.fit, job.in_all, self.slot_count)
+            if abs(wanted - self._advice) > ADVISED_AGAIN * self._advice:  # it is a request
+                self._advice = wanted
+                self._stages.advise(wanted)
 
     # -- looking after workers and stages ------------------------------------------------------
 

@@ -10,10 +10,10 @@ from typing import Annotated
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arguments import checked_fields
 from ..base.arrays import Floats
 from ..base.declared import Seed, told
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from .geometry import segment_distances
 
 
@@ -72,7 +72,7 @@ class Planning(Search):
     radii: Floats = field(default_factory=lambda: np.empty(0))  # (m,), metres
 
     def __post_init__(self) -> None:
-        start, target = _point("start", self.start), _point("target", self.target)
+        start, target = ((float(x), float(y)) for x, y in (self.start, self.target))
         if start == target:
             raise LidarpoolError(
                 f"start and target of the path are both {start}: there is nothing to plan. "
@@ -98,11 +98,6 @@ class Planning(Search):
             ("start", start), ("target", target), ("centres", centres), ("radii", radii)
         ):  # fmt: skip
             object.__setattr__(self, name, value)
-
-
-def _point(name: str, value: ArrayLike) -> tuple[float, float]:
-    x, y = _checked(name, value, lambda n: n.shape == (2,), "two finite numbers").tolist()
-    return x, y
 
 
 def _checked(name: str, value: ArrayLike, fits: Callable[[Floats], bool], what: str) -> Floats:

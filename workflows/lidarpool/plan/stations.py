@@ -12,9 +12,9 @@ from pydantic import Field
 
 from raybeam import RayCaster
 
-from ..base.arguments import checked
 from ..base.arrays import Bools, Floats, Ints
 from ..base.errors import LidarpoolError
+from ..base.validation import checked
 from ..scene.drawn import Drawn
 from ..scene.floor import SLAB_M
 from ..scene.scene import Scene

@@ -207,6 +207,15 @@ class Page:
             place = 0.03, 1 - (1.84 + 0.62 * number) * line
             self._text(self.figure, place, detail, 7.2, theme.MUTED, ha="left")
 
+    def heading(self, axes: Axes, text: str, **given: Any) -> None:
+        """Name a chart, above its left end."""
+        style: dict[str, Any] = {
+            "fontsize": 7.6 * self.unit,
+            "color": theme.INK,
+            "family": FONT,
+        } | given
+        axes.set_title(text, loc="left", parse_math=False, **style)
+
     def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
         """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
         rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
@@ -223,12 +232,15 @@ class Page:
             size,
         )  # fmt: skip
 
-    def key(self, handles: list[Line2D], size: float) -> None:
-        """Put a legend of handles into the right margin; `size` of the font in points."""
-        legend = self.figure.legend(
-            handles, ["x"] * len(handles), loc="center left", bbox_to_anchor=(0.842, 0.5),
-            frameon=False, labelcolor=theme.INK, labelspacing=0.55, handletextpad=0.5,
-            borderpad=0, handlelength=1.4, prop={"family": FONT, "size": size * self.unit},
+    def key(
+        self, handles: list[Line2D], size: float, on: Axes | Figure | None = None, **given: Any
+    ) -> None:
+        """Put a legend of handles into the right margin, or elsewhere; `size` in points."""
+        style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | given
+        style = {"handletextpad": 0.5, "handlelength": 1.4} | style
+        legend = (on or self.figure).legend(
+            handles, ["x"] * len(handles), frameon=False, labelcolor=theme.INK, labelspacing=0.55,
+            prop={"family": FONT, "size": size * self.unit}, **style,
         )  # fmt: skip
         # Names come from files: matplotlib leaves out those that begin with an underscore,
         # and fails on texts that only look like a formula ("$\\frac{x$").
@@ -270,9 +282,13 @@ class Page:
         """
         advice = "choose a folder that exists, can be written to and has room"
         with explained(f"The picture {path} could not be written", advice):
-            image = io.BytesIO()
-            self.figure.savefig(image, dpi=DPI, format=path.suffix[1:] or "png")
-            Storage.at(path.parent, durable=False).write(path.name, image.getvalue())
+            Storage.at(path.parent, durable=False).write(path.name, self.png())
+
+    def png(self) -> bytes:
+        """Return the page as a PNG, in its light colours."""
+        image = io.BytesIO()
+        self.figure.savefig(image, dpi=DPI, format="png")
+        return image.getvalue()
 
     def svg(self) -> str:
         """Return the page as an element of HTML, whose ink may follow the style around it.

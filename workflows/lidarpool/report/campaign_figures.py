@@ -1,86 +1,23 @@
-"""What a data set's card is made of: a description, and figures of its jobs."""
+"""Figures of the jobs of a data set."""
 
 from __future__ import annotations
 
 import hashlib
-import heapq
 from array import array
+from bisect import insort
 from collections import Counter
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
-from pathlib import Path
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from poolpart import TaskRecord
-
 from ..base.arrays import Bools, Floats
-from ..export.jobs import JobRow, Value
-from ..pipeline.task_book import StageTotals
+from ..export.jobs import JobRow
 from .ranks import rank_correlation
 
 FAILED_MOST, SLOWEST_MOST = 200, 10  # jobs that are kept whole
 _COUNTS = ("scans", "sweeps", "rays", "hits", "points")
-
-
-@dataclass(frozen=True, eq=False)
-class CampaignInfo:
-    """What a card says beside the table of jobs.
-
-    Parameters
-    ----------
-    title
-        Name of the data set.
-    count
-        Jobs of the description.
-    seed
-        Of what was drawn.
-    format
-        Of the jobs' files: kitti, nuscenes, mcap, parquet or folder.
-    names
-        Names of the varied values, in the order of the table's columns.
-    sensors
-        {name: model and rate in words}; the name is "" where there is only one.
-    license
-        As given; "" for none.
-    versions
-        Software on which the bytes of points depend, {name: version}.
-    seconds
-        Wall time of this run.
-    resumed
-        Jobs of an earlier run.
-    notes
-        Remarks for the user.
-    picture
-        PNG of one job, a local file; None for none.
-    classes
-        Names of semantic classes, {class: name}, as far as known.
-    file
-        Name of the description, as after ``lidarpool run``; "" for a campaign of Python.
-    description
-        The description as text.
-    stages, records
-        Tasks of this run: the totals of each stage, and some tasks.
-    """
-
-    title: str
-    count: int
-    seed: int
-    format: str
-    names: Sequence[str] = ()
-    sensors: Mapping[str, str] = field(default_factory=dict)
-    license: str = ""
-    versions: Mapping[str, str] = field(default_factory=dict)
-    seconds: float = 0.0
-    resumed: int = 0
-    notes: Sequence[str] = ()
-    picture: Path | None = None
-    classes: Mapping[int, str] = field(default_factory=dict)
-    file: str = "campaign.yaml"
-    description: str = ""
-    stages: Sequence[StageTotals] = ()
-    records: Sequence[TaskRecord] = ()
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +35,7 @@ class Varied:
 
 
 class Figures:
-    """Totals, and a few numbers of each job: 60 bytes, and 12 for each varied quantity.
+    """Totals, and a few numbers of each job: 40 bytes, and 9 for each varied quantity.
 
     Parameters
     ----------
@@ -109,17 +46,16 @@ class Figures:
     """
 
     def __init__(self, names: Sequence[str], jobs: Iterable[JobRow] = ()) -> None:
-        self.jobs, self.done = 0, 0
-        self.totals: Counter[str] = Counter(dict.fromkeys(_COUNTS, 0))
-        self.splits: dict[str, Counter[str]] = {}  # {split: done jobs, sweeps, points}
+        self.jobs = 0
+        self.splits: dict[str, Counter[str]] = {}  # {split: done jobs, and their counts}
         self.classes: Counter[int] = Counter()  # {class: points}
         self.classed: Counter[int] = Counter()  # {class: jobs that have it}
-        self.seconds = 0.0
         self.failed: list[JobRow] = []  # the first of them
-        self._slowest: list[tuple[float, int, JobRow]] = []
+        self.slowest: list[JobRow] = []  # those that took longest to cast, the slowest first
         self._each = {name: array("d") for name in ("points", "rays", "hits", "seconds", "failed")}
-        self._numbers = {name: array("d") for name in names}
-        self._codes = {name: array("i") for name in names}
+        # Numbers, or places in the labels; and which of both.
+        self._values = {name: array("d") for name in names}
+        self._labelled = {name: array("b") for name in names}
         self._labels: dict[str, dict[str, int]] = {name: {} for name in names}
         self._digest = hashlib.sha256()
         for row in jobs:
@@ -134,49 +70,48 @@ class Figures:
         for name, kept in self._each.items():
             kept.append(not row.done if name == "failed" else getattr(row, name))
         for name, labels in self._labels.items():
-            self._add_value(name, labels, row.values.get(name))
+            value = row.values.get(name, np.nan)
+            if labelled := isinstance(value, str | bool):
+                text = value if isinstance(value, str) else str(value).lower()
+                value = labels.setdefault(text, len(labels))
+            self._values[name].append(value)
+            self._labelled[name].append(labelled)
         if not row.done:
             if len(self.failed) < FAILED_MOST:
                 self.failed.append(row)
             return
-        self.done += 1
         self._digest.update(f"{row.name} {row.sha256}\n".encode())
-        self.seconds += row.seconds
         counts = {name: getattr(row, name) for name in _COUNTS}
-        self.totals.update(counts)
-        self.splits.setdefault(row.split, Counter()).update(counts | {"jobs": 1})
+        self.splits.setdefault(row.split, Counter()).update(counts, jobs=1)
         self.classes.update(row.classes)
         self.classed.update(row.classes.keys())
-        entry = (row.seconds, -row.number, row)
-        if len(self._slowest) < SLOWEST_MOST:
-            heapq.heappush(self._slowest, entry)
-        else:
-            heapq.heappushpop(self._slowest, entry)
-
-    def _add_value(self, name: str, labels: dict[str, int], value: Value | None) -> None:
-        number = isinstance(value, int | float) and not isinstance(value, bool)
-        self._numbers[name].append(float(value) if number and value is not None else np.nan)
-        if value is None or number:
-            self._codes[name].append(-1)
-        else:
-            text = value if isinstance(value, str) else ("false", "true")[bool(value)]
-            self._codes[name].append(labels.setdefault(text, len(labels)))
+        insort(self.slowest, row, key=lambda row: (-row.seconds, row.number))
+        del self.slowest[SLOWEST_MOST:]
 
     def _varied(self, name: str) -> Varied:
-        numbers, labels = np.array(self._numbers[name]), self._labels[name]
+        values, labels = np.array(self._values[name]), dict(self._labels[name])
+        known = np.isfinite(values)
+        values[~known] = np.nan
         if not labels:
-            return Varied(name, numbers, ())
-        texts = list(labels)
-        text_of = np.array(self._codes[name])
-        known = np.isfinite(numbers)
-        for value in np.unique(numbers[known]).tolist():  # as «auto» beside 1 and 2
-            texts.append(f"{value:g}")
-            text_of[numbers == value] = len(texts) - 1
-        order = sorted(range(len(texts)), key=lambda k: texts[k])
-        place = np.append(np.argsort(order), -1)  # the last for -1
-        values = place[text_of].astype(np.float64)
-        values[values < 0] = np.nan
-        return Varied(name, values, tuple(texts[k] for k in order))
+            return Varied(name, values, ())
+        numbers = known & (np.array(self._labelled[name]) == 0)
+        codes = values.copy()
+        for value in np.unique(values[numbers]).tolist():  # as «auto» beside 1 and 2
+            codes[numbers & (values == value)] = labels.setdefault(f"{value:g}", len(labels))
+        order = sorted(labels)
+        codes[known] = np.argsort([labels[text] for text in order])[codes[known].astype(np.intp)]
+        return Varied(name, codes, tuple(order))
+
+    @property
+    def done(self) -> int:
+        """How many jobs are done."""
+        return sum(counts["jobs"] for counts in self.splits.values())
+
+    @property
+    def totals(self) -> dict[str, int]:
+        """Scans, sweeps, rays, hits and points of all done jobs."""
+        each = self.splits.values()
+        return {name: sum(counts[name] for counts in each) for name in _COUNTS}
 
     @property
     def sha256(self) -> str:
@@ -186,12 +121,7 @@ class Figures:
     @property
     def varied(self) -> list[Varied]:
         """What each varied quantity was in each job."""
-        return [self._varied(name) for name in self._numbers]
-
-    @property
-    def slowest(self) -> list[JobRow]:
-        """Jobs that took longest to cast, the slowest first."""
-        return [row for _, _, row in sorted(self._slowest, reverse=True)]
+        return [self._varied(name) for name in self._values]
 
     def each(self, name: str) -> Floats:
         """Return points, rays, hits or seconds of each job (n,)."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import tempfile
 import time
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
@@ -15,7 +14,7 @@ from typing import Any
 from ..base.errors import LidarpoolError, explained
 from ..base.fingerprint import fingerprint
 from ..base.software import difference, software
-from ..base.storage import Storage
+from ..base.storage import TEMPORARY, Storage
 from ..base.words import counted
 from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
 from ..export.folder import result_folder
@@ -29,7 +28,6 @@ from ..run.result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, drop_run
 from ..run.writer import JobWriter
 from ..scenario.campaign import Campaign, hashes
-from .campaign_figures import CampaignInfo
 from .campaign_report import write_card
 from .sweep_picture import draw_sweep
 
@@ -140,7 +138,8 @@ class DataSetOutput(Output[CampaignRun]):
         assert cluster is not None, "something is left"
         dataset = replace(self.dataset, made_with=_made_with(store))
         mark = store.db.meta["mark"]
-        probe = (f"{mark}-dataset", mark.encode())
+        # What a killed run leaves of it is removed as that of any killed writer.
+        probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
         with explained(f"{dataset.place} cannot be written"):
             dataset.place.prepare()
             dataset.place.write(*probe)
@@ -178,29 +177,9 @@ class DataSetOutput(Output[CampaignRun]):
             place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
         write_table(place, campaign.names, store.rows())
         self.dataset.finish(store.rows())
-        info = CampaignInfo(
-            title=campaign.title,
-            license=campaign.license,
-            count=campaign.count,
-            seed=campaign.seed,
-            format=self.dataset.format,
-            names=campaign.names,
-            sensors=run.sensors,
-            versions=store.casting or software(),
-            seconds=run.seconds,
-            resumed=run.resumed,
-            notes=run.notes,
-            stages=run.stages,
-            file=campaign.command,
-            description=campaign.description,
-        )
-        with tempfile.TemporaryDirectory(prefix="lidarpool-") as folder:
-            saved = sweeps(place.url)
-            if len(saved):
-                picture = Path(folder, "job.png")
-                draw_sweep(next(iter(saved))).save(picture)
-                info = replace(info, picture=picture)
-            write_card(place, info, store.rows())
+        saved = sweeps(place.url)
+        picture = draw_sweep(next(iter(saved))) if len(saved) else None
+        write_card(place, campaign, run, store.rows(), store.casting or software(), picture)
 
 
 def _identity(store: RunStore) -> str:

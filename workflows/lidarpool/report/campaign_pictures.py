@@ -29,6 +29,7 @@ BETWEEN = 78  # columns of charts
 COUNTS, GAP, AGAINST, BELOW = 120, 20, 340, 60  # heights: histogram, dots, and labels under them
 SLANTED = 56  # more below slanted labels
 ABOVE = 76  # from one row of charts to the next
+MIDDLE = (10, 50, 90)  # percentiles of the points of jobs with near values
 MOST_COLOURS = 6  # labels that have colours of their own
 _BINS = 24  # at most
 _GROUPS, _GROUP = 12, 8  # of jobs, by value, whose medians are drawn: so many, of at least so many
@@ -119,13 +120,10 @@ def draw_varied(figures: Figures) -> Page | None:
         _draw_points(page, lower, scale, points, failures, colours)
         lower.set_ylim(limits)
         for axes in (upper, lower):
-            _set_scale(axes, scale)
-        _set_labels(page, lower, scale, wide)
+            _set_labels(page, axes, scale, wide)
         upper.tick_params(which="both", labelbottom=False, bottom=False)
-        upper.set_title(
-            shortened(varied.name, int(wide / 13.8)), loc="left", fontsize=7.8 * page.unit,
-            color=theme.INK, family=FONT, weight="bold", pad=4 * page.unit, parse_math=False,
-        )  # fmt: skip
+        name = shortened(varied.name, int(wide / 13.8))
+        page.heading(upper, name, weight="bold", pad=4 * page.unit)
         if column == 0:
             upper.set_ylabel("jobs")
             lower.set_ylabel("points of a job")
@@ -159,18 +157,14 @@ def _remarks(figures: Figures, shown: Sequence[Varied], telling: Varied | None) 
 
 def _most_telling(scales: Sequence[Scale], points: Floats, done: Bools) -> int | None:
     """Which quantity of few labels has groups whose points differ most; None without any."""
-    best, most = None, 0.0
+    between = {}  # {number of a quantity: variance of the means of its groups}
     for number, scale in enumerate(scales):
         known = done & (scale.bin_of >= 0)
-        if not 2 <= len(scale.labels) <= MOST_COLOURS or not known.any():
-            continue
-        groups, these = scale.bin_of[known], points[known]
-        sums, counts = np.bincount(groups, these), np.bincount(groups)
-        means = sums / np.maximum(counts, 1)
-        between = float(np.var(means[groups]))
-        if best is None or between > most:
-            best, most = number, between
-    return best
+        if 2 <= len(scale.labels) <= MOST_COLOURS and known.any():
+            groups = scale.bin_of[known]
+            means = np.bincount(groups, points[known]) / np.bincount(groups).clip(1)
+            between[number] = float(np.var(means[groups]))
+    return max(between, key=lambda number: between[number], default=None)
 
 
 def draw_results(figures: Figures) -> Page | None:
@@ -178,30 +172,26 @@ def draw_results(figures: Figures) -> Page | None:
     done = ~figures.failures
     if not done.any():
         return None
-    points, rays, hits = (figures.each(name)[done] for name in ("points", "rays", "hits"))
-    with np.errstate(invalid="ignore"):
-        hit = 100 * hits / rays
-    quantities = (
-        ("points of a job", points),
-        ("rays that hit, per cent", hit[np.isfinite(hit)]),
-        ("casting a job, all its tasks, s", figures.each("seconds")[done]),
+    points, rays, hits, seconds = (
+        figures.each(name)[done] for name in ("points", "rays", "hits", "seconds")
     )
+    with np.errstate(invalid="ignore"):
+        quantities = (
+            Varied("points of a job", points, ()),
+            Varied("rays that hit, per cent", 100 * hits / rays, ()),
+            Varied("casting a job, all its tasks, s", seconds, ()),
+        )
     high, top = 250, 128
     page = Page((WIDTH, top + high + 92))
     wide = (WIDTH - LEFT - RIGHT - BETWEEN * 2) / 3
-    for column, (name, values) in enumerate(quantities):
+    for column, quantity in enumerate(quantities):
         axes = _chart(page, LEFT + column * (wide + BETWEEN), top, wide, high)
-        axes.set_xlabel(name)
-        axes.xaxis.set_major_locator(MaxNLocator(5))
-        axes.xaxis.set_major_formatter(FuncFormatter(_tick))
-        if len(values):
-            low, most = float(values.min()), float(values.max())
-            aside = 0.0 if most > low else abs(most) / 2 or 0.5
-            limits = low - aside, most + aside
-            counts, edges = np.histogram(values, min(40, 8 + len(values) // 8), limits)
-            axes.stairs(counts, edges, fill=True, color=BAR)
-            axes.axvline(float(np.median(values)), color=theme.INK, lw=1.1 * page.unit)
-            axes.set_ylim(0, 1.08 * counts.max())
+        scale = Scale.of(quantity)
+        _draw_counts(axes, scale, np.zeros(len(points), np.bool_), theme.rgb(BAR))
+        _set_labels(page, axes, scale, wide)
+        axes.set_xlabel(quantity.name)
+        if len(quantity.there):
+            axes.axvline(float(np.median(quantity.there)), color=theme.INK, lw=1.1 * page.unit)
     page.figure.axes[0].set_ylabel("jobs")
     page.title("What came of it", "Jobs by points, hits and time; the line is the median.")
     return page
@@ -236,7 +226,8 @@ def _draw_counts(axes: Axes, scale: Scale, failures: Bools, colours: Floats) -> 
         left, right = left + 0.15, right - 0.15
     wide = right - left
     axes.bar(left, counts - failed, wide, bottom=failed, align="edge", color=colours, lw=0)
-    axes.bar(left, failed, wide, align="edge", color=theme.SENSOR, lw=0)
+    if failed.any():
+        axes.bar(left, failed, wide, align="edge", color=theme.SENSOR, lw=0)
     axes.set_ylim(0, 1.1 * max(1, counts.max()))
 
 
@@ -259,14 +250,16 @@ def _draw_points(
     )  # fmt: skip
     if scale.labels:
         for number in np.unique(scale.bin_of[done]).tolist():
-            low, median, high = _percentiles(points[done[scale.bin_of[done] == number]])
+            group = points[done[scale.bin_of[done] == number]]
+            low, median, high = np.percentile(group, MIDDLE).tolist()
             near = np.array([number - 0.35, number + 0.35])
             axes.fill_between(near, low, high, color=theme.MUTED, alpha=0.2, lw=0)
             axes.plot(near, [median, median], color=theme.INK, lw=1.6 * unit)
     elif (groups := min(_GROUPS, len(done) // _GROUP)) > 1:
         ordered = np.array_split(done[np.argsort(places[done], kind="stable")], groups)
         middles = [float(np.median(places[group])) for group in ordered]
-        lows, medians, highs = np.array([_percentiles(points[group]) for group in ordered]).T
+        each = np.array([np.percentile(points[group], MIDDLE) for group in ordered])
+        lows, medians, highs = each.T
         axes.fill_between(middles, lows, highs, color=theme.MUTED, alpha=0.16, lw=0)
         axes.plot(middles, medians, color=theme.INK, lw=1.6 * unit, solid_joinstyle="round")
     failed = np.flatnonzero(known & failures)
@@ -289,39 +282,26 @@ def _limits(points: Floats) -> tuple[float, float]:
     return 0.0, 1.06 * max(high, 1.0)
 
 
-def _percentiles(values: Floats) -> tuple[float, float, float]:
-    low, median, high = np.percentile(values, (10, 50, 90)).tolist()
-    return low, median, high
-
-
-def _set_scale(axes: Axes, scale: Scale) -> None:
-    low, high = scale.edges[[0, -1]].tolist()
-    aside = 0.0 if scale.labels else 0.02
-    if scale.is_log:
-        axes.set_xscale("log")
-        ratio = (high / low) ** aside
-        axes.set_xlim(low / ratio, high * ratio)
-    else:
-        axes.set_xlim(low - aside * (high - low), high + aside * (high - low))
-
-
 def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
-    axis = axes.xaxis
-    if scale.is_log:
-        few = scale.edges[-1] < 1000 * scale.edges[0]
-        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
-        axis.set_major_formatter(FuncFormatter(_tick))
-        axis.set_minor_formatter(NullFormatter())
-    elif not scale.labels:
-        axis.set_major_locator(MaxNLocator(max(2, min(6, int(wide / 90)))))
-        axis.set_major_formatter(FuncFormatter(_tick))
-    else:
-        slanted = _slanted(scale, wide)
+    """Set the limits of the axis of values, and name its bins or numbers."""
+    axis, (low, high) = axes.xaxis, scale.edges[[0, -1]].tolist()
+    if scale.labels:
+        axes.set_xlim(low, high)
         axis.set_ticks(range(len(scale.labels)), list(_short(scale.labels)))
+        slant = {"rotation": 28, "ha": "right", "rotation_mode": "anchor"}
         for text in axes.get_xticklabels():
             text.set(parse_math=False, fontsize=6.8 * page.unit, family=FONT)
-            if slanted:
-                text.set(rotation=28, ha="right", rotation_mode="anchor")
+            text.set(**slant if _slanted(scale, wide) else {})
+        return
+    if scale.is_log:
+        axes.set_xscale("log")
+        axes.set_xlim(low * (low / high) ** 0.02, high * (high / low) ** 0.02)
+        axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 1000 * low else (1,)))
+        axis.set_minor_formatter(NullFormatter())
+    else:
+        axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
+        axis.set_major_locator(MaxNLocator(max(2, min(6, int(wide / 90)))))
+    axis.set_major_formatter(FuncFormatter(_tick))
 
 
 def _short(labels: Sequence[str]) -> Iterator[str]:

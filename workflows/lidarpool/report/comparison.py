@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -12,24 +11,30 @@ import numpy as np
 from pydantic import Field
 
 from .._version import __version__
-from ..base.arguments import checked
 from ..base.arrays import AnyArray, Floats, Indices, Ints
 from ..base.errors import LidarpoolError, explained
 from ..base.open3d_module import load_open3d
+from ..base.validation import checked
 from ..base.words import counted
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..export.folder import result_folder, staging
 from ..export.recordings import Recording, Turn, open_recording
 from ..sensor.noise import Purpose, uniform
-from .page.words import millimetres, ratio
 from .range_image import RangeImages, paired_images, range_images
 from .ranks import rank_correlation
 
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
 MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
-
+RESIDUALS: dict[str, Callable[[Floats], Any]] = {
+    "bias_m": np.mean,
+    "rmse_m": lambda values: np.sqrt(np.mean(values**2)),
+    "median_m": lambda values: np.quantile(values, 0.5),
+    "mad_m": lambda values: np.median(np.abs(values - np.quantile(values, 0.5))),
+    "p05_m": lambda values: np.quantile(values, 0.05),
+    "p95_m": lambda values: np.quantile(values, 0.95),
+}
 
 # Points (n, 3) of a cloud, and their distances (n,) to the other.
 Above = tuple[Floats, Floats]
@@ -47,7 +52,9 @@ class Comparison:
     above: tuple[Above, Above]  # of one pair of sweeps, or of all
 
     def __repr__(self) -> str:
-        return "\n".join(table(self.figures))
+        from .page.page import rendered
+
+        return rendered("comparison.txt", report=self.figures).rstrip("\n")
 
     @checked
     def save(self, folder: str | Path) -> list[Path]:
@@ -64,11 +71,9 @@ class Comparison:
             staging(place) as staged,
         ):
             names = write_comparison(staged, self)
-            text = json.dumps(self.figures, indent=1, allow_nan=False)
-            (staged / "compare.json").write_text(f"{text}\n", encoding="utf-8")
-            for name in ("compare.json", *names):
+            for name in names:
                 (staged / name).replace(place / name)
-        return [place / name for name in ("compare.json", *names)]
+        return [place / name for name in names]
 
 
 @checked
@@ -302,7 +307,8 @@ class _Comparing:
                 "b_to_a": _distances(to_a),
                 "chamfer_m": float(to_b.mean() + to_a.mean()),
                 "f_scores": [
-                    {"distance_m": one, **_scores(np.mean(to_b <= one), np.mean(to_a <= one))}
+                    {"distance_m": one}
+                    | _scores(float(np.mean(to_b <= one)), float(np.mean(to_a <= one)))
                     for one in self.within
                 ],
             },
@@ -353,36 +359,22 @@ def nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
 
 
 def _residuals(values: Floats) -> dict[str, Any]:
-    """Figures of residuals A - B; None where there are none."""
-    if not len(values):
-        names = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
-        return {"cells": 0, **dict.fromkeys(names)}
-    exact = values.astype(np.float64)
-    low, middle, high = np.quantile(exact, (0.05, 0.5, 0.95)).tolist()
-    return {
-        "cells": len(values),
-        "bias_m": float(exact.mean()),
-        "rmse_m": float(np.sqrt(np.mean(exact**2))),
-        "median_m": middle,
-        "mad_m": float(np.median(np.abs(exact - middle))),
-        "p05_m": low,
-        "p95_m": high,
-    }
+    """Figures of residuals A - B, `RESIDUALS`; None where there are none."""
+    figures = (float(figure(values)) if len(values) else None for figure in RESIDUALS.values())
+    return {"cells": len(values), **dict(zip(RESIDUALS, figures, strict=True))}
 
 
 def _no_return(counts: Any) -> dict[str, Any]:
     """Figures of cells without a return in A, with those in B as the truth."""
-    returns, both, of_a, of_b = (int(count) for count in counts)
+    returns, both, of_a, of_b = counts.tolist()
+    names = {"in_both": both, "in_a_only": of_a, "in_b_only": of_b, "returns_in_both": returns}
     precision = both / (both + of_a) if both + of_a else None
-    recall = both / (both + of_b) if both + of_b else None
-    counted_ = {"in_both": both, "in_a_only": of_a, "in_b_only": of_b, "returns_in_both": returns}
-    return counted_ | _scores(precision, recall)
+    return names | _scores(precision, both / (both + of_b) if both + of_b else None)
 
 
-def _scores(precision: Any, recall: Any) -> dict[str, float | None]:
+def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
     f1 = None
     if precision is not None and recall is not None:
-        precision, recall = float(precision), float(recall)
         f1 = 2 * precision * recall / (precision + recall) if precision + recall else 0.0
     return {"precision": precision, "recall": recall, "f1": f1}
 
@@ -395,43 +387,3 @@ def _distances(values: Floats) -> dict[str, Any]:
         "mean_m": float(values.mean()),
         **dict(zip(shares, quantiles, strict=True)),
     }
-
-
-def table(figures: dict[str, Any]) -> Iterator[str]:
-    """Lines of a comparison for a terminal."""
-    for name in "ab":
-        one = figures[name]
-        sweeps = f", {counted(one['sweeps'], 'sweep')}" if figures["pairs"] else ""
-        told = " (the reference)" if name == "b" else ""
-        yield f"{name.upper():<9}{one['name']}: {counted(one['points'], 'point')}{sweeps}{told}"
-    image, light, far = figures["range_image"], figures["intensity"], figures["distances"]
-    if image is not None:
-        told, by = image["residual"], image["paired_by"]
-        yield (
-            f"ranges   A - B in {told['cells']:,} {by} of {len(image['rings'])} rings x "
-            f"{image['columns']:,} columns of {image['azimuth_step_deg']:.4g} deg: "
-            f"bias {millimetres(told['bias_m'])}, median {millimetres(told['median_m'])}, MAD "
-            f"{millimetres(told['mad_m'])}, RMSE {millimetres(told['rmse_m'])}"
-        )
-        if (lost := image["no_return"]) is not None:
-            yield (
-                f"no return {lost['in_both']:,} {by} in both, {lost['in_a_only']:,} in A only, "
-                f"{lost['in_b_only']:,} in B only: precision {ratio(lost['precision'])}, recall "
-                f"{ratio(lost['recall'])}, F1 {ratio(lost['f1'])}"
-            )
-    if light is not None:
-        yield (
-            f"intensity rank correlation {light['rank_correlation']:.3f} of "
-            f"{light['pairs']:,} {light['of']}"
-        )
-    for name, words in (("a_to_b", "A to B"), ("b_to_a", "B to A")):
-        told = far[name]
-        yield (
-            f"{words:<9}mean {millimetres(told['mean_m'])}, median "
-            f"{millimetres(told['median_m'])}, 95 % {millimetres(told['p95_m'])}, farthest "
-            f"{millimetres(told['max_m'])}"
-        )
-    scores = ", ".join(f"{one['f1']:.3f} at {one['distance_m']:g} m" for one in far["f_scores"])
-    yield f"F-score  {scores}; Chamfer distance {millimetres(far['chamfer_m'])}"
-    for note in figures["notes"]:
-        yield f"note: {note}"

@@ -2,23 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.colors import LogNorm, Normalize
+from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ..base.arrays import AnyArray
 from ..base.choice import one_of_each_part
 from ..base.words import counted
 from ..render import theme
-from ..render.page import FONT, Page, shortened
-from .page.page import environment
-from .page.words import MINUS, millimetres, ratio
+from ..render.page import Page
+from .page.page import rendered
+from .page.words import millimetres
 
 if TYPE_CHECKING:
     from .comparison import Comparison
@@ -32,85 +32,23 @@ ONLY_A, ONLY_B = theme.rgb("#2ca25f"), theme.rgb("#101418")  # no colours of res
 NONE = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
 RANGES, RESIDUALS, FAR = "viridis", "RdBu_r", "plasma"
 SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
+CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")
 CLOSEST_M = 0.001  # end of the scale of distances
 
 
 def write_comparison(folder: Path, found: Comparison) -> list[str]:
-    """Write compare.html and the pictures as PNG into a folder; return their names."""
-    drawn, names = [], ["compare.html"]
-    for name, page, caption in _pictures(found):
-        names.append(f"compare-{name}.png")
-        page.save(folder / names[-1])
-        drawn.append((Markup(page.svg()), caption))
-    figures = found.figures
-    text = (
-        environment()
-        .get_template("comparison.html")
-        .render(
-            report=figures,
-            title=f"{_short(figures, 'a')} and {_short(figures, 'b')}",
-            begun="",
-            summary=_summary(figures),
-            facts=list(_facts(figures)),
-            pictures=drawn,
-            length=_length,
-            ratio=ratio,
-        )
-    )
-    (folder / names[0]).write_text(text, encoding="utf-8")
-    return names
-
-
-def _short(figures: dict[str, Any], which: str) -> str:
-    return shortened(figures[which]["name"].rstrip("/").rpartition("/")[2], 40)
-
-
-def _length(value: float | None) -> str:
-    return millimetres(value).replace("-", MINUS)
-
-
-def _summary(figures: dict[str, Any]) -> str:
-    pairs = counted(figures["pairs"], "pair") + " of sweeps" if figures["pairs"] else "All points"
-    text = f"{pairs} compared: A is {figures['a']['name']}, B {figures['b']['name']}, the reference"
-    return f"{text}. Residuals are A minus B."
-
-
-def _facts(figures: dict[str, Any]) -> Iterator[tuple[str, str]]:
-    """Return the numbers for the head of the page, and what each is."""
-    image, light, far = figures["range_image"], figures["intensity"], figures["distances"]
-    if image is not None:
-        told = image["residual"]
-        yield _length(told["median_m"]), "median of range residuals"
-        yield millimetres(told["mad_m"]), "their median absolute deviation"
-        if image["no_return"] is not None:
-            yield ratio(image["no_return"]["f1"]), "F1 of cells without a return"
-    if light is not None:
-        yield f"{light['rank_correlation']:.3f}", "rank correlation of intensity"
-    yield millimetres(far["a_to_b"]["median_m"]), "from A to B, the median"
-    yield millimetres(far["b_to_a"]["median_m"]), "from B to A, the median"
-
-
-def _pictures(found: Comparison) -> Iterator[tuple[str, Page, str]]:
-    """Return names, pictures and captions."""
+    """Write compare.json, compare.html and pictures as PNG into a folder; return their names."""
+    drawn = {"distances": draw_distances(found), "above": draw_above(found)}
     if found.images is not None:
-        yield (
-            "ranges",
-            draw_ranges(found),
-            "Range images of a sweep, as the sensor looks around: A, B, and A minus B.",
-        )
-        yield (
-            "rings",
-            draw_rings(found),
-            "Residuals of each ring: median, and the middle 90 %; cells without a return; and all "
-            "residuals as a histogram.",
-        )
-    yield (
-        "distances",
-        draw_distances(found),
-        "Share of points that have the other cloud within a distance"
-        + ("; intensities of A and B." if found.figures["intensity"] else "."),
-    )
-    yield "above", draw_above(found), "Both clouds from above, by the distance to the other."
+        drawn = {"ranges": draw_ranges(found), "rings": draw_rings(found)} | drawn
+    for name, page in drawn.items():
+        (folder / f"compare-{name}.png").write_bytes(page.png())
+    images = {name: page.svg() for name, page in drawn.items()}
+    text = rendered("comparison.html", report=found.figures, begun="", pictures=images)
+    (folder / "compare.html").write_text(text, encoding="utf-8")
+    text = json.dumps(found.figures, indent=1, allow_nan=False) + "\n"
+    (folder / "compare.json").write_text(text, encoding="utf-8")
+    return ["compare.json", "compare.html", *(f"compare-{name}.png" for name in drawn)]
 
 
 def draw_ranges(found: Comparison) -> Page:
@@ -151,7 +89,7 @@ def draw_ranges(found: Comparison) -> Page:
         some = np.unique(np.linspace(0, rows - 1, min(rows, 5)).round().astype(int))
         axes.set_yticks(some, [f"{images.elevation_deg[row]:.1f}" for row in some])
         axes.grid(False)
-        _name(page, axes, words)
+        page.heading(axes, words)
     share = high / height
     bottom = (height - top - 2 * high - gap) / height
     ramp = np.linspace(0, 1, 256)
@@ -162,8 +100,7 @@ def draw_ranges(found: Comparison) -> Page:
     named = (("only A has a return", ONLY_A), ("only B has a return", ONLY_B),
              ("no return", NONE))  # fmt: skip
     handles = [_dot(text, colour) for text, colour in named]
-    _key(page, page.figure, handles, loc="upper right", bbox_to_anchor=(RIGHT, 1 - 40 / height),
-         ncols=3)  # fmt: skip
+    _key(page, page.figure, handles, loc="upper right", bbox_to_anchor=(RIGHT, 1 - 40 / height))
     return page
 
 
@@ -197,13 +134,9 @@ def draw_rings(found: Comparison) -> Page:
     left = LEFT + wide + apart
     if lost:
         axes = page.chart((left, 0.13, wide, 0.64), xlabel="cells without a return, %")
-        for colour, name, words in ((B, "in_b_only", "B"), (A, "in_a_only", "A")):
-            share = [
-                100 * (row["no_return"]["in_both"] + row["no_return"][name])
-                / max(sum(row["no_return"][key] for key in
-                          ("in_both", "in_a_only", "in_b_only", "returns_in_both")), 1)
-                for row in rows
-            ]  # fmt: skip
+        counts = np.array([[row["no_return"][name] for name in CELLS] for row in rows])
+        for colour, which, words in ((B, 2, "B"), (A, 1, "A")):
+            share = 100 * (counts[:, 0] + counts[:, which]) / counts.sum(axis=1)
             axes.plot(share, elevation, "o-", color=colour, ms=size, mew=0, lw=0.6 * page.unit,
                       label=words)  # fmt: skip
         axes.set_xlim(left=min(0, axes.get_xlim()[0]))
@@ -245,7 +178,7 @@ def draw_distances(found: Comparison) -> Page:
     axes.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     for one in far["f_scores"]:
         axes.axvline(one["distance_m"], color=theme.LINE, lw=0.9 * page.unit, ls=(0, (4, 3)))
-    _key(page, axes, [_dot("A to B", A), _dot("B to A", B)], loc="lower right")
+    _key(page, axes, [_dot("A to B", A), _dot("B to A", B)], loc="lower right", bbox_to_anchor=None)
     if found.figures["intensity"]:
         light = found.figures["intensity"]
         axes = page.chart((LEFT + 0.5, 0.13, 0.4, 0.64), xlabel="intensity in B",
@@ -255,7 +188,7 @@ def draw_distances(found: Comparison) -> Page:
                     rasterized=True)  # fmt: skip
         axes.grid(False)
         told = f"rank correlation {light['rank_correlation']:.3f}"
-        _name(page, axes, f"{told} of {light['pairs']:,} {light['of']}")
+        page.heading(axes, f"{told} of {light['pairs']:,} {light['of']}")
     return page
 
 
@@ -285,7 +218,7 @@ def draw_above(found: Comparison) -> Page:
         )  # fmt: skip
         middle = (low + high) / 2
         axes.set(xlim=middle[0] + np.array([-side, side]), ylim=middle[1] + np.array([-side, side]))
-        _name(page, axes, ("A, distance to B", "B, distance to A")[k])
+        page.heading(axes, ("A, distance to B", "B, distance to A")[k])
     page.colour_bar(theme.mapped(FAR, np.linspace(0, 1, 256)), norm, "distance, m",
                     (0.875, 0.12, 0.014, tall))  # fmt: skip
     return page
@@ -305,20 +238,13 @@ def _bins(values: AnyArray) -> AnyArray:
     return np.linspace(0, most, 121)
 
 
-def _name(page: Page, axes: Axes, text: str) -> None:
-    axes.set_title(text, loc="left", fontsize=7.6 * page.unit, color=theme.INK, family=FONT)
-
-
 def _dot(text: str, colour: Any, marker: str = "s") -> Line2D:
     edge = theme.MUTED if marker == "s" else colour
     return Line2D([], [], ls="", marker=marker, color=colour, mec=edge, mew=0.5, label=text, ms=4)
 
 
-def _key(page: Page, on: Any, handles: list[Line2D], **given: Any) -> None:
-    """Put a legend into axes, or anywhere on the page."""
-    given = {"loc": "upper left", "ncols": len(handles)} | given
-    if isinstance(on, Axes) and given["loc"] == "upper left":
-        given |= {"bbox_to_anchor": (0, 1.09), "borderaxespad": 0}
-    given["prop"] = {"family": FONT, "size": 6.8 * page.unit}
-    style = {"frameon": False, "handletextpad": 0.2, "columnspacing": 1.2}
-    on.legend(handles=handles, labelcolor=theme.INK, **style, **given)
+def _key(page: Page, on: Axes | Figure, handles: list[Line2D], **given: Any) -> None:
+    """Put a legend above axes, or elsewhere."""
+    above = {"loc": "upper left", "bbox_to_anchor": (0, 1.09), "borderaxespad": 0}
+    style = {"ncols": len(handles), "handletextpad": 0.2, "columnspacing": 1.2, "borderpad": 0.4}
+    page.key(handles, 6.8, on, **style, **(given or above))

@@ -28,7 +28,15 @@ from ..sensor.weather import Weather
 from .cloud_numbers import CountedCloud
 
 ELEVATION_RAYS = 20_000  # whose elevations are examined
-_ORDER = (GENERATE, INTERSECT, SORT, COLLECT, EXPORT, TRIAL)  # in which stages are listed
+# {stage: its name on pages}, in the order of the pipeline
+STAGES = {
+    GENERATE: "generate",
+    INTERSECT: "intersect",
+    SORT: "sort frames",
+    COLLECT: "collect points",
+    EXPORT: "export cloud",
+    TRIAL: "plan path",
+}
 
 _PACKAGES = (
     "numpy", "dask", "distributed", "trimesh", "embreex", "numba", "open3d-cpu", "open3d",
@@ -190,8 +198,13 @@ def stage_figures(totals: Iterable[StageTotals]) -> dict[str, dict[str, Any]]:
             "span_seconds": round(stage.stop - stage.start, 4),
             "workers": sorted(stage.workers),
         }
-        for stage in sorted(totals, key=lambda totals: _ORDER.index(totals.stage))
+        for stage in in_order(totals)
     }
+
+
+def in_order(totals: Iterable[StageTotals]) -> list[StageTotals]:
+    """Sort stages as the pipeline has them."""
+    return sorted(totals, key=lambda stage: [*STAGES].index(stage.stage))
 
 
 def overlap_seconds(totals: Iterable[StageTotals]) -> float:

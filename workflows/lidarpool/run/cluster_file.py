@@ -17,10 +17,10 @@ from poolpart.clusters import INFORMATION
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
+from ..base.validation import validation_errors
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..pipeline import GPU, LIDAR, OTHER
-from ..scenario.validation_errors import validation_errors
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
 # without tasks for so long. And a host that does not answer is given up after so long.

@@ -9,8 +9,8 @@ from typing import Annotated
 from distributed import Client
 from pydantic import Field
 
-from ..base.arguments import checked_fields
 from ..base.storage import Storage
+from ..base.validation import checked_fields
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..scenario.sections import TaskOptions
 from .cluster_file import ClusterFile

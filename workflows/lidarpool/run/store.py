@@ -12,11 +12,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 
-from ..base.arguments import checked
 from ..base.errors import LidarpoolError, explained
 from ..base.fingerprint import fingerprint
 from ..base.software import software
 from ..base.storage import Storage
+from ..base.validation import checked
 from ..columns.parts import mark_name, own_files, scans_of
 from ..export.jobs import JobRow
 from ..pipeline.database import (

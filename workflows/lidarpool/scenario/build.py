@@ -27,6 +27,8 @@ from ..scene.scene import Scene
 from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
+from ..sensor.survey import CloudOptions
+from ..sensor.weather import Weather
 from .moving import ActorSection, MountSection
 from .placing import Placing, place
 from .scenario import Scenario
@@ -225,7 +227,7 @@ def _poses(scenario: Scenario, placing: Placing | None, origin: Floats) -> list[
         return []
     poses = SEED_POSES if placing is None else placing.poses
     if scenario.poses is not None:
-        poses = tuple(pose.pose() for pose in scenario.poses)
+        poses = scenario.poses
     return [replace(one, position=tuple(np.subtract(one.position, origin))) for one in poses]
 
 
@@ -294,10 +296,7 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
 
     `vehicles` are the classes of the last actors of the scene.
     """
-    made = []
-    for number, given in enumerate(scenario.materials):
-        with prefixed(f"materials[{number}]"):
-            made.append(Material(**dict(given)))
+    made = [*scenario.materials]
     placed: tuple[CopiesSection | ActorSection, ...] = (*scenario.scene.copies, *scenario.actors)
     own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
     for entry in placed:
@@ -332,7 +331,8 @@ def _survey(
 ) -> Survey:
     """Build the survey, its poses in local coordinates."""
     needs, carried = scenario.output.needs, frame.sensors
-    cloud = dict(scenario.cloud) | {"columns": (*scenario.cloud.columns, *needs, *columns)}
+    cloud = declared(scenario.cloud, CloudOptions)
+    cloud["columns"] = (*scenario.cloud.columns, *needs, *columns)
     cloud["epsg"] = scenario.cloud.epsg or frame.epsg
     if scenario.scene.has_seed and cloud["keep_every"] is None:
         cloud["keep_every"] = 1 if "ray" in needs else SEED_KEPT
@@ -347,8 +347,8 @@ def _survey(
         materials=materials,
         returns=Returns(**dict(scenario.returns)),
         noise=Noise() if own_noise else Noise(**dict(scenario.noise)),
-        navigation=scenario.navigation and scenario.navigation.navigation(),
-        **dict(scenario.weather),
+        navigation=scenario.navigation,
+        **declared(scenario.weather, Weather),
         **cloud,
     )
 

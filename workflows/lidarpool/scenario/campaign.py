@@ -16,10 +16,10 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 from pydantic import Field, ValidationError
 
-from ..base.arguments import checked, shown
-from ..base.declared import Seed, declared
+from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
+from ..base.validation import checked, shown, validation_errors
 from ..base.words import counted
 from ..base.yamlfile import read_yaml
 from ..export.jobs import Value
@@ -33,7 +33,6 @@ from .scenario import Scenario
 from .sections import PoolSection, file_states
 from .static_scene import SceneCache
 from .tables import Row, read_rows
-from .validation_errors import validation_errors
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")
@@ -106,7 +105,7 @@ class Campaign:
         assert head.count is not None, "known by now"
         self.count, self.seed, self.license = head.count, head.seed, head.license
         self.title, self.splits = head.title, dict(head.splits)
-        self.keep, self.files = Keep(**declared(head.keep, Keep)), jobs.files
+        self.keep, self.files = head.keep, jobs.files
         self._jobs, self._splits = jobs, Splits(head.splits, head.seed)
 
     @classmethod
@@ -282,7 +281,6 @@ def _valid(data: Mapping[str, Any], source: str) -> CampaignSection:
 def _head(**given: Any) -> CampaignSection:
     """Check the fields that Python gives."""
     keep = given.pop("keep")
-    keep = declared(keep, Keep) if isinstance(keep, Keep) else keep
     keep = dict(keep) if isinstance(keep, Mapping) else keep
     return _valid({"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}, "")
 

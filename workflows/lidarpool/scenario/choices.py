@@ -14,9 +14,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, Strict, model_validator
 
-from ..base.arguments import checked_fields
-from ..base.arguments import shown as given
-from ..base.declared import Seed, Text, TextOrTexts, is_text, short, told
+from ..base.declared import Seed, Text, TextOrTexts, allowed, is_text, must_be, short, told
+from ..base.validation import checked_fields
 from ..export.jobs import Value
 from ..export.table import FORMATS, LAYOUTS
 from .draws import SHARE_LEAST, SIGMAS, Draw
@@ -31,22 +30,11 @@ Interval = Annotated[tuple[float, float], Strict(False)]
 Wholes = Annotated[tuple[int, int], Strict(False)]
 
 
-def _options(value: Any) -> Any:
-    if value is not None and not (isinstance(value, (list, tuple, dict)) and value):
-        raise ValueError(
-            f"give a list of values, or a mapping of names to values; given is {given(value)}."
-        )
-    return value
-
-
 Options = Annotated[
-    Annotated[tuple[Any, ...], Strict(False)] | dict[Text, Any] | None,
-    BeforeValidator(
-        _options,
-        json_schema_input_type=Annotated[list[Any], Field(min_length=1)]
-        | Annotated[dict[str, Any], Field(min_length=1)]
-        | None,
-    ),
+    Annotated[tuple[Any, ...], Strict(False), Field(min_length=1)]
+    | Annotated[dict[Text, Any], Field(min_length=1)]
+    | None,
+    allowed("a list of values, or a mapping of names to values"),
 ]
 Weight = Annotated[float, Field(ge=0, le=1e9)]
 Share = Annotated[float, Field(ge=0, le=1)]
@@ -204,7 +192,7 @@ class Choice(Section):
 
     def hint(self, error: str) -> str:
         """Advice on an end that a field does not take."""
-        if self.integer is None and "integer" in error and not self.listed:
+        if self.integer is None and "whole number" in error and not self.listed:
             return " Take integer: [least, largest]."
         return " Give limits." if self.normal is not None and self.normal.limits is None else ""
 
@@ -231,10 +219,7 @@ _KINDS = tuple(name for name in Choice.model_fields if name != "weights")
 
 def _choice(value: Any) -> Any:
     if not isinstance(value, (dict, Choice)):
-        raise ValueError(
-            f"say how it is chosen, {{uniform: [0, 1]}} or {{choice: [1, 4]}}; given is "
-            f"{given(value)}."
-        )
+        raise must_be("how it is chosen, {uniform: [0, 1]} or {choice: [1, 4]}")
     return value
 
 
@@ -272,16 +257,12 @@ class Keep:
         return () if self.format == "folder" else FORMATS[self.format].needed(self.layout)
 
 
-class KeepSection(Section, Keep):
-    """The format of the data set; in YAML also just its name."""
-
-
 KeepEntry = Annotated[
-    KeepSection,
+    Keep,
     short(
         lambda v: v is None or is_text(v),
         lambda v: {"format": v} if v else {},
-        Text | KeepSection | None,
+        Text | Keep | None,
     ),
 ]
 
@@ -315,7 +296,7 @@ class CampaignSection(Section):
             {"sensors.roof.model": {"choice": ["velodyne/vlp16", "ouster/os1-64"]}},
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
-    keep: Annotated[KeepEntry, told("format of the data set")] = KeepSection()
+    keep: Annotated[KeepEntry, told("format of the data set")] = Keep()
     splits: Annotated[
         dict[str, Share],
         may_be_empty(dict[str, Share]),

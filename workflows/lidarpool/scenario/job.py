@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..base.arguments import checked_fields
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from ..export.formats import Format
 from ..plan import Planning
 from ..scene.scene import Scene

@@ -10,20 +10,20 @@ import numpy as np
 from pydantic import Strict, model_validator
 
 from ..base.arrays import Floats
-from ..base.declared import Text, TextOrTexts, is_text, short, told
+from ..base.declared import Text, TextOrTexts, declared, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
-from ..sensor import Sensor, Track, load_trajectory
+from ..sensor import Pose, Sensor, Track, load_trajectory
 from ..sensor.survey import Steps
-from ..sensor.trajectory import CLOCK_S, Beyond
+from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import InstrumentPose, MeshEntry, PoseSection, Section, SensorSection, ShapeSection
+from .sections import MeshEntry, Section, SensorSection, ShapeSection
 from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
 
 
-class MountSection(InstrumentPose):
+class MountSection(Section, InstrumentPose):
     """Position and angles of a sensor on its carrier, in the carrier's axes."""
 
     link: Annotated[
@@ -34,6 +34,10 @@ class MountSection(InstrumentPose):
             "top_lidar_link",
         ),
     ] = None
+
+    def pose(self) -> Pose:
+        """Return it as a pose."""
+        return Pose(**declared(self, Pose))
 
 
 class CarriedSection(SensorSection):
@@ -54,7 +58,7 @@ class CarriedSection(SensorSection):
         return replace(made, start_ns=self.start_s * 1e9) if self.start_s else made
 
 
-class TimedPose(PoseSection):
+class TimedPose(Section, Pose):
     """A pose at a time; if no pose has an angle, the carrier faces its direction of travel."""
 
     time_s: Annotated[Seconds, told("seconds, by the clock of the trajectory")]

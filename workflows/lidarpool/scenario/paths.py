@@ -9,9 +9,9 @@ from typing import Any
 from pydantic import BaseModel
 
 from ..base.errors import LidarpoolError
+from ..base.validation import attributes_of, dotted, fields_of, is_section, sections_in
 from ..base.words import counted, did_you_mean
 from .scenario import Scenario
-from .validation_errors import dotted, models_in
 
 
 @dataclass(frozen=True)
@@ -56,10 +56,11 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
     key: str | int
     while rest:
         at = ".".join(text.split(".")[: -len(rest)])
-        if node is None and not rest[0].isdecimal() and (sections := list(models_in(kind))):
-            node = sections[0].model_construct()  # its defaults
+        if node is None and not rest[0].isdecimal() and (sections := list(sections_in(kind))):
+            model = issubclass(sections[0], BaseModel)  # of defaults
+            node = sections[0].model_construct() if model else object.__new__(sections[0])
             steps[-1] = (steps[-1][0], node)
-        if isinstance(node, BaseModel):
+        if is_section(type(node)):
             key, node, kind = _field(node, rest[0], at)
             used = 1
         elif isinstance(node, dict):
@@ -77,12 +78,11 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
 
 
 def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
-    fields = {field.alias or own: own for own, field in type(node).model_fields.items()}
+    fields = fields_of(type(node))
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
         raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
-    field = type(node).model_fields[fields[name]]
-    return name, getattr(node, fields[name], None), field.annotation
+    return name, getattr(node, attributes_of(type(node))[name], None), fields[name].annotation
 
 
 def _named(names: Sequence[str], rest: Sequence[str], at: str) -> tuple[str, int]:
@@ -112,9 +112,10 @@ def opened(node: Any) -> Any:
 
     What is within stays as it is: sections that were checked are not checked again.
     """
-    if isinstance(node, BaseModel):
-        fields = type(node).model_fields.items()
-        return {f.alias or n: getattr(node, n) for n, f in fields if n in node.model_fields_set}
+    if is_section(type(node)):
+        names = attributes_of(type(node))
+        given = getattr(node, "model_fields_set", names.values())
+        return {n: getattr(node, a) for n, a in names.items() if a in given and hasattr(node, a)}
     return list(node) if isinstance(node, (tuple, list)) else dict(node)
 
 

@@ -13,17 +13,17 @@ from pydantic import PrivateAttr, Strict, ValidationError
 
 from ..base.declared import Text, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
+from ..base.validation import validation_errors
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.meshfile import SUFFIXES
-from ..sensor.survey import SENSORS_MOST, Steps
+from ..sensor import Material, Navigation
+from ..sensor.survey import SENSORS_MOST, CloudOptions, Steps
 from ..sensor.trajectory import CENTRE
+from ..sensor.weather import Weather
 from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
 from .sections import (
-    CloudSection,
     CopiesSection,
-    MaterialSection,
-    NavigationSection,
     NoiseSection,
     OutputSection,
     PlanningSection,
@@ -33,12 +33,10 @@ from .sections import (
     SceneSection,
     Section,
     SensorSection,
-    WeatherSection,
     may_be_empty,
     scene_in_short,
 )
 from .traffic import TrafficSection
-from .validation_errors import validation_errors
 
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
@@ -127,7 +125,7 @@ class Scenario(Section):
         ),
     ] = None
     materials: Annotated[
-        tuple[MaterialSection, ...],
+        tuple[Material, ...],
         Strict(False),
         told(
             "materials of objects, by name; the last entry for an object counts",
@@ -137,15 +135,15 @@ class Scenario(Section):
     ] = ()
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
-    weather: Annotated[WeatherSection, may_be_empty(WeatherSection)] = WeatherSection()
+    weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
     navigation: Annotated[
-        NavigationSection | None,
+        Navigation | None,
         told(
             "IMU and GNSS receiver of the carrier, with errors that drift",
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
         ),
     ] = None
-    cloud: Annotated[CloudSection, may_be_empty(CloudSection)] = CloudSection()
+    cloud: Annotated[CloudOptions, may_be_empty(CloudOptions)] = CloudOptions()
     output: Annotated[OutputSection, may_be_empty(OutputSection)] = OutputSection()
     planning: Annotated[PlanningSection, may_be_empty(PlanningSection)] = PlanningSection()
     pool: Annotated[PoolSection, may_be_empty(PoolSection)] = PoolSection()

@@ -24,6 +24,10 @@ class _Plain(GenerateJsonSchema):
         # pydantic 2.12 leaves out the docstrings of models that are dataclasses as well.
         return {"description": inspect.getdoc(schema["cls"])} | super().model_schema(schema)
 
+    def dataclass_schema(self, schema: Any) -> dict[str, Any]:
+        summary, _, _ = (inspect.getdoc(schema["cls"]) or "").partition("\n\n")
+        return super().dataclass_schema(schema) | {"description": summary}
+
     def default_schema(self, schema: Any) -> dict[str, Any]:
         made = super().default_schema(schema)
         if isinstance(made.get("default"), dict) or made.get("default") == float("inf"):

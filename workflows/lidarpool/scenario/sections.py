@@ -12,7 +12,6 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
 
-from ..base.arguments import shown
 from ..base.declared import (
     Angle,
     Coordinate,
@@ -20,8 +19,8 @@ from ..base.declared import (
     Text,
     TextOrTexts,
     Triple,
-    declared,
     is_text,
+    must_be,
     short,
     told,
 )
@@ -30,13 +29,11 @@ from ..export.table import EXPORTS, FORMATS, LAYOUTS
 from ..plan.planning import Search
 from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
-from ..sensor import Gnss, Imu, Material, Mounted, Navigation, Noise, Pose, Returns, Sensor
+from ..sensor import Mounted, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
 from ..sensor.materials import SemanticClass
 from ..sensor.models import datasheet, load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
-from ..sensor.survey import CloudOptions
-from ..sensor.weather import Weather
 
 COPIES_MOST = 1_000_000  # of one entry
 
@@ -142,36 +139,24 @@ MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | Mes
 MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
 
 
-class PoseSection(Section, Pose):
-    """Pose of the sensor, in world coordinates."""
-
-    def pose(self) -> Pose:
-        """Return it as a pose."""
-        return Pose(**declared(self, Pose))
-
-
 def _pose(value: Any) -> Any:
     if isinstance(value, list):
         return {"position": value}
-    if not isinstance(value, (dict, PoseSection)):
-        raise ValueError(
-            f"a pose is x, y and z in metres, [0, 0, 1], or position and angles, {{position: "
-            f"[0, 0, 1], yaw_deg: 90}}; given is {shown(value)}."
+    if not isinstance(value, (dict, Pose, CopySection)):
+        raise must_be(
+            "x, y and z in metres, [0, 0, 1], or position and angles, {position: [0, 0, 1], "
+            "yaw_deg: 90}"
         )
     return value
 
 
-PoseEntry = Annotated[
-    PoseSection, BeforeValidator(_pose, json_schema_input_type=Triple | PoseSection)
-]
-
-
+PoseEntry = Annotated[Pose, BeforeValidator(_pose, json_schema_input_type=Triple | Pose)]
 Place = Annotated[
     tuple[Coordinate, ...], Strict(False), Field(min_length=2, max_length=3)
 ]  # x and y, perhaps z
 
 
-class CopySection(PoseSection):
+class CopySection(Section, Pose):
     """Where one of several copies stands; in YAML also just [x, y] or [x, y, z]."""
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
@@ -465,10 +450,6 @@ _GRID = {  # {field of a grid: its default}
 }
 
 
-class CloudSection(Section, CloudOptions):
-    """Which hits become points, and their columns."""
-
-
 class ExportSection(Section):
     """A format to export the cloud to; in YAML also just its name."""
 
@@ -511,70 +492,12 @@ class OutputSection(Section):
         return tuple(dict.fromkeys(chain.from_iterable(needed)))
 
 
-class MaterialSection(Section, Material):
-    """Material of objects; the last entry for an object counts."""
-
-
 class ReturnsSection(Section, Returns):
     """Sub-rays of a beam, and which of its returns are reported."""
 
 
 class NoiseSection(Section, Noise):
     """Noise of ranges and angles, lost returns and false ones."""
-
-
-class WeatherSection(Section, Weather):
-    """Extinction of the air, and returns from it."""
-
-
-class InstrumentPose(PoseSection):
-    """Position and angles of an instrument in the carrier's axes."""
-
-    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
-
-
-class ImuSection(Section, Imu):
-    """Inertial measurement unit of the carrier; its noise is named as in kalibr's imu.yaml."""
-
-    mount: Annotated[InstrumentPose, told("its pose in the carrier's axes")] = InstrumentPose()
-
-
-class GnssSection(Section, Gnss):
-    """GNSS receiver of the carrier."""
-
-    mount: Annotated[InstrumentPose, told("pose of its antenna in the carrier's axes")] = (
-        InstrumentPose()
-    )
-
-
-class NavigationSection(Section, Navigation):
-    """IMU and GNSS receiver of the carrier, with errors that drift: imu.csv and gnss.csv."""
-
-    imu: Annotated[
-        ImuSection | None,
-        told(
-            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
-            "/imu/data_raw",
-            {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
-        ),
-    ] = None
-    gnss: Annotated[
-        GnssSection | None,
-        told(
-            "GNSS receiver: positions in gnss.csv, /gnss/fix",
-            {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
-        ),
-    ] = None
-
-    def navigation(self) -> Navigation:
-        """Return them as instruments."""
-        imu, gnss = self.imu, self.gnss
-        return Navigation(
-            imu=imu and Imu(**declared(imu, Imu) | {"mount": imu.mount.pose()}),
-            gnss=gnss and Gnss(**declared(gnss, Gnss) | {"mount": gnss.mount.pose()}),
-            gravity_m_s2=self.gravity_m_s2,
-            seed=self.seed,
-        )
 
 
 class Obstacle(Section):

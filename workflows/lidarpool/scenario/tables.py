@@ -15,9 +15,9 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from ..base.allowance import check_fits
 from ..base.errors import LidarpoolError, Mistakes
+from ..base.validation import sections_in, validation_errors
 from ..base.yamlfile import load_yaml
 from ..sensor.calibrations import said
-from .validation_errors import models_in, validation_errors
 
 _MARKS = ",;\t"  # between cells
 _WHOLE = re.compile(r"[-+]?[0-9]+")
@@ -73,7 +73,7 @@ def read_rows(path: Path, kind: Any) -> list[Row]:
         raise LidarpoolError(f"{path} does not exist: check the name and the folder.") from error
     except (OSError, ValueError, csv.Error, LidarpoolError) as error:
         raise LidarpoolError(f"{path} is not a usable table: {said(error)}") from error
-    model = next(models_in(entry), BaseModel)
+    model = next(sections_in(entry), BaseModel)
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:

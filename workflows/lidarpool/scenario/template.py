@@ -6,9 +6,9 @@ import textwrap
 from collections.abc import Iterator, Sequence
 from typing import Any
 
-from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from ..base.validation import fields_of, is_section
 from .placing import Placing, as_entry, on_one_line
 from .scenario import MESH_CLOUD, Scenario
 from .schema import SCHEMA_FILE
@@ -50,12 +50,12 @@ def scenario_template(files: Sequence[dict[str, str]] = (), placing: Placing | N
 def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
     """Yield the lines of a section or a top-level field, `given` in place of some defaults."""
     section = field.annotation
-    if not (isinstance(section, type) and issubclass(section, BaseModel)):
+    if not (isinstance(section, type) and is_section(section)):
         yield from _lines(name, field, "")
         return
     summary = (section.__doc__ or "").partition("\n")[0].partition(";")[0].rstrip(".")
     yield from _beside(f"{name}:", summary, "")
-    for inner, content in section.model_fields.items():
+    for inner, content in fields_of(section).items():
         if inner in given:
             yield from _beside(
                 f"{inner}: {on_one_line(given[inner])}", content.description or "", "  "

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..base.arguments import checked_fields
 from ..base.arrays import Floats, Indices
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
 from .colours import joined

@@ -12,9 +12,9 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ..base.arguments import checked
 from ..base.arrays import AnyArray, Floats, Ints
 from ..base.declared import Seed
+from ..base.validation import checked
 from . import city_kinds
 from .city_furniture import MOST_CARS, parked_cars, street_trees
 from .city_kinds import Solid

@@ -11,9 +11,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arguments import checked_fields
 from ..base.arrays import AnyArray, Bools, Floats, Floats32, Indices, Ints, Ints32
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from ..sensor import Pose
 from .colours import Colours
 from .mesh import Mesh, Voxels

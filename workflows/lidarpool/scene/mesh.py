@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from ..base.arguments import as_array, checked_fields
 from ..base.arrays import AnyArray, Bools, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked_fields
 from .colours import Colours
 
 UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left

@@ -13,9 +13,9 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from ..base.allowance import check_fits
-from ..base.arguments import checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, prefixed
+from ..base.validation import checked
 from ..base.vocabulary import UNITS_M
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Track

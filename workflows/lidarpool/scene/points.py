@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 from ..base.allowance import bytes_of, check_fits, memory
-from ..base.arguments import checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, prefixed
 from ..base.open3d_module import load_open3d
+from ..base.validation import checked
 from ..base.words import printable
 from .instances import FARTHEST_M
 from .mesh import Mesh

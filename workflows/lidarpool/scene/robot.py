@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arguments import as_array, checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked
 from ..base.words import counted, did_you_mean, printable
 from ..sensor import Pose, Stations, Trajectory
 from ..sensor.calibrations import text_of

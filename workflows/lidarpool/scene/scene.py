@@ -11,9 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..base.arguments import as_array, checked, checked_fields, shown
 from ..base.arrays import Bools, Floats, Ints32
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked, checked_fields, shown
 from ..base.words import counted
 from ..sensor import Pose, Track
 from . import colours as coloured

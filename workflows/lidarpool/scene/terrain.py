@@ -7,10 +7,10 @@ from typing import Annotated
 import numpy as np
 from pydantic import Field
 
-from ..base.arguments import checked
 from ..base.arrays import Floats, Ints
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError
+from ..base.validation import checked
 from .instances import Instance
 from .mesh import Mesh
 from .plants import MOST_TREES, SCALES, SPECIES, all_trees, placed

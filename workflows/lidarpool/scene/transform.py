@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arguments import as_array
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array
 from ..sensor import Pose
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that

@@ -18,9 +18,9 @@ from xml.etree.ElementTree import Element, ParseError
 import numpy as np
 
 from ..base.allowance import Allowance, check_fits
-from ..base.arguments import checked, shown
 from ..base.arrays import Bytes, Floats
 from ..base.errors import LidarpoolError, prefixed
+from ..base.validation import checked, shown
 from ..base.words import printable
 from ..base.xmlfile import xml_root
 from ..sensor.trajectory import rotations_of

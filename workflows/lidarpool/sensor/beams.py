@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..base.arguments import as_array, checked, checked_fields
 from ..base.arrays import Floats, Ints
 from ..base.declared import told
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked, checked_fields
 
 CHANNELS_MOST = 65_535  # the type of the column
 

@@ -7,13 +7,13 @@ normal from the vertical.
 from __future__ import annotations
 
 from functools import cache
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from ..base.arguments import shown
 from ..base.arrays import Floats
+from ..base.declared import allowed
 
 LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
@@ -23,18 +23,9 @@ _NODES = 361  # angles of light for which integrals are tabulated, from 0 to 90 
 _ANGLES = 500  # of leaves, in the integrals
 
 
-def _named_or_ratio(value: Any) -> Any:
-    """Refuse what is neither, in one line instead of pydantic's for each."""
-    if value in NAMES or (type(value) in (int, float) and 0.05 <= value <= 20):
-        return value
-    raise ValueError(
-        f"given is {shown(value)}; it must be one of {', '.join(NAMES)}, or the ratio of an "
-        "ellipsoid's axes, 0.05 to 20."
-    )
-
-
 LeafAngle = Annotated[
-    LeafAngles | Annotated[float, Field(ge=0.05, le=20)], BeforeValidator(_named_or_ratio)
+    LeafAngles | Annotated[float, Field(ge=0.05, le=20)],
+    allowed(f"one of {', '.join(NAMES)}, or the ratio of an ellipsoid's axes, 0.05 to 20"),
 ]
 
 

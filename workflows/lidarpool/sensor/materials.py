@@ -14,12 +14,12 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from ..base.arguments import checked_fields, shown
 from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import Share, TextOrTexts, told, written_as
+from ..base.declared import Share, TextOrTexts, allowed, told, written_as
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from ..base.words import did_you_mean
 from .leaves import LeafAngle
 
@@ -57,13 +57,6 @@ def reflectances() -> dict[str, Measured]:
     }
 
 
-def _share_or_texture(value: Any) -> Any:
-    """Refuse what is neither, in one line instead of pydantic's for each."""
-    if value in (None, "texture") or (type(value) in (int, float) and 0 <= value <= 1):
-        return value
-    raise ValueError(f"given is {shown(value)}; it must be 0 to 1, or texture.")
-
-
 @dataclass(frozen=True)
 @checked_fields
 class Material:
@@ -86,7 +79,7 @@ class Material:
     ]
     reflectance: Annotated[
         Share | Literal["texture"] | None,
-        BeforeValidator(_share_or_texture),
+        allowed("0 to 1, or texture"),
         told(
             "share of light that is scattered; by default 0.5, for glass and mirrors "
             "0; texture: the luminance of the colour that was hit"

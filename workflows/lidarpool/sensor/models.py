@@ -15,9 +15,9 @@ import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
 
 from ..base.allowance import check_fits
-from ..base.arguments import checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.validation import checked, validation_errors
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
@@ -292,13 +292,8 @@ def _read(path: Path | Traversable) -> SensorModel:
             check_fits(path)
         return SensorModel.model_validate(load_yaml(path.read_text("utf-8-sig")))
     except ValidationError as error:
-        first = error.errors()[0]
-        place = ".".join(map(str, first["loc"])) or "as a whole"
-        said_of_it = f"{first['msg'].removeprefix('Value error, ')}."
-        if first["type"] == "extra_forbidden":
-            fields = {field for part in _Part.__subclasses__() for field in part.model_fields}
-            said_of_it = f"this is not a field.{did_you_mean(str(first['loc'][-1]), fields)}"
-        raise LidarpoolError(f"{path}, {place}: {said_of_it}") from error
+        lines = validation_errors(error, SensorModel)
+        raise LidarpoolError("\n".join(f"{path}: {line}" for line in lines)) from error
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
 

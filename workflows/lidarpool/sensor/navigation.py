@@ -22,12 +22,12 @@ from typing import Annotated, NamedTuple, Protocol
 import numpy as np
 from pydantic import Field, Strict
 
-from ..base.arguments import checked_fields
 from ..base.arrays import Floats, Ints
-from ..base.declared import Seed, told, written_as
+from ..base.declared import Seed, told
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from .noise import Purpose, named_seed, normal
-from .trajectory import CENTRE, Pose, Trajectory, velocities
+from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, velocities
 
 BLOCK = 1 << 14  # samples that are made at a time
 
@@ -59,7 +59,7 @@ class Imu:
     rate_hz: Annotated[
         float, told("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
     ] = 200.0
-    mount: Pose = CENTRE
+    mount: Annotated[Pose, AT_CENTRE, told("its pose in the carrier's axes")] = CENTRE
     gyroscope_noise_density: Annotated[TurnNoise, told("angle random walk, rad/s/sqrt(Hz)")] = 0.0
     gyroscope_bias: Annotated[
         TurnNoise,
@@ -94,7 +94,7 @@ class Gnss:
     """
 
     rate_hz: Annotated[float, told("positions a second", ge=0.0001, le=1000)] = 10.0
-    mount: Pose = CENTRE
+    mount: Annotated[Pose, AT_CENTRE, told("pose of its antenna in the carrier's axes")] = CENTRE
     horizontal_m: Annotated[
         Deviation, told("standard deviation of white noise to the east and north")
     ] = 0.0
@@ -109,24 +109,13 @@ class Gnss:
     drift_vertical_m: Annotated[Deviation, told("the same, up")] = 0.0
     drift_time_s: Annotated[Correlation, told("correlation time of the drift")] = 600.0
     origin: Annotated[
-        tuple[float, float, float] | None,
-        written_as(Place | None),
+        Place | None,
         told(
             "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
             "world's zero, x to the east and y to the north; by default by cloud.epsg",
             [48.7758, 9.1829, 290.0],
         ),
     ] = None
-
-    def __post_init__(self) -> None:
-        given = self.origin
-        if given is not None and not (
-            len(given) == 3 and np.isfinite(given).all() and abs(given[0]) <= 90
-        ):
-            raise LidarpoolError(
-                f"origin is {given}; it must be latitude and longitude, degrees, and height, "
-                "metres: (48.8, 9.2, 290)."
-            )
 
 
 @dataclass(frozen=True)
@@ -145,8 +134,21 @@ class Navigation:
         If a number is outside its range.
     """
 
-    imu: Imu | None = None
-    gnss: Gnss | None = None
+    imu: Annotated[
+        Imu | None,
+        told(
+            "inertial measurement unit: angular velocities and specific forces in imu.csv, "
+            "/imu/data_raw",
+            {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
+        ),
+    ] = None
+    gnss: Annotated[
+        Gnss | None,
+        told(
+            "GNSS receiver: positions in gnss.csv, /gnss/fix",
+            {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
+        ),
+    ] = None
     gravity_m_s2: Annotated[
         float, told("gravity, downwards along the world's z axis", ge=-100, le=100)
     ] = 9.80665

@@ -17,10 +17,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
-from ..base.arguments import checked_fields
 from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import Seed, Share, told
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from .materials import at_right_angles
 
 # Detection threshold for signal plus noise, in standard deviations.

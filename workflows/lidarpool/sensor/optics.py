@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import log, pi, sqrt
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
-from pydantic import BeforeValidator, Field
+from pydantic import Field
 
-from ..base.arguments import checked_fields, shown
 from ..base.arrays import Floats
-from ..base.declared import told
+from ..base.declared import allowed, told
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields
 from .disc import SUBRAYS, Beam, Profile
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
@@ -26,18 +26,11 @@ Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "all"]
 
 
-def _one_or_two(value: Any) -> Any:
-    """Refuse what is neither, in one line instead of pydantic's for each."""
-    angles = list(value) if isinstance(value, (list, tuple)) else [value]
-    fits = all(type(angle) in (int, float) and 0 <= angle <= 1000 for angle in angles)
-    if value is None or (fits and len(angles) == (2 if isinstance(value, (list, tuple)) else 1)):
-        return tuple(value) if isinstance(value, list) else value
-    raise ValueError(f"given is {shown(value)}; it must be 0 to 1000, or two such: [across, up].")
-
-
+Angle = Annotated[float, Field(ge=0, le=1000)]
 # Full angle of a beam's cone, at 1/e² of its maximum; or two, across and up.
 Divergence = Annotated[
-    Annotated[float, Field(ge=0, le=1000)] | Sequence[float], BeforeValidator(_one_or_two)
+    Angle | Annotated[Sequence[Angle], Field(min_length=2, max_length=2)],
+    allowed("0 to 1000, or two such: [across, up]"),
 ]
 Diameter = Annotated[float, Field(ge=0, le=10)]
 Pulse = Annotated[float, Field(ge=0, le=1e6)]
@@ -66,7 +59,7 @@ class Optics:
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, Sequence):
-            object.__setattr__(self, "divergence_mrad", _pair(self.divergence_mrad))
+            object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
 
 @dataclass(frozen=True)
@@ -131,7 +124,7 @@ class Returns:
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, Sequence):
-            object.__setattr__(self, "divergence_mrad", _pair(self.divergence_mrad))
+            object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
     def of(self, optics: Optics) -> tuple[float, float]:
         """Divergence, radians, and least distance of two returns, metres.
@@ -164,7 +157,7 @@ class Returns:
                 f"returns.subrays is {self.subrays}, but the sensor has no divergence: give "
                 "returns.divergence_mrad."
             )
-        across, up = _pair(wide) if isinstance(wide, Sequence) else (wide or 0.0, wide or 0.0)
+        across, up = wide if isinstance(wide, Sequence) else (wide or 0.0, wide or 0.0)
         return across / 1000, up / 1000
 
     def length_ns(self, optics: Optics) -> float:
@@ -190,15 +183,6 @@ class Returns:
                 "or give a longer pulse_ns."
             )
         return sigma
-
-
-def _pair(divergence: Sequence[float]) -> tuple[float, float]:
-    """Divergences across and up; LidarpoolError if there are not two."""
-    if len(divergence) != 2:
-        raise LidarpoolError(
-            f"divergence_mrad is {shown(divergence)}; it must be one angle, or two: [across, up]."
-        )
-    return divergence[0], divergence[1]
 
 
 def spread(

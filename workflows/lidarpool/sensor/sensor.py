@@ -11,10 +11,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 from pydantic import Field
 
-from ..base.arguments import checked, checked_fields
 from ..base.arrays import Floats, Ints
 from ..base.declared import told
 from ..base.errors import LidarpoolError
+from ..base.validation import checked, checked_fields
 from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
 from .optics import LIGHT_M_NS, Optics
 

@@ -14,9 +14,9 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
-from ..base.arguments import checked_fields, shown
 from ..base.declared import FILLED_IN, told, written_as
 from ..base.errors import LidarpoolError
+from ..base.validation import checked_fields, shown
 from ..columns.table import (
     COORDINATES,
     OPTIONAL,
@@ -113,6 +113,7 @@ class ScanSpec:
 
 
 @dataclass(frozen=True, kw_only=True)
+@checked_fields
 class CloudOptions:
     """Which hits become points, and their columns.
 

@@ -9,10 +9,10 @@ from typing import Annotated, Any, ClassVar, Literal, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arguments import as_array, checked_fields, shown
 from ..base.arrays import Bools, Floats, Indices
-from ..base.declared import Angle, Triple, told, written_as
+from ..base.declared import Angle, Triple, short, told, written_as
 from ..base.errors import LidarpoolError
+from ..base.validation import as_array, checked_fields, shown
 from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
@@ -42,9 +42,6 @@ class Pose:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(map(float, self.position)))
-        numbers = (*self.position, self.yaw_deg, self.pitch_deg, self.roll_deg)
-        if len(self.position) != 3 or not np.isfinite(numbers).all():
-            raise LidarpoolError(f"A pose needs three finite coordinates and angles, not {self}.")
 
     @property
     def rotation(self) -> Floats | None:
@@ -109,6 +106,19 @@ def pose_of(name: str, given: Any) -> Pose:
 
 
 CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a carrier
+
+
+@dataclass(frozen=True)
+class InstrumentPose(Pose):
+    """Position and angles of an instrument in the carrier's axes, as a file has them."""
+
+    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
+
+
+# A pose in a file whose position may be left out.
+AT_CENTRE = short(
+    lambda v: isinstance(v, dict), lambda v: {"position": [0] * 3} | v, InstrumentPose
+)
 
 
 class Trajectory(Protocol):

@@ -12,9 +12,9 @@ import numpy as np
 from pydantic import Field
 
 from ..base.allowance import check_fits
-from ..base.arguments import checked
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
+from ..base.validation import checked
 from .calibrations import said, text_of
 from .trajectory import Beyond, Track, quaternions_of, rotations_of
 

@@ -15,6 +15,7 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.declared import told
+from ..base.validation import checked_fields
 from .materials import REFERENCE_M, extinction
 
 # Index of refraction of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
@@ -36,6 +37,7 @@ LARGE = 2.0  # light that a large particle takes, in its cross-sections: half of
 
 
 @dataclass(frozen=True, kw_only=True)
+@checked_fields
 class Weather:
     """Extinction of the air, and returns from it.
 

@@ -15,9 +15,9 @@ from pydantic import Field
 
 from raybeam.poses import check_poses
 
-from ..base.arguments import checked, shown
 from ..base.arrays import Floats, Floats32
 from ..base.errors import LidarpoolError
+from ..base.validation import checked, shown
 from ..base.words import did_you_mean
 from ..columns.cloud import Cloud
 from ..columns.table import AXES, SCAN, Column

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
@@ -11,9 +10,10 @@ import numpy as np
 
 from poolpart import TaskRecord
 
-from ...base.words import counted
+from ...base.words import counted, natural
 from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
+from ..report import STAGES
 from .words import duration
 
 WIDTH = 1000  # units of the drawing, which the page scales
@@ -52,14 +52,8 @@ class Timeline(NamedTuple):
     row: int = ROW  # height of a row
 
 
-def make_timeline(
-    stages: Sequence[StageTotals], records: Sequence[TaskRecord], names: dict[str, str]
-) -> Timeline | None:
-    """Lay out the tasks of a run; None if nothing ran.
-
-    `stages` count all tasks, `records` are some of them, and `names` is {stage: its name on the
-    page}.
-    """
+def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
+    """Lay out the tasks of a run, of which some have records; None if nothing ran."""
     if not stages:
         return None
     begin = min(stage.start for stage in stages)
@@ -75,8 +69,8 @@ def make_timeline(
 
     overview = [
         Row(
-            names[stage.stage],
-            f"{names[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
+            STAGES[stage.stage],
+            f"{STAGES[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
             f"work within {duration(stage.stop - stage.start)}",
             stage.stage,
             bars(stage.busy),
@@ -85,37 +79,37 @@ def make_timeline(
     ]
     groups = [Group("Stages", "while at least one task ran", overview)]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    by_partition: dict[str, list[TaskRecord]] = defaultdict(list)
-    for record in records:
+    # {partition: {(worker, stage): tasks}}
+    drawn: dict[str, dict[tuple[str, str], list[TaskRecord]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for record in (record for stage in stages for record in stage.records):
         where = record.partition if not record.misplaced else " + ".join(record.resources)
-        by_partition[where or "no partition"].append(record)
-    for partition, tasks in sorted(by_partition.items()):
-        workers = {task.worker for task in tasks}  # tasks that have a record
+        drawn[where or "no partition"][record.worker, record.stage].append(record)
+    for partition, tasks in sorted(drawn.items()):
+        workers = {worker for worker, _ in tasks}  # of tasks that have a record
         workers = workers.union(*(s.workers for s in stages if s.partition == partition))
-        detail = f"{counted(len(workers), 'worker')}, "
-        detail += counted(max(ran[partition], len(tasks)), "task")
-        if ran[partition] > len(tasks):  # else gaps would look like idle time
-            detail += f", of which {len(tasks):,} are drawn: gaps are not all idle time"
-        rows: dict[tuple[str, str], list[TaskRecord]] = defaultdict(list)
-        for task in tasks:
-            rows[task.worker, task.stage].append(task)
-        busiest = sorted(rows, key=lambda row: -sum(task.seconds for task in rows[row]))
-        if len(rows) > ROWS_MOST:
-            detail += f"; the busiest {ROWS_MOST} of {len(rows):,} rows"
-        order = list(names)
-        drawn = []
-        for row in sorted(busiest[:ROWS_MOST], key=lambda r: (_natural(r[0]), order.index(r[1]))):
-            (worker, stage), those = row, rows[row]
-            busy = duration(sum(task.seconds for task in those))
-            told = f"{worker}: {names[stage]}, {counted(len(those), 'task')}, {busy}"
-            drawn.append(Row(worker, told, stage, bars((t.start, t.stop) for t in those)))
-        groups.append(Group(partition, detail, drawn))
+        count = sum(map(len, tasks.values()))
+        detail = f"{counted(len(workers), 'worker')}, {counted(max(ran[partition], count), 'task')}"
+        if ran[partition] > count:  # else gaps would look like idle time
+            detail += f", of which {count:,} are drawn: gaps are not all idle time"
+        if len(tasks) > ROWS_MOST:
+            detail += f"; the busiest {ROWS_MOST} of {len(tasks):,} rows"
+        work = {row: sum(task.seconds for task in tasks[row]) for row in tasks}
+        busiest = sorted(work, key=lambda row: -work[row])[:ROWS_MOST]
+        rows = [
+            Row(
+                worker,
+                f"{worker}: {STAGES[stage]}, {counted(len(tasks[worker, stage]), 'task')}, "
+                + duration(work[worker, stage]),
+                stage,
+                bars((task.start, task.stop) for task in tasks[worker, stage]),
+            )
+            for worker, stage in sorted(
+                busiest, key=lambda row: (natural(row[0]), [*STAGES].index(row[1]))
+            )
+        ]
+        groups.append(Group(partition, detail, rows))
     marks = np.arange(0, seconds, nice_step(seconds / 6))
     ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
     return Timeline(seconds, ticks, groups, sum(stage.tasks for stage in stages))
-
-
-def _natural(worker: str) -> list[tuple[int, str]]:
-    """Sort key: GPU-2 before GPU-10."""
-    pieces = re.split(r"(\d+)", worker)
-    return [(int(p), "") if p.isdecimal() else (-1, p) for p in pieces]

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Sequence
+from typing import Any
+
+from markupsafe import Markup
 
 MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
 _SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
@@ -14,6 +18,18 @@ def printable(text: str) -> str:
     return "".join(
         c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
     )
+
+
+def markdown(text: str) -> str:
+    """Text of a user as one line of Markdown that shows it as it is."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
+
+
+def code(text: str) -> Markup:
+    """Name as code of Markdown; with letters that end code or a cell, as text."""
+    is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
+    return Markup(f"`{text}`" if is_plain else markdown(text))
 
 
 def grouped(count: int) -> str:
@@ -61,14 +77,15 @@ def excess(fraction: float) -> str:
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
-def bound(value: float) -> str:
-    """Minimum or maximum of a column, whole numbers with all their digits."""
-    return f"{value:,}" if isinstance(value, int) else f"{value:,.6g}"
-
-
-def metres(value: float | None) -> str:
-    """Length in metres, or words for none."""
-    return "–" if value is None else f"{value:,.2f} m".replace("-", MINUS)
+def told(value: Any, digits: int = 6) -> str:
+    """Return a number, whole ones with all their digits; text, true or false, or several."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return " × ".join(told(one, digits) for one in value)
+    if isinstance(value, float):
+        return f"{value:,.{digits}g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def numbers(values: Sequence[float]) -> str:
@@ -80,7 +97,8 @@ def millimetres(value: float | None) -> str:
     """Length in the unit that suits it, or words for none."""
     if value is None:
         return "unknown"
-    return f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
+    text = f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
+    return text.replace("-", MINUS)
 
 
 def ratio(value: float | None) -> str:

@@ -1,0 +1,429 @@
+"""Validation of what users give, in Python and in files, by pydantic; its errors as sentences."""
+
+from __future__ import annotations
+
+import inspect
+import os
+import re
+import reprlib
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from dataclasses import fields as dataclass_fields
+from datetime import datetime
+from functools import cache, wraps
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import (
+    Annotated,
+    Any,
+    Literal,
+    ParamSpec,
+    TypeVar,
+    Union,
+    get_args,
+    get_origin,
+    get_type_hints,
+)
+
+import numpy as np
+from numpy.typing import ArrayLike, DTypeLike
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    ConfigDict,
+    GetCoreSchemaHandler,
+    GetPydanticSchema,
+    Strict,
+    TypeAdapter,
+    ValidationError,
+    WrapValidator,
+)
+from pydantic.fields import FieldInfo
+from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
+from typing_extensions import TypedDict
+
+from .arrays import AnyArray
+from .errors import LidarpoolError
+from .words import counted, did_you_mean
+
+P = ParamSpec("P")
+R = TypeVar("R")
+C = TypeVar("C", bound=type)
+Fields = Mapping[str, FieldInfo]
+Place = tuple[int | str, ...]
+
+# No others, finite numbers, no conversion of text to numbers.
+STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+_PYTHON = ConfigDict(strict=True, allow_inf_nan=False, validate_by_name=True)
+
+# {class: an example}
+_EXAMPLES = {
+    "Beams": "Beams.even(32, 40)",
+    "Gnss": "Gnss(horizontal_m=0.02)",
+    "Imu": "Imu(gyroscope_noise_density=1e-4)",
+    "Material": "Material('Window*', reflectance=0.1)",
+    "Mesh": "Mesh('hall', vertices, faces)",
+    "Mounted": "Mounted(sensor, Pose((1, 0, 2)), 'roof')",
+    "Navigation": "Navigation(imu=Imu(), gnss=Gnss())",
+    "Noise": "Noise(range_m=0.01)",
+    "Planning": "Planning((0, 0), (10, 0), centres=[(5, 0)], radii=2)",
+    "Pose": "Pose((0, 0, 1), yaw_deg=90)",
+    "Returns": "Returns('dual')",
+    "Scene": "Scene.load('hall.glb')",
+    "Sensor": "load_sensor('velodyne/vlp16')",
+    "Survey": "Survey(poses=[(0, 0, 1)])",
+    "Trajectory": "load_trajectory('drive.tum')",
+}
+# {kind of pydantic's error, or class: what is allowed}
+_ALLOWED = {
+    "bool_type": "true or false",
+    "callable_type": "a function",
+    "dataclass_type": "a mapping",
+    "dict_type": "a mapping",
+    "float_type": "a number",
+    "int_from_float": "a whole number",
+    "int_type": "a whole number",
+    "model_type": "a mapping",
+    "string_type": "text",
+    "Mapping": "a dict",
+    "PathLike": "a path",
+}
+_ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
+_LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
+_ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
+_PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
+_LETTERS = 160  # of a value that is shown
+
+
+def checked(function: Callable[P, R]) -> Callable[P, R]:
+    """Let a function refuse arguments that do not fit their annotations; they stay as they are.
+
+    Raises
+    ------
+    LidarpoolError
+        From the function: the argument, its value, and what it must be.
+    """
+
+    @wraps(function)
+    def refusing(*args: P.args, **kwargs: P.kwargs) -> R:
+        # Python reports too many, too few and unknown ones.
+        _check(function, {**dict(zip(_usual(function), args, strict=False)), **kwargs})
+        return function(*args, **kwargs)
+
+    return refusing
+
+
+def checked_fields(cls: C) -> C:
+    """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
+
+    In a section of a file it is a section itself, of the same fields.
+
+    Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
+    """
+    after: Callable[[Any], None] = getattr(cls, "__post_init__", lambda self: None)
+
+    def __post_init__(self: Any) -> None:  # noqa: N807
+        _check(cls, vars(self))
+        after(self)
+
+    cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
+    cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
+    cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
+    return cls
+
+
+def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:
+    """Make a dataclass a section of files: of its fields as a mapping, or an instance."""
+    schema = handler(source)
+    own: Any = handler.resolve_ref_schema(schema)
+    own["strict"] = False  # strict ones take only instances
+
+    def made(value: Any, inner: Callable[[Any], Any]) -> Any:
+        try:
+            return inner(value)
+        except LidarpoolError as error:  # of `__post_init__`
+            raise ValueError(str(error)) from error
+
+    return core_schema.no_info_wrap_validator_function(made, schema)
+
+
+def _check(thing: Any, given: Mapping[str, Any]) -> None:
+    """Refuse values, other than defaults, that do not fit the annotations of a thing."""
+    usual = _usual(thing)
+    given = {name: value for name, value in given.items() if value is not usual.get(name, usual)}
+    if not given:
+        return
+    adapter, fields = _python(thing)
+    try:
+        adapter.validator.validate_python(given)
+    except ValidationError:
+        try:
+            adapter.validator.validate_python(_without_numpy(given))
+        except ValidationError as error:
+            first = next(_sentences(error, fields, in_file=False))
+            raise LidarpoolError(first) from None
+
+
+def _without_numpy(value: Any) -> Any:
+    """Return numbers and lists of Python in place of those of NumPy, which will do as well."""
+    if isinstance(value, (np.generic, np.ndarray)) and value.ndim < 2:
+        return value.tolist()
+    if isinstance(value, dict):
+        return {key: _without_numpy(one) for key, one in value.items()}
+    return type(value)(map(_without_numpy, value)) if type(value) in (list, tuple) else value
+
+
+@cache
+def _usual(thing: Any) -> dict[str, Any]:
+    """Defaults of the parameters of a function, or the fields of a dataclass."""
+    if isinstance(thing, type):
+        return {field.name: field.default for field in dataclass_fields(thing)}
+    return {name: one.default for name, one in inspect.signature(thing).parameters.items()}
+
+
+@cache
+def _python(thing: Any) -> tuple[TypeAdapter[Any], Fields]:
+    """Return what validates the arguments of a function, or the fields of a dataclass."""
+    known = get_type_hints(thing, include_extras=True)
+    hints = {name: known[name] for name in _usual(thing) if name in known}
+    table: Any = TypedDict
+    table = table(thing.__name__, {n: _instances(h) for n, h in hints.items()}, total=False)
+    table.__pydantic_config__ = _PYTHON
+    return TypeAdapter(table), {n: FieldInfo.from_annotation(h) for n, h in hints.items()}
+
+
+def _instances(hint: Any) -> Any:
+    """Return an annotation as pydantic is to check it in Python.
+
+    Of a class there must be an instance, of a protocol its attributes; arrays are not checked here.
+    """
+    origin, args = get_origin(hint), get_args(hint)
+    if origin is Annotated:
+        notes = [note for note in hint.__metadata__ if not isinstance(note, GetPydanticSchema)]
+        return Annotated[(_instances(args[0]), *notes)]
+    if origin in (Union, UnionType):
+        kinds = tuple(map(_instances, args))
+        return Any if Any in kinds else Union[kinds]  # noqa: UP007 - of as many as there are
+    if origin in (Sequence, Collection, Iterable, tuple):
+        kinds = tuple(one if one is ... else _instances(one) for one in args)
+        if Any in kinds:
+            return Any
+        items: Any = tuple.__class_getitem__(kinds if origin is tuple else (*kinds, ...))
+        return Annotated[items, Strict(False), WrapValidator(_once)]
+    if origin is Literal or hint in (bool, int, float, str, NoneType, datetime):
+        return hint
+    if origin is Callable or origin is Mapping:
+        return Callable if origin is Callable else _instance(Mapping)
+    if not isinstance(hint, type) or hint is Any:
+        return Any
+    if getattr(hint, "_is_protocol", False):
+        return Annotated[Any, AfterValidator(_having(hint))]
+    return _instance(os.PathLike if hint is Path else hint)
+
+
+def _instance(kind: type) -> Any:
+    return Annotated[Any, GetPydanticSchema(lambda *_: core_schema.is_instance_schema(kind))]
+
+
+def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
+    # An iterator can be read only once: leave it to the function.
+    return value if isinstance(value, Iterator) else handler(value)
+
+
+def _having(protocol: type) -> Callable[[Any], Any]:
+    """Return what refuses values without the attributes of a protocol."""
+    names = [name for name in vars(protocol) if not name.startswith("_")]
+
+    def having(value: Any) -> Any:
+        # Of the class first: a property may take its time.
+        if all(hasattr(type(value), name) or hasattr(value, name) for name in names):
+            return value
+        raise PydanticKnownError("is_instance_of", {"class": protocol.__name__})
+
+    return having
+
+
+def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
+    """Yield a line for each error in a file: field, value given, values allowed.
+
+    For a misspelt name, a field of the same section is suggested.
+    """
+    return _sentences(error, fields_of(section))
+
+
+def _sentences(error: ValidationError, fields: Fields, in_file: bool = True) -> Iterator[str]:
+    found: dict[Place, list[ErrorDetails]] = {}  # of a union, an error for each of its kinds
+    hints = {}
+    for detail in error.errors(include_url=False):
+        place, hint = _followed(detail["loc"], fields)
+        found.setdefault(place, []).append(detail)
+        hints[place] = hint
+    alike: dict[Any, list[Place]] = {}  # {field and kind of mistake: where it was made}
+    for place, details in found.items():
+        # Of a list in which all entries are wrong pydantic says that it has none.
+        within = (other[: len(place)] == place != other for other in found)
+        if details[0]["type"] == "too_short" and any(within):
+            continue
+        field = tuple(step for step in place if not isinstance(step, int))
+        alike.setdefault((field, *(one["type"] for one in details)), []).append(place)
+    for first, *others in alike.values():
+        more = f" {counted(len(others), 'more entry', 'more entries')} like it." if others else ""
+        yield _sentence(first, found[first], hints[first], fields, in_file) + more
+
+
+def _sentence(
+    place: Place, details: Sequence[ErrorDetails], hint: Any, fields: Fields, in_file: bool
+) -> str:
+    at, kind, given = dotted(place), details[0]["type"], details[0]["input"]
+    if kind == "value_error":
+        message = str(details[0]["ctx"]["error"])
+        return f"{at}: {message}" if at else message
+    if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
+        *section, name = place
+        known = [*_within(_followed(section, fields)[1], fields)]
+        if (other := _ALIKE.get(str(name), "")) in known:
+            return f"{at} is not a field. Did you mean {other!r}?"
+        return f"{at} is not a field.{did_you_mean(str(name), known)}"
+    if kind == "missing":
+        return f"{at} is missing; it must be given."
+    value = shown(given)
+    if in_file and (given is None or isinstance(given, bool)):
+        value = "empty" if given is None else str(given).lower()
+    allowed = dict.fromkeys(_allowed(detail, hint) for detail in details)
+    near = ""
+    if kind == "literal_error" and isinstance(given, str):
+        near = did_you_mean(given, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
+    return f"{at} is {value}; {' or '.join(allowed)}.{near}".replace(" or it must be ", " or ")
+
+
+def _allowed(detail: ErrorDetails, hint: Any) -> str:
+    kind, context = detail["type"], detail.get("ctx", {})
+    if kind == "is_instance_of":
+        name = str(context["class"]).rpartition(".")[2]
+        such = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
+        return f"it must be {_ALLOWED.get(name) or _with_article(name)}{such}"
+    if kind in ("list_type", "tuple_type"):
+        inner = [*classes_in(hint)]
+        of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
+        names = (one.__name__ for one in inner)
+        such = next((f", such as [{_EXAMPLES[name]}]" for name in names if name in _EXAMPLES), "")
+        return f"it must be a list{of}{such}"
+    if kind in ("too_short", "too_long"):
+        few = kind == "too_short"
+        count = counted(context["min_length" if few else "max_length"], "entry", "entries")
+        return f"it must have at {'least' if few else 'most'} {count}"
+    if not _LIMITS.keys().isdisjoint(context):
+        limits = _limits(hint)
+        return f"it must be {_range(limits if context.items() <= limits.items() else context)}"
+    message = detail["msg"].replace("Input should be", "it must be", 1)
+    return f"it must be {_ALLOWED[kind]}" if kind in _ALLOWED else message[:1].lower() + message[1:]
+
+
+def _limits(hint: Any) -> dict[str, Any]:
+    """Limits in an annotation, as pydantic's `Field` has them: {name: limit}."""
+    inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
+    limits = {name: limit for one in inner for name, limit in _limits(one).items()}
+    for note in getattr(hint, "__metadata__", ()):
+        for limit in (note, *getattr(note, "metadata", ())):
+            limits |= {name: getattr(limit, name) for name in _LIMITS if hasattr(limit, name)}
+    return limits
+
+
+def _range(limits: Mapping[str, Any]) -> str:
+    numbers = {name: limit if limit % 1 else int(limit) for name, limit in limits.items()}
+    if numbers.keys() == {"ge", "le"}:
+        return f"{numbers['ge']} to {numbers['le']}"
+    return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
+
+
+def _followed(steps: Iterable[int | str], fields: Fields) -> tuple[Place, Any]:
+    """Return a place without the kinds of unions that pydantic adds, and the annotation there."""
+    place: list[int | str] = []
+    hint: Any = None
+    for step in steps:
+        here = _within(hint, fields)
+        if step in here:
+            hint = here[str(step)].rebuild_annotation()
+        elif isinstance(step, str) and _is_union(hint):
+            continue
+        place.append(step)
+    return tuple(place), hint
+
+
+def _within(hint: Any, fields: Fields) -> Fields:
+    """Fields of the sections in an annotation; None has those at the top."""
+    if hint is None:
+        return fields
+    return {name: one for kind in sections_in(hint) for name, one in fields_of(kind).items()}
+
+
+def _is_union(hint: Any) -> bool:
+    args = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
+    kinds = {*args} - {NoneType} if get_origin(hint) in (Union, UnionType) else {}
+    return len(kinds) > 1 or any(map(_is_union, args))
+
+
+def fields_of(section: Any) -> Fields:
+    """Fields of a section by their names in a file."""
+    return {field.alias or name: field for name, field in _declared(section).items()}
+
+
+def attributes_of(section: Any) -> Mapping[str, str]:
+    """Attributes of a section by their names in a file."""
+    return {field.alias or name: name for name, field in _declared(section).items()}
+
+
+@cache
+def _declared(section: Any) -> Fields:
+    if issubclass(section, BaseModel):
+        return section.model_fields
+    hints, made = get_type_hints(section, include_extras=True), FieldInfo.from_annotated_attribute
+    return {one.name: made(hints[one.name], one) for one in dataclass_fields(section)}
+
+
+def is_section(kind: Any) -> bool:
+    """Whether a class is a section of files: a model, or a dataclass with `checked_fields`."""
+    return issubclass(kind, BaseModel) or hasattr(kind, "__pydantic_config__")
+
+
+def sections_in(annotation: Any) -> Iterator[Any]:
+    """Sections in an annotation, such as `tuple[Section, ...] | None`."""
+    return filter(is_section, classes_in(annotation))
+
+
+def classes_in(annotation: Any) -> Iterator[type]:
+    """Classes in an annotation, such as `tuple[Class, ...] | None`."""
+    if isinstance(annotation, type) and not get_args(annotation):
+        yield annotation
+    for inner in get_args(annotation):
+        yield from classes_in(inner)
+
+
+def dotted(place: Sequence[int | str]) -> str:
+    """Location as poses[0].position."""
+    steps = (f"[{step}]" if isinstance(step, int) else f".{step}" for step in place)
+    return "".join(steps).removeprefix(".")
+
+
+def shown(value: object) -> str:
+    """Show a value: plain values cut to a readable length, others by their type."""
+    if not isinstance(value, _PLAIN):
+        return "an array" if isinstance(value, np.ndarray) else _with_article(type(value).__name__)
+    short = reprlib.Repr()
+    short.maxstring = short.maxother = short.maxlong = 60
+    short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
+    text = short.repr(value)
+    return text if len(text) <= _LETTERS else f"{text[:_LETTERS]}…"
+
+
+def _with_article(name: str) -> str:
+    return f"{'an' if name[0].lower() in 'aeio' else 'a'} {name}"
+
+
+def as_array(name: str, values: ArrayLike, dtype: DTypeLike = np.float64) -> AnyArray:
+    """Return values as an array of numbers; LidarpoolError if they are not numbers."""
+    try:
+        return np.asarray(values, dtype)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise LidarpoolError(
+            f"{name} is {shown(values)}; it must be an array of numbers, or lists of them."
+        ) from error
