@@ -226,6 +226,7 @@ BAD = [
     ("steps: !!python/object/apply:os.getcwd []", "line 1: could not determine a constructor"),
     ("sensor: {layers: " + "9" * 5000 + "}", r"sensor\.layers is 9+\.\.\.|Exceeds the limit"),
     (b"\xff\xfe\x00", "not valid YAML: 'utf-8' codec"),
+    ('sensor: {model: "~nosuchuser/x.yaml"}', r"'~nosuchuser/x\.yaml' cannot be found"),
     ('scene: {files: ["~nosuchuser/x.stl"]}', r"'~nosuchuser/x\.stl' cannot be found"),
 ]
 

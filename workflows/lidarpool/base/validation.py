@@ -152,15 +152,14 @@ def _check(thing: Any, given: Mapping[str, Any]) -> None:
     given = {name: value for name, value in given.items() if value is not usual.get(name, usual)}
     if not given:
         return
-    adapter, fields = _python(thing)
+    validator, hints = _python(thing)
     try:
-        adapter.validator.validate_python(given)
+        validator.validate_python(given)
     except ValidationError:
         try:
-            adapter.validator.validate_python(_without_numpy(given))
+            validator.validate_python(_without_numpy(given))
         except ValidationError as error:
-            first = next(_sentences(error, fields, in_file=False))
-            raise LidarpoolError(first) from None
+            raise LidarpoolError(_argument_error(error, hints)) from None
 
 
 def _without_numpy(value: Any) -> Any:
@@ -181,14 +180,14 @@ def _usual(thing: Any) -> dict[str, Any]:
 
 
 @cache
-def _python(thing: Any) -> tuple[TypeAdapter[Any], Fields]:
+def _python(thing: Any) -> tuple[Any, dict[str, Any]]:
     """Return what validates the arguments of a function, or the fields of a dataclass."""
     known = get_type_hints(thing, include_extras=True)
     hints = {name: known[name] for name in _usual(thing) if name in known}
     table: Any = TypedDict
     table = table(thing.__name__, {n: _instances(h) for n, h in hints.items()}, total=False)
     table.__pydantic_config__ = _PYTHON
-    return TypeAdapter(table), {n: FieldInfo.from_annotation(h) for n, h in hints.items()}
+    return TypeAdapter(table).validator, hints
 
 
 def _instances(hint: Any) -> Any:
@@ -216,7 +215,7 @@ def _instances(hint: Any) -> Any:
     if not isinstance(hint, type) or hint is Any:
         return Any
     if getattr(hint, "_is_protocol", False):
-        return Annotated[Any, AfterValidator(_having(hint))]
+        return Annotated[Any, _having(hint)]
     return _instance(os.PathLike if hint is Path else hint)
 
 
@@ -229,17 +228,17 @@ def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
     return value if isinstance(value, Iterator) else handler(value)
 
 
-def _having(protocol: type) -> Callable[[Any], Any]:
-    """Return what refuses values without the attributes of a protocol."""
+def _having(protocol: type) -> AfterValidator:
+    """Refuse values without the attributes of a protocol."""
     names = [name for name in vars(protocol) if not name.startswith("_")]
 
     def having(value: Any) -> Any:
         # Of the class first: a property may take its time.
-        if all(hasattr(type(value), name) or hasattr(value, name) for name in names):
-            return value
-        raise PydanticKnownError("is_instance_of", {"class": protocol.__name__})
+        if not all(hasattr(type(value), name) or hasattr(value, name) for name in names):
+            raise PydanticKnownError("is_instance_of", {"class": protocol.__name__})
+        return value
 
-    return having
+    return AfterValidator(having)
 
 
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
@@ -247,75 +246,85 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
 
     For a misspelt name, a field of the same section is suggested.
     """
-    return _sentences(error, fields_of(section))
-
-
-def _sentences(error: ValidationError, fields: Fields, in_file: bool = True) -> Iterator[str]:
-    found: dict[Place, list[ErrorDetails]] = {}  # of a union, an error for each of its kinds
-    hints = {}
-    for detail in error.errors(include_url=False):
-        place, hint = _followed(detail["loc"], fields)
-        found.setdefault(place, []).append(detail)
-        hints[place] = hint
+    found = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     alike: dict[Any, list[Place]] = {}  # {field and kind of mistake: where it was made}
-    for place, details in found.items():
+    for place, detail in found.items():
         # Of a list in which all entries are wrong pydantic says that it has none.
         within = (other[: len(place)] == place != other for other in found)
-        if details[0]["type"] == "too_short" and any(within):
+        if detail["type"] == "too_short" and any(within):
             continue
         field = tuple(step for step in place if not isinstance(step, int))
-        alike.setdefault((field, *(one["type"] for one in details)), []).append(place)
+        alike.setdefault((field, detail["type"]), []).append(place)
     for first, *others in alike.values():
         more = f" {counted(len(others), 'more entry', 'more entries')} like it." if others else ""
-        yield _sentence(first, found[first], hints[first], fields, in_file) + more
+        hint, known = _at(first, section)
+        yield _sentence(first, [found[first]], hint, known, _in_file) + more
+
+
+def _in_file(value: Any) -> str:
+    plain = str(value).lower() if isinstance(value, bool) else shown(value)
+    return "empty" if value is None else plain
+
+
+def _argument_error(error: ValidationError, hints: Mapping[str, Any]) -> str:
+    """Return what is wrong with the first wrong argument; of a union, with all of its kinds."""
+    places: dict[Place, list[ErrorDetails]] = {}
+    for detail in error.errors(include_url=False):
+        name, *steps = detail["loc"]
+        entry = (name, *(step for step in steps if isinstance(step, int)))
+        places.setdefault(entry, []).append(detail)
+    place, details = next(iter(places.items()))
+    return _sentence(place, details, hints[str(place[0])], (), shown)
 
 
 def _sentence(
-    place: Place, details: Sequence[ErrorDetails], hint: Any, fields: Fields, in_file: bool
+    place: Place,
+    details: Sequence[ErrorDetails],
+    hint: Any,
+    known: Collection[str],
+    show: Callable[[Any], str],
 ) -> str:
     at, kind, given = dotted(place), details[0]["type"], details[0]["input"]
     if kind == "value_error":
         message = str(details[0]["ctx"]["error"])
         return f"{at}: {message}" if at else message
     if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
-        *section, name = place
-        known = [*_within(_followed(section, fields)[1], fields)]
-        if (other := _ALIKE.get(str(name), "")) in known:
-            return f"{at} is not a field. Did you mean {other!r}?"
-        return f"{at} is not a field.{did_you_mean(str(name), known)}"
+        name = str(place[-1])
+        other = _ALIKE.get(name, "")
+        near = f" Did you mean {other!r}?" if other in known else did_you_mean(name, known)
+        return f"{at} is not a field.{near}"
     if kind == "missing":
         return f"{at} is missing; it must be given."
-    value = shown(given)
-    if in_file and (given is None or isinstance(given, bool)):
-        value = "empty" if given is None else str(given).lower()
     allowed = dict.fromkeys(_allowed(detail, hint) for detail in details)
     near = ""
     if kind == "literal_error" and isinstance(given, str):
         near = did_you_mean(given, re.findall(r"'([^']*)'", details[0]["ctx"]["expected"]))
-    return f"{at} is {value}; {' or '.join(allowed)}.{near}".replace(" or it must be ", " or ")
+    return f"{at} is {show(given)}; it must {' or '.join(allowed)}.{near}".replace(
+        " or be ", " or "
+    )
 
 
 def _allowed(detail: ErrorDetails, hint: Any) -> str:
+    """Return what a value must do: «be 1 to 10»."""
     kind, context = detail["type"], detail.get("ctx", {})
     if kind == "is_instance_of":
         name = str(context["class"]).rpartition(".")[2]
         such = f", such as {_EXAMPLES[name]}" if name in _EXAMPLES else ""
-        return f"it must be {_ALLOWED.get(name) or _with_article(name)}{such}"
+        return f"be {_ALLOWED.get(name) or _with_article(name)}{such}"
     if kind in ("list_type", "tuple_type"):
         inner = [*classes_in(hint)]
         of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
-        names = (one.__name__ for one in inner)
-        such = next((f", such as [{_EXAMPLES[name]}]" for name in names if name in _EXAMPLES), "")
-        return f"it must be a list{of}{such}"
+        examples = [_EXAMPLES[one.__name__] for one in inner if one.__name__ in _EXAMPLES]
+        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples else "")
     if kind in ("too_short", "too_long"):
         few = kind == "too_short"
         count = counted(context["min_length" if few else "max_length"], "entry", "entries")
-        return f"it must have at {'least' if few else 'most'} {count}"
+        return f"have at {'least' if few else 'most'} {count}"
     if not _LIMITS.keys().isdisjoint(context):
         limits = _limits(hint)
-        return f"it must be {_range(limits if context.items() <= limits.items() else context)}"
-    message = detail["msg"].replace("Input should be", "it must be", 1)
-    return f"it must be {_ALLOWED[kind]}" if kind in _ALLOWED else message[:1].lower() + message[1:]
+        return f"be {_range(limits if context.items() <= limits.items() else context)}"
+    words = detail["msg"].removeprefix("Input should ").removeprefix("it must ")
+    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words
 
 
 def _limits(hint: Any) -> dict[str, Any]:
@@ -335,47 +344,31 @@ def _range(limits: Mapping[str, Any]) -> str:
     return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
 
 
-def _followed(steps: Iterable[int | str], fields: Fields) -> tuple[Place, Any]:
-    """Return a place without the kinds of unions that pydantic adds, and the annotation there."""
-    place: list[int | str] = []
-    hint: Any = None
-    for step in steps:
-        here = _within(hint, fields)
-        if step in here:
-            hint = here[str(step)].rebuild_annotation()
-        elif isinstance(step, str) and _is_union(hint):
-            continue
-        place.append(step)
-    return tuple(place), hint
+def _at(place: Place, hint: Any) -> tuple[Any, Fields]:
+    """Return the annotation at a place in a file, and the fields of the section around it."""
+    known: Fields = {}
+    inner = _named(hint)
+    for step in place:
+        known = inner
+        if step in known:
+            hint = known[str(step)].rebuild_annotation()
+            inner = _named(hint)
+    return hint, known
 
 
-def _within(hint: Any, fields: Fields) -> Fields:
-    """Fields of the sections in an annotation; None has those at the top."""
-    if hint is None:
-        return fields
-    return {name: one for kind in sections_in(hint) for name, one in fields_of(kind).items()}
-
-
-def _is_union(hint: Any) -> bool:
-    args = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
-    kinds = {*args} - {NoneType} if get_origin(hint) in (Union, UnionType) else {}
-    return len(kinds) > 1 or any(map(_is_union, args))
+def _named(hint: Any) -> Fields:
+    """Fields of the sections in an annotation, by their names in a file."""
+    fields = (pair for kind in sections_in(hint) for pair in fields_of(kind).items())
+    return {field.alias or name: field for name, field in fields}
 
 
 def fields_of(section: Any) -> Fields:
-    """Fields of a section by their names in a file."""
-    return {field.alias or name: field for name, field in _declared(section).items()}
-
-
-def attributes_of(section: Any) -> Mapping[str, str]:
-    """Attributes of a section by their names in a file."""
-    return {field.alias or name: name for name, field in _declared(section).items()}
+    """Fields of a section of files: {attribute: field}."""
+    return section.model_fields if issubclass(section, BaseModel) else _of_dataclass(section)
 
 
 @cache
-def _declared(section: Any) -> Fields:
-    if issubclass(section, BaseModel):
-        return section.model_fields
+def _of_dataclass(section: Any) -> Fields:
     hints, made = get_type_hints(section, include_extras=True), FieldInfo.from_annotated_attribute
     return {one.name: made(hints[one.name], one) for one in dataclass_fields(section)}
 

@@ -71,7 +71,7 @@ class Figures:
             kept.append(not row.done if name == "failed" else getattr(row, name))
         for name, labels in self._labels.items():
             value = row.values.get(name, np.nan)
-            if labelled := isinstance(value, str | bool):
+            if labelled := isinstance(value, str | bool | np.bool_):
                 text = value if isinstance(value, str) else str(value).lower()
                 value = labels.setdefault(text, len(labels))
             self._values[name].append(value)

@@ -77,11 +77,9 @@ def _of_labels(varied: Varied) -> Scale:
     if len(labels) > MOST_LABELS:
         counts = np.bincount(varied.there.astype(np.intp), minlength=len(labels))
         kept = np.sort(np.argsort(-counts, kind="stable")[: MOST_LABELS - 1])
-        place = np.full(len(labels), MOST_LABELS - 1.0)
+        place = np.append(np.full(len(labels), MOST_LABELS - 1.0), np.nan)
         place[kept] = np.arange(len(kept))
-        known = np.isfinite(values)
-        values = values.copy()
-        values[known] = place[values[known].astype(np.intp)]
+        values = place[np.nan_to_num(values, nan=-1).astype(np.intp)]
         labels = (*(labels[k] for k in kept), f"{len(labels) - len(kept)} others")
     return Scale(values, np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1), labels)
 
@@ -248,19 +246,19 @@ def _draw_points(
         places[some], points[some], s=size, c=colours[some], alpha=alpha, linewidths=0,
         clip_on=False, rasterized=True,
     )  # fmt: skip
-    if scale.labels:
-        for number in np.unique(scale.bin_of[done]).tolist():
-            group = points[done[scale.bin_of[done] == number]]
-            low, median, high = np.percentile(group, MIDDLE).tolist()
-            near = np.array([number - 0.35, number + 0.35])
-            axes.fill_between(near, low, high, color=theme.MUTED, alpha=0.2, lw=0)
-            axes.plot(near, [median, median], color=theme.INK, lw=1.6 * unit)
-    elif (groups := min(_GROUPS, len(done) // _GROUP)) > 1:
-        ordered = np.array_split(done[np.argsort(places[done], kind="stable")], groups)
-        middles = [float(np.median(places[group])) for group in ordered]
-        each = np.array([np.percentile(points[group], MIDDLE) for group in ordered])
-        lows, medians, highs = each.T
-        axes.fill_between(middles, lows, highs, color=theme.MUTED, alpha=0.16, lw=0)
+    if scale.labels:  # a bar for each
+        bins = np.unique(scale.bin_of[done])
+        groups = [done[scale.bin_of[done] == number] for number in bins]
+        middles = (bins[:, None] + [-0.35, 0.35, np.nan]).ravel()
+    else:
+        count = min(_GROUPS, len(done) // _GROUP)
+        ordered = done[np.argsort(places[done], kind="stable")]
+        groups = np.array_split(ordered, count) if count > 1 else []
+        middles = np.array([np.median(places[group]) for group in groups])
+    if groups:
+        percentiles = [np.percentile(points[group], MIDDLE) for group in groups]
+        lows, medians, highs = np.repeat(percentiles, len(middles) // len(groups), axis=0).T
+        axes.fill_between(middles, lows, highs, color=theme.MUTED, alpha=0.18, lw=0)
         axes.plot(middles, medians, color=theme.INK, lw=1.6 * unit, solid_joinstyle="round")
     failed = np.flatnonzero(known & failures)
     failed = failed[one_of_each_part(len(failed), MOST_DOTS)]
@@ -300,7 +298,9 @@ def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
         axis.set_minor_formatter(NullFormatter())
     else:
         axes.set_xlim(low - 0.02 * (high - low), high + 0.02 * (high - low))
-        axis.set_major_locator(MaxNLocator(max(2, min(6, int(wide / 90)))))
+        whole = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
+        few = max(2, min(6, int(wide / 90)))
+        axis.set_major_locator(MaxNLocator(few, integer=whole, min_n_ticks=1))
     axis.set_major_formatter(FuncFormatter(_tick))
 
 

@@ -18,7 +18,7 @@ from ..run.result import CampaignRun
 from ..scenario.campaign import Campaign
 from .campaign_figures import Figures
 from .campaign_pictures import draw_results, draw_varied
-from .page.page import of_tasks, rendered
+from .page.page import rendered
 from .report import stage_figures
 
 CARD, PAGE, PICTURES, SPLITS = "README.md", "report.html", "pictures", "splits"
@@ -70,9 +70,9 @@ def write_card(
         figures = Figures(campaign.names, _with_splits(place, jobs))
         pages = {"job": picture, "varied": draw_varied(figures), "results": draw_results(figures)}
         drawn = {name: page for name, page in pages.items() if page is not None}
-        for name, picture in drawn.items():
+        for name, drawing in drawn.items():
             with place.writing(f"{PICTURES}/{name}.png") as file:
-                file.write(picture.png())
+                file.write(drawing.png())
         place.remove([f"{PICTURES}/{name}.png" for name in pages if name not in drawn])
         report = campaign_report(campaign, run, versions, figures)
         values: dict[str, Any] = {
@@ -91,7 +91,7 @@ def write_card(
             slowest=figures.slowest,
             description=campaign.description,
             **values,
-            **of_tasks(run.stages),
+            stages=run.stages,
         )
         place.write(PAGE, page.encode())
         card = rendered("card.md", drawn=[*drawn], **values)

@@ -44,7 +44,7 @@ def write_comparison(folder: Path, found: Comparison) -> list[str]:
     for name, page in drawn.items():
         (folder / f"compare-{name}.png").write_bytes(page.png())
     images = {name: page.svg() for name, page in drawn.items()}
-    text = rendered("comparison.html", report=found.figures, begun="", pictures=images)
+    text = rendered("comparison.html", report=found.figures, pictures=images)
     (folder / "compare.html").write_text(text, encoding="utf-8")
     text = json.dumps(found.figures, indent=1, allow_nan=False) + "\n"
     (folder / "compare.json").write_text(text, encoding="utf-8")
@@ -68,7 +68,7 @@ def draw_ranges(found: Comparison) -> Page:
     both = np.concatenate([image[np.isfinite(image)] for image in images.ranges])
     low, most = np.quantile(both, (0.01, 0.98)) if len(both) else (0.0, 1.0)
     norm = LogNorm(max(float(low), 0.01), max(float(most), float(low) * 1.01, 0.02))
-    (in_a, in_b), residual = images.there, images.residual
+    (in_a, in_b), residual = images.there, images.ranges[0] - images.ranges[1]
     scale = Normalize(-_limit(found), _limit(found))
     for k, words in enumerate(("A", "B", "A − B")):
         bottom = (height - top - (k + 1) * high - k * gap) / height

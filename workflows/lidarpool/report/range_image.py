@@ -42,11 +42,6 @@ class RangeImages:
         """Where A and B have returns."""
         return np.isfinite(self.ranges[0]), np.isfinite(self.ranges[1])
 
-    @property
-    def residual(self) -> Floats:
-        """Range of A minus that of B, metres; NaN where one has no return."""
-        return self.ranges[0] - self.ranges[1]
-
 
 @dataclass(frozen=True, eq=False)
 class _Polar:

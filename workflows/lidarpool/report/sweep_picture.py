@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from matplotlib.lines import Line2D
 
 from ..base.words import counted
 from ..export.loader import Sweep
@@ -42,11 +41,8 @@ def draw_sweep(sweep: Sweep) -> Page:
         painted = np.full((len(points), 3), 0.6)
         for one, colour in zip(frequent, colours, strict=True):
             painted[classes == one] = colour
-        handles = [
-            Line2D([], [], marker="o", ls="", color=colour, label=f"class {one}" if one else "none")
-            for one, colour in zip(frequent, colours, strict=True)
-        ]
-        page.key(handles, 8)
+        names = [f"class {one}" if one else "none" for one in frequent]
+        page.legend([*zip(names, colours, strict=True)], "sensor")
     else:
         z = points[:, 2]
         low, high = np.percentile(z, (2, 98)) if len(z) else (0.0, 1.0)
@@ -56,5 +52,5 @@ def draw_sweep(sweep: Sweep) -> Page:
     axes.set_xlim(-reach * ratio, reach * ratio)
     axes.set_ylim(-reach, reach)
     axes.scatter(points[:, 0], points[:, 1], s=3 * page.unit**2, c=painted, lw=0, rasterized=True)
-    axes.plot(0, 0, marker="^", color=theme.SENSOR, ms=7 * page.unit)
+    axes.plot(0, 0, marker="o", color=theme.SENSOR, ms=7 * page.unit)
     return page

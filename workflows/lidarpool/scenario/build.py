@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from glob import escape
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -47,7 +48,7 @@ SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 # Of the hits in a scene with the default objects, every so many are kept.
 SEED_KEPT = 5
 
-Robots = dict[MeshFile, Robot]  # {their file: robot}
+Robots = dict[MeshFile | None, Robot]  # {their file: robot}
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,14 +84,6 @@ class _Frame(NamedTuple):
     poses: list[Pose]
     epsg: int | None
 
-    @property
-    def start_s(self) -> float:
-        """Start of the survey, by the clock of trajectories."""
-        if self.track is None:
-            return 0.0
-        assert self.track.start_s is not None, "of every track"
-        return self.track.start_s
-
 
 def build(
     scenario: Scenario,
@@ -121,7 +114,7 @@ def build(
     epsg = _common_epsg(scenario, found)
     with prefixed(scenario.source):
         way = scenario.trajectory
-        track = None if way is None else way.track(scenario.folder, standing)
+        track = None if way is None else way.track(scenario.path, standing)
         sensors = _sensors(scenario, robots)
     placing = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
@@ -150,8 +143,7 @@ def _robots(scenario: Scenario, found: Findings) -> Robots:
     """Read the robots, each file once."""
     robots: Robots = {}
     for file in (entry.file for entry in scenario.actors if entry.is_robot):
-        assert file is not None, "of a robot"
-        if file not in robots:
+        if file is not None and file not in robots:
             with prefixed(scenario.source):
                 path = scenario.path(file.file)
             robots[file] = load_robot(
@@ -159,11 +151,6 @@ def _robots(scenario: Scenario, found: Findings) -> Robots:
             )
             found.sources[file.file] = robots[file].summary
     return robots
-
-
-def _robot_of(entry: ActorSection, robots: Robots) -> Robot:
-    assert entry.file is not None, "it is a robot"
-    return robots[entry.file]
 
 
 def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
@@ -184,11 +171,11 @@ def _sensors(scenario: Scenario, robots: Robots) -> list[Mounted]:
     common = scenario.noise, scenario.returns
     if not scenario.sensors:
         mount = _mount(scenario, scenario.mount or MountSection(), robots)
-        return [scenario.sensor.mounted(scenario.folder, mount, *common)]
+        return [scenario.sensor.mounted(scenario.path, mount, *common)]
     out = []
     for name, section in scenario.sensors.items():
         mount = _mount(scenario, section.mount, robots)
-        carried = section.mounted(scenario.folder, mount, *common, name)
+        carried = section.mounted(scenario.path, mount, *common, name)
         out.append(replace(carried, steps=section.steps))
     return out
 
@@ -198,17 +185,16 @@ def _mount(scenario: Scenario, mount: MountSection, robots: Robots) -> Pose:
     if mount.link is None:
         return mount.pose()
     carriers = [one for one in scenario.actors if one.trajectory is None and one.is_robot]
-    on = [entry for entry in carriers if mount.link in _robot_of(entry, robots).links]
+    on = [entry for entry in carriers if mount.link in robots[entry.file].links]
     if len(on) != 1:
-        links = [link for entry in carriers for link in _robot_of(entry, robots).links]
+        links = [link for entry in carriers for link in robots[entry.file].links]
         raise LidarpoolError(
             f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
             f"have; one must.{did_you_mean(mount.link, links)}"
         )
     (entry,) = on
     with prefixed(f"actor {entry.name!r}"):
-        joints = _joints(scenario, entry)
-        path = _robot_of(entry, robots).path(mount.link, joints=joints)
+        path = robots[entry.file].path(mount.link, joints=_joints(scenario, entry))
     if path.moves:
         raise LidarpoolError(
             f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "
@@ -237,12 +223,12 @@ def _actors(
     """Build the actors; their trajectories begin with that of the survey."""
     shapes: dict[Any, Mesh] = {}
     with prefixed(scenario.source):
-        ways = [entry.way(scenario.folder, standing, carrier) for entry in scenario.actors]
+        ways = [entry.way(scenario.path, standing, carrier) for entry in scenario.actors]
     out: list[Actor] = []
     for entry, way in zip(scenario.actors, ways, strict=True):
         if entry.is_robot:
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
-                out += _links(scenario, entry, _robot_of(entry, robots), way, found.notes.append)
+                out += _links(scenario, entry, robots[entry.file], way, found.notes.append)
         else:
             mesh = mesh_of(scenario, entry, shapes, found)
             out.append(Actor(replace(mesh, name=entry.name), way))
@@ -267,18 +253,13 @@ def _vehicles(
     section = scenario.traffic
     if section is None:
         return []
+    start_s = 0.0 if frame.track is None else frame.track.start_s or 0.0
+    shape_of = partial(mesh_of, scenario, made={}, found=found)
     with prefixed(scenario.source):
         duration = _survey(scenario, frame, []).duration_ns / 1e9
-        begin = frame.start_s - section.offset_s
+        begin = start_s - section.offset_s
         passages, count = read_fcd(scenario.path(section.file), begin, begin + duration)
-        shapes: dict[Any, Mesh] = {}
-        made = actors_of(
-            section,
-            passages,
-            lambda entry: mesh_of(scenario, entry, shapes, found),
-            standing,
-            frame.start_s,
-        )
+        made = actors_of(section, passages, shape_of, standing, start_s)
     if not made:
         found.notes.append(
             f"{section.file}: no vehicle or person is in the scene from {begin:g} to "

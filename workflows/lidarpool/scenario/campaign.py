@@ -8,10 +8,11 @@ import re
 from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
+from itertools import combinations
 from pathlib import Path
 from types import MappingProxyType
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field, ValidationError
@@ -19,20 +20,20 @@ from pydantic import Field, ValidationError
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.validation import checked, shown, validation_errors
+from ..base.validation import checked, dotted, shown, validation_errors
 from ..base.words import counted
 from ..base.yamlfile import read_yaml
 from ..export.jobs import Value
 from ..export.table import check_whole
 from .build import build
-from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits, file_of
+from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits
 from .draws import Draw
 from .job import Job, job_of
-from .paths import FieldPath, find_field, held, put
+from .paths import Steps, find_field, put
 from .scenario import Scenario
 from .sections import PoolSection, file_states
 from .static_scene import SceneCache
-from .tables import Row, read_rows
+from .tables import read_rows
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")
@@ -85,6 +86,7 @@ class Campaign:
     command: str = ""  # what follows ``lidarpool run``; empty for a function
     description: str = ""  # the file's text, where there is one
     files: Set[Path]  # that its jobs may be made of; some may be missing
+    choices: Mapping[str, str]  # {name: how its value is chosen, «0.2 to 20, log_uniform»}
 
     @checked
     def __init__(
@@ -106,6 +108,7 @@ class Campaign:
         self.count, self.seed, self.license = head.count, head.seed, head.license
         self.title, self.splits = head.title, dict(head.splits)
         self.keep, self.files = head.keep, jobs.files
+        self.choices = jobs.choices
         self._jobs, self._splits = jobs, Splits(head.splits, head.seed)
 
     @classmethod
@@ -163,14 +166,6 @@ class Campaign:
         Of a function, those of its first job that can be made, which is made to be asked.
         """
         return self._jobs.names
-
-    @property
-    def choices(self) -> Mapping[str, str]:
-        """How the values are chosen, in words: {name: «0.2 to 20, log_uniform»}.
-
-        Empty for functions.
-        """
-        return self._jobs.choices
 
     def values(self, number: int) -> dict[str, Value]:
         """Return what differs from job to job: {name: value}; of a sample, how many rows.
@@ -291,7 +286,7 @@ class _Jobs:
     count: int
     names: tuple[str, ...] = ()
     choices: Mapping[str, str] = MappingProxyType({})
-    files: Set[Path] = frozenset()  # that they may be made of
+    files: Set[Path] = frozenset()
     identity: Mapping[str, str]
 
     def name(self, number: int) -> str:
@@ -329,10 +324,17 @@ class _Made(_Jobs):
         return {"make": fingerprint(self._make)}
 
     def values(self, number: int) -> dict[str, Value]:
-        return self._values(number, self._made(number).values)
+        return dict(self.job(number, None, (), {}).values)
 
     def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         made = self._made(number)
+        if extra := [name for name in made.values if name not in self.names]:
+            raise LidarpoolError(
+                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
+                "the same names, with None where there is no value."
+            )
+        values = {name: _plain(number, name, value) for name, value in made.values.items()}
+        values = {name: value for name, value in values.items() if value is not None}
         survey, seed = made.survey, _noise_seed(self._seed, number)
         check_whole(columns, survey.keep_every)
         survey = replace(
@@ -341,15 +343,7 @@ class _Made(_Jobs):
             sensors=[replace(one, noise=_seeded(one.noise, seed)) for one in survey.sensors],
             columns=(*survey.columns, *columns),
         )
-        return Job(made.scene, survey, values=self._values(number, made.values), **own)
-
-    def _values(self, number: int, given: Mapping[str, Any]) -> dict[str, Value]:
-        if extra := [name for name in given if name not in self.names]:
-            raise LidarpoolError(
-                f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
-                "the same names, with None where there is no value."
-            )
-        return _without_none({n: _plain(number, n, value) for n, value in given.items()})
+        return Job(made.scene, survey, values=values, **own)
 
     def _made(self, number: int) -> Job:
         try:
@@ -427,14 +421,14 @@ class _Varied(_Jobs):
         self._vary, self._seed, self._source = section.vary, section.seed, str(path)
         mistakes = Mistakes()
         self._bases: list[_Base] = []
-        tables: dict[Any, list[Row]] = {}  # {file and kind of entry: rows}
-        alone = len(section.base) == 1
+        tables: dict[Any, list[Any]] = {}  # {file and kind of entry: entries}
         for name in section.base:
             with mistakes.noted(), prefixed(path):
-                file = file_of(path.parent, name)
+                file = path.parent / Path(name).expanduser()
                 if is_campaign(file):
                     raise LidarpoolError(f"base {name!r} is a campaign; give a scenario.")
-                self._bases.append(_Base(file, section.vary, tables, alone))
+                where = f"vary, of {file.name}" if section.base[1:] else "vary"
+                self._bases.append(_Base(file, section.vary, tables, where))
         mistakes.tell()
         for one in self._bases:
             one.check(self._source, mistakes)
@@ -445,8 +439,8 @@ class _Varied(_Jobs):
         for text, choice in section.vary.items():
             if choice.each is not None:
                 self._strides[text] = grid
-                grid *= len(choice.listed)
-        drawn = [text for text, choice in section.vary.items() if choice.each is None]
+                grid *= len(choice.options)
+        drawn = [text for text in section.vary if text not in self._strides]
         if section.count is None and drawn:
             raise LidarpoolError(
                 f"{path}: count is missing: {drawn[0]} is drawn, so say how many jobs."
@@ -457,14 +451,12 @@ class _Varied(_Jobs):
                 f"{COUNT_MOST:,}."
             )
         self.count = section.count or grid
-        several = ("base",) if len(self._bases) > 1 else ()
-        self.names = (*several, *section.vary)
-        listed = ", ".join(base.name for base in self._bases[:8])
-        listed += ", …" * (len(self._bases) > 8)
-        self.choices = dict.fromkeys(several, f"{listed}, each of {len(self._bases):,}")
-        self.choices |= {text: choice.words for text, choice in section.vary.items()}
-
-        self._last: tuple[int, _Drawn] | None = None
+        self.choices = {text: choice.words for text, choice in section.vary.items()}
+        if len(self._bases) > 1:
+            listed = ", ".join(base.name for base in self._bases[:8])
+            listed += ", …" * (len(self._bases) > 8)
+            self.choices = {"base": f"{listed}, each of {len(self._bases):,}", **self.choices}
+        self.names = tuple(self.choices)
 
     @cached_property
     def identity(self) -> dict[str, str]:  # type: ignore[override]
@@ -475,96 +467,94 @@ class _Varied(_Jobs):
         }
 
     def values(self, number: int) -> dict[str, Value]:
-        return _without_none(self._drawn(number).told)
+        return self._drawn(number)[0]
 
     def scenario(self, number: int) -> Scenario:
-        drawn, seed = self._drawn(number), _noise_seed(self._seed, number)
-        base = self._bases[number % len(self._bases)]
+        told, changes = self._drawn(number)
+        base, seed = self._bases[number % len(self._bases)], _noise_seed(self._seed, number)
         try:
-            return base.scenario_of(drawn.values, drawn.rows, f"{self._source}: job {number}", seed)
+            return base.changed(changes, f"{self._source}: job {number}", seed)
         except LidarpoolError as error:
-            shown = ", ".join(f"{n}: {value}" for n, value in self.values(number).items())
+            shown = ", ".join(f"{name}: {value}" for name, value in told.items())
             raise LidarpoolError(
                 f"{error}\nIts values are {shown or 'those of the base'}."
             ) from error
 
-    def _drawn(self, number: int) -> _Drawn:
-        """Draw what a job has of its own; the last is kept, as several things ask for it."""
-        if self._last is not None and self._last[0] == number:
-            return self._last[1]
+    def _drawn(self, number: int) -> tuple[dict[str, Value], Changes]:
+        """Draw what a job has of its own: for the table of jobs, and for the scenario."""
         base = self._bases[number % len(self._bases)]
-        drawn = _Drawn({"base": base.name} if len(self._bases) > 1 else {}, {}, {})
+        told: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
+        changes: Changes = {}
         for text, choice in self._vary.items():
             draw = Draw(self._seed, number, text)
             if choice.sample is not None:
                 chosen = draw.integer(*choice.sample.count)
                 table = base.tables[text]
-                drawn.rows[text] = [table[i].entry for i in draw.subset(len(table), chosen)]
-                drawn.told[text] = chosen
-            elif choice.each is not None:
-                turn = number // self._strides[text] % len(choice.listed)
-                drawn.values[text], drawn.told[text] = choice.option(turn)
+                rows = [table[i] for i in draw.subset(len(table), chosen)]
+                changes[text], told[text] = partial(_extended, rows), chosen
+                continue
+            if choice.each is not None:
+                turn = number // self._strides[text] % len(choice.options)
+                value, told[text] = choice.options[turn]
             else:
-                drawn.values[text], drawn.told[text] = choice.drawn(draw)
-        self._last = number, drawn
-        return drawn
+                value, told[text] = choice.drawn(draw)
+            changes[text] = partial(_replaced, value)
+        return {name: value for name, value in told.items() if value is not None}, changes
 
 
-class _Drawn(NamedTuple):
-    """What a job has of its own."""
+Changes = dict[str, Callable[[Any], Any]]  # {path: what it makes of the value there}
 
-    told: dict[str, Value | None]  # for the table of jobs
-    values: dict[str, Any]  # {path: value}
-    rows: dict[str, list[Any]]  # {path: entries that are added}
+
+def _replaced(value: Any, _: Any) -> Any:
+    return value
+
+
+def _extended(entries: Sequence[Any], there: Sequence[Any] | None) -> list[Any]:
+    return [*(there or ()), *entries]
 
 
 class _Base:
     """A scenario, and where the paths of a campaign lead in it."""
 
     def __init__(
-        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Row]], alone: bool
+        self, path: Path, vary: Mapping[str, Choice], tables: dict[Any, list[Any]], where: str
     ) -> None:
-        self._where = "vary" if alone else f"vary, of {path.name}"  # for messages
-        self.scenario, self.name, self._folder = Scenario.load(path), path.name, path.parent
+        self._where = where  # for messages
+        self.scenario, self.name = Scenario.load(path), path.name
         self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
-        self._fields: dict[str, FieldPath] = {}
-        self.tables: dict[str, list[Row]] = {}
+        self._steps: dict[str, Steps] = {}
+        self.tables: dict[str, list[Any]] = {}
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
-            with mistakes.noted(), prefixed(self._where):
-                self._fields[text], kind = find_field(self.scenario, text)
-            if choice.sample is None or text not in self._fields:
+            with mistakes.noted(), prefixed(where):
+                self._steps[text], kind = find_field(self.scenario, text)
+            if choice.sample is None or text not in self._steps:
                 continue
-            with mistakes.noted(), prefixed(f"{self._where}: {text}"):
-                table = file_of(self._folder, choice.sample.file)
+            with mistakes.noted(), prefixed(f"{where}: {text}"):
+                table = self.scenario.path(choice.sample.file)
                 if (key := (table, repr(kind))) not in tables:
                     tables[key] = read_rows(table, kind)
                 self.tables[text] = tables[key]
                 if (most := choice.sample.count[1]) > (there := len(tables[key])):
                     has = counted(there, "row")
                     raise LidarpoolError(f"count is up to {most:,}, and {table} has {has}.")
-        with mistakes.noted():
+        with mistakes.noted(), prefixed(where):
             self._check_apart()
         mistakes.tell()
 
     def _check_apart(self) -> None:
         """Refuse paths that lead to the same field, or into one that is replaced as a whole."""
-        fields = list(self._fields.values())
-        for i, one in enumerate(fields):
-            for other in fields[:i]:
-                short, long = sorted((one, other), key=lambda field: len(field.keys))
-                if short.keys == long.keys:
-                    raise LidarpoolError(
-                        f"{self._where}: {other.text} and {one.text} lead to the same field: "
-                        "leave one out."
-                    )
-                added = self._vary[short.text].sample is not None
-                if long.keys[: len(short.keys)] == short.keys and not added:
-                    raise LidarpoolError(
-                        f"{self._where}: {short.text} is chosen as a whole, and {long.text} is a "
-                        "part of it: leave one out."
-                    )
+        places = {text: tuple(key for key, _ in steps) for text, steps in self._steps.items()}
+        for other, one in combinations(places, 2):
+            short, long = sorted((one, other), key=lambda text: len(places[text]))
+            if places[short] == places[long]:
+                raise LidarpoolError(f"{other} and {one} lead to the same field: leave one out.")
+            within = places[long][: len(places[short])] == places[short]
+            if within and self._vary[short].sample is None:
+                raise LidarpoolError(
+                    f"{short} is chosen as a whole, and {long} is a part of it: leave one out."
+                )
 
     def check(self, source: str, mistakes: Mistakes) -> None:
         """Note values that are not valid, and find out which files jobs may be made of.
@@ -572,40 +562,35 @@ class _Base:
         The first values of all paths are tried together, then the second, and so on; only if
         something is wrong, each alone, to find out which.
         """
-        trials: dict[str, list[Any]] = {t: c.ends for t, c in self._vary.items() if not c.sample}
-        samples = {t: c.sample.count for t, c in self._vary.items() if c.sample}
-        together: LidarpoolError | None = None
-        turns = [-(-len(self.tables[text]) // max(1, most)) for text, (_, most) in samples.items()]
-        for turn in range(max([1, *map(len, trials.values()), *(1 + each for each in turns)])):
-            values = {text: ends[turn % len(ends)] for text, ends in trials.items()}
-            rows = {text: self._rows_of(text, turn, *counts) for text, counts in samples.items()}
+        trials = {text: self._trials(text) for text in self._vary}
+        for turn in range(max([1, *map(len, trials.values())])):
+            changes = {text: tried[turn % len(tried)] for text, tried in trials.items()}
             try:
-                found = self.scenario_of(values, rows, f"{source}: {self._where}")
+                found = self.changed(changes, f"{source}: {self._where}")
             except LidarpoolError as error:
-                together = error
-                break
+                wrong = [line for text in self._vary for line in self._tried(text)[:1]]
+                mistakes.lines += [f"{source}: {self._where}: {line}" for line in wrong]
+                mistakes.lines += () if wrong else str(error).splitlines()
+                return
             self.files.update(found.files)
-        if together is None:
-            return
-        wrong = [
-            f"{source}: {self._where}: {line}" for text in trials for line in self._tried(text)[:1]
-        ]
-        mistakes.lines += wrong or str(together).splitlines()
 
-    def _rows_of(self, text: str, turn: int, least: int, most: int) -> list[Any]:
-        """Entries of a sample for a turn: the fewest first, then all rows in pieces."""
-        table = self.tables[text]
-        begin = (turn - 1) * most % max(1, len(table))
-        rows = table[begin : begin + most] if turn else table[:least]
-        return [row.entry for row in rows]
+    def _trials(self, text: str) -> list[Callable[[Any], Any]]:
+        """Return changes of a path, valid if all jobs are; of a table, all rows in pieces."""
+        choice = self._vary[text]
+        if choice.sample is None:
+            return [partial(_replaced, end) for end in choice.ends]
+        (least, most), table = choice.sample.count, self.tables[text]
+        begins = range(0, len(table), max(1, most)) if most else ()
+        pieces = [table[begin : begin + most] for begin in begins]
+        return [partial(_extended, rows) for rows in (table[:least], *pieces)]
 
     def _tried(self, text: str) -> list[str]:
         """Lines on the values of a path that are not valid in the base."""
-        choice, place = self._vary[text], self._fields[text].place
+        choice, place = self._vary[text], dotted([key for key, _ in self._steps[text]])
         lines = []
-        for value in choice.ends:
+        for value in () if choice.sample else choice.ends:
             try:
-                self.scenario_of({text: value}, {}, "")
+                self.changed({text: partial(_replaced, value)}, "")
             except LidarpoolError as error:
                 told = str(error).partition("\n")[0].removeprefix(": ")
                 own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
@@ -613,25 +598,15 @@ class _Base:
                 lines.append(f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}")
         return lines
 
-    def scenario_of(
-        self,
-        values: Mapping[str, Any],
-        rows: Mapping[str, Sequence[Any]],
-        source: str,
-        noise_seed: int = 0,
-    ) -> Scenario:
-        """Return the scenario with other values, and with entries added to lists."""
+    def changed(self, changes: Changes, source: str, noise_seed: int = 0) -> Scenario:
+        """Return the scenario with changes, and with a seed of its noise if it has none."""
+        ways = [(self._steps[text], change) for text, change in changes.items()]
+        if noise_seed and _NOISE not in changes:
+            ways.append((self._noise, lambda seed: seed or noise_seed))
         made: Any = self.scenario
-        for text, value in values.items():
-            made = put(made, self._fields[text].steps, value)
-        for text, entries in rows.items():
-            steps = self._fields[text].steps
-            made = put(made, steps, [*(held(made, steps) or ()), *entries])
-        changed = {self._fields[text].keys[0] for text in (*values, *rows)}
-        if noise_seed and _NOISE not in values and not held(made, self._noise.steps):
-            made = put(made, self._noise.steps, noise_seed)
-            changed.add(self._noise.keys[0])
-        sections = {str(name): made[name] for name in changed}
+        for steps, change in ways:
+            made = put(made, steps, change)
+        sections = {str(name): made[name] for ((name, _), *_), _ in ways}
         return self.scenario.with_sections(sections, source=source)
 
 
@@ -642,10 +617,6 @@ def _noise_seed(seed: int, number: int) -> int:
 def _seeded(noise: Any, seed: int) -> Any:
     """Give noise a seed where there is noise without one."""
     return noise if noise is None or noise.seed else replace(noise, seed=seed)
-
-
-def _without_none(values: Mapping[str, Value | None]) -> dict[str, Value]:
-    return {name: value for name, value in values.items() if value is not None}
 
 
 def _print(scenario: Scenario) -> str:

@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property, lru_cache
 from math import inf, isclose, isfinite, lcm
-from pathlib import Path
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
 from pydantic import BeforeValidator, Field, Strict, model_validator
 
-from ..base.declared import Seed, Text, TextOrTexts, allowed, is_text, must_be, short, told
+from ..base.declared import Seed, Share, Text, TextOrTexts, allowed, is_text, must_be, short, told
 from ..base.validation import checked_fields
 from ..export.jobs import Value
 from ..export.table import FORMATS, LAYOUTS
@@ -37,7 +37,6 @@ Options = Annotated[
     allowed("a list of values, or a mapping of names to values"),
 ]
 Weight = Annotated[float, Field(ge=0, le=1e9)]
-Share = Annotated[float, Field(ge=0, le=1)]
 
 
 class Normal(Section):
@@ -152,47 +151,38 @@ class Choice(Section):
         """Name of the field that is given."""
         return next(name for name in _KINDS if getattr(self, name) is not None)
 
-    @property
-    def listed(self) -> list[Any]:
-        """Values of `choice` or `each`."""
+    @cached_property
+    def options(self) -> list[tuple[Any, Value | None]]:
+        """Values of `choice` or `each`, and what the table of jobs says of each."""
         given = self.choice if self.choice is not None else self.each
-        return list(given.values() if isinstance(given, Mapping) else given or ())
+        if isinstance(given, Mapping):
+            return [(value, name) for name, value in given.items()]
+        return [(value, _in_table(value, number)) for number, value in enumerate(given or ())]
 
     @property
     def ends(self) -> list[Any]:
         """Values that are valid if all are: the ends of a range, or all of a list."""
         if self.normal is not None:
             return list(self.normal.ends)
-        return list(self.uniform or self.log_uniform or self.integer or self.listed)
+        chosen = [value for value, _ in self.options]
+        return list(self.uniform or self.log_uniform or self.integer or chosen)
 
     def drawn(self, draw: Draw) -> tuple[Any, Value | None]:
         """Draw a value, and what the table of jobs says of it; None for an empty cell.
 
         Not of `each` and `sample`, which need more than a job's random numbers.
         """
-        if self.uniform is not None:
-            value: Any = draw.uniform(*self.uniform)
-        elif self.log_uniform is not None:
-            value = draw.log_uniform(*self.log_uniform)
-        elif self.normal is not None:
+        if self.choice is not None:
+            return self.options[draw.position(len(self.options), self.weights or ())]
+        if self.normal is not None:
             value = draw.normal(self.normal.mean, self.normal.std, self.normal.limits)
-        elif self.integer is not None:
-            value = draw.integer(*self.integer)
         else:
-            return self.option(draw.position(len(self.listed), self.weights or ()))
+            value = getattr(draw, self.kind)(*self.ends)
         return value, value
-
-    def option(self, position: int) -> tuple[Any, Value | None]:
-        """Return a value of `choice` or `each`, and what the table says of it."""
-        given = self.choice if self.choice is not None else self.each
-        value = self.listed[position]
-        if isinstance(given, Mapping):
-            return value, list(given)[position]
-        return value, _in_table(value, position)
 
     def hint(self, error: str) -> str:
         """Advice on an end that a field does not take."""
-        if self.integer is None and "whole number" in error and not self.listed:
+        if self.integer is None and "whole number" in error and not self.options:
             return " Take integer: [least, largest]."
         return " Give limits." if self.normal is not None and self.normal.limits is None else ""
 
@@ -209,8 +199,7 @@ class Choice(Section):
             return f"{least:g} to {most:g}, {about}"
         if ends := self.uniform or self.log_uniform or self.integer:
             return f"{ends[0]:.12g} to {ends[1]:.12g}, {self.kind}"
-        labels = [self.option(position)[1] for position in range(len(self.listed))]
-        shown = ["none" if label is None else str(label) for label in labels]
+        shown = ["none" if label is None else str(label) for _, label in self.options]
         return f"{', '.join(shown[:8])}{', …' * (len(shown) > 8)}, {self.kind} of {len(shown):,}"
 
 
@@ -341,19 +330,15 @@ class Splits:
         for name, share in exact.items():
             done += share
             self._block += [name] * (round(done * size) - len(self._block))
-        self._last: tuple[int, Sequence[str]] = (-1, ())
 
     def __call__(self, number: int) -> str:
         """Name of a job's split; empty if there are none."""
         if not self._block:
             return ""
         block, place = divmod(number, len(self._block))
-        if self._last[0] != block:
-            order = Draw(self._seed, block, "splits").order(len(self._block))
-            self._last = block, [self._block[i] for i in order]
-        return self._last[1][place]
+        return self._block[_order(self._seed, block, len(self._block))[place]]
 
 
-def file_of(folder: Path, name: str) -> Path:
-    """Path of a file that a campaign names."""
-    return folder / Path(name).expanduser()
+@lru_cache
+def _order(seed: int, block: int, count: int) -> list[int]:
+    return Draw(seed, block, "splits").order(count)

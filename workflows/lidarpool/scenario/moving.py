@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
@@ -17,7 +16,7 @@ from ..sensor import Pose, Sensor, Track, load_trajectory
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
-from .sections import MeshEntry, Section, SensorSection, ShapeSection
+from .sections import MeshEntry, PathOf, Section, SensorSection, ShapeSection
 from .standing import Standing, following
 
 _OF_ROBOTS = {"file", "opacity"}  # fields of a mesh file that robots have
@@ -52,9 +51,9 @@ class CarriedSection(SensorSection):
         told("its time steps (scans), instead of the survey's", 120),
     ] = None
 
-    def sensor(self, folder: Path) -> Sensor:
+    def sensor(self, path: PathOf) -> Sensor:
         """Make the sensor, which starts at its own time; errors as of `SensorSection`."""
-        made = super().sensor(folder)
+        made = super().sensor(path)
         return replace(made, start_ns=self.start_s * 1e9) if self.start_s else made
 
 
@@ -123,12 +122,13 @@ class TrajectorySection(Section):
             raise ValueError("give either file or points.")
         return self
 
-    def track(self, folder: Path, standing: Standing, start_s: float | None = None) -> Track:
+    def track(self, path: PathOf, standing: Standing, start_s: float | None = None) -> Track:
         """Return it in a scene's local coordinates; LidarpoolError if it cannot be used.
 
-        `standing` is what there is to follow; `start_s` is that of a survey, of whose clock it is.
+        `path` returns that of a file, `standing` is what there is to follow; `start_s` is that of
+        a survey, of whose clock it is.
         """
-        way = self._level(folder, standing.origin, start_s)
+        way = self._level(path, standing.origin, start_s)
         if self.surfaces is None:
             return way
         # Pieces may end before the survey does.
@@ -144,15 +144,15 @@ class TrajectorySection(Section):
             f"the trajectory leaves its surfaces ({', '.join(self.surfaces)}): let it end before."
         )
 
-    def _level(self, folder: Path, origin: Floats, start_s: float | None) -> Track:
+    def _level(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
         """Return it without surfaces."""
         start_s = self.start_s if start_s is None else start_s
         smooth = self.interpolation == "smooth"
         if self.file is not None:
             track = load_trajectory(
-                folder / Path(self.file).expanduser(),
+                path(self.file),
                 format=self.format,
-                times=None if self.times is None else folder / Path(self.times).expanduser(),
+                times=None if self.times is None else path(self.times),
                 columns=self.columns,
                 camera_axes=self.camera_axes,
                 offset_s=self.offset_s,
@@ -219,11 +219,11 @@ class ActorSection(ShapeSection):
         """Whether its file is that of a robot."""
         return self.file is not None and self.file.file.lower().endswith(ROBOTS)
 
-    def way(self, folder: Path, standing: Standing, carrier: Track | None) -> Track:
+    def way(self, path: PathOf, standing: Standing, carrier: Track | None) -> Track:
         """Return its trajectory from the survey's start on."""
         if self.trajectory is None:
             assert carrier is not None, "checked with the scenario"
             return carrier
         start_s = 0.0 if carrier is None else carrier.start_s
         with prefixed(f"actor {self.name!r}"):
-            return self.trajectory.track(folder, standing, start_s)
+            return self.trajectory.track(path, standing, start_s)

@@ -2,47 +2,27 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from pydantic import BaseModel
 
 from ..base.errors import LidarpoolError
-from ..base.validation import attributes_of, dotted, fields_of, is_section, sections_in
+from ..base.validation import fields_of, is_section, sections_in
 from ..base.words import counted, did_you_mean
 from .scenario import Scenario
 
-
-@dataclass(frozen=True)
-class FieldPath:
-    """Where a path leads in one scenario.
-
-    Parameters
-    ----------
-    text
-        As it was written: ``sensors.roof.model``.
-    steps
-        Keys, and numbers of entries, with the value of each in the scenario; of a section that is
-        left out there, one of defaults.
-    """
-
-    text: str
-    steps: tuple[tuple[str | int, Any], ...]
-
-    @property
-    def keys(self) -> tuple[str | int, ...]:
-        """Keys and numbers of the steps."""
-        return tuple(key for key, _ in self.steps)
-
-    @property
-    def place(self) -> str:
-        """As errors of a scenario write it: ``scene.files[0].file``."""
-        return dotted(self.keys)
+# Keys and numbers of entries, each with the value there; of a section that is left out, one of
+# defaults.
+Steps = tuple[tuple[str | int, Any], ...]
 
 
-def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
-    """Find out where a path leads, and the annotation of the field there.
+def find_field(scenario: Scenario, text: str) -> tuple[Steps, Any]:
+    """Find out where a path such as ``sensors.roof.model`` leads in a scenario.
+
+    Returns
+    -------
+    The steps to the field, and its annotation.
 
     Raises
     ------
@@ -74,15 +54,16 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldPath, Any]:
             raise LidarpoolError(f"{text} leads to no field: {what}.")
         steps.append((key, node))
         rest = rest[used:]
-    return FieldPath(text, tuple(steps)), kind
+    return tuple(steps), kind
 
 
 def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
-    fields = fields_of(type(node))
+    fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
         raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
-    return name, getattr(node, attributes_of(type(node))[name], None), fields[name].annotation
+    own = fields[name]
+    return name, getattr(node, own, None), fields_of(type(node))[own].annotation
 
 
 def _named(names: Sequence[str], rest: Sequence[str], at: str) -> tuple[str, int]:
@@ -107,37 +88,23 @@ def _entry(entries: Sequence[Any], rest: Sequence[str], at: str) -> tuple[int, i
     return next(i for i, one in enumerate(entries) if getattr(one, "name", None) == name), used
 
 
-def opened(node: Any) -> Any:
-    """Return a section's own fields as a dict, a list of entries as a list: to be changed.
+def put(node: Any, steps: Steps, change: Callable[[Any], Any]) -> Any:
+    """Return a section with what `change` makes of the value where the steps lead.
 
-    What is within stays as it is: sections that were checked are not checked again.
+    The original stays as it is. Sections on the way become mappings of their own fields, to be
+    checked again; those beside it stay as they are.
     """
-    if is_section(type(node)):
-        names = attributes_of(type(node))
-        given = getattr(node, "model_fields_set", names.values())
-        return {n: getattr(node, a) for n, a in names.items() if a in given and hasattr(node, a)}
-    return list(node) if isinstance(node, (tuple, list)) else dict(node)
-
-
-def put(node: Any, steps: Sequence[tuple[str | int, Any]], value: Any) -> Any:
-    """Return a section with a value where the steps lead; the original stays as it is."""
     if not steps:
-        return value
+        return change(node)
     (key, base), *rest = steps
-    own = opened(node)
-    if isinstance(own, list):
-        assert isinstance(key, int), "a number of an entry"
-        below = own[key] if key < len(own) else base
-    else:
-        below = own.get(key, base)
-    own[key] = put(base if below is None else below, rest, value)
+    own: Any = list(node) if isinstance(node, (tuple, list)) else _own_fields(node)
+    below = own[key] if isinstance(own, list) else own.get(key, base)  # type: ignore[index]
+    own[key] = put(base if below is None else below, tuple(rest), change)
     return own
 
 
-def held(node: Any, steps: Sequence[tuple[str | int, Any]]) -> Any:
-    """Return what a section, some of whose parts may be opened, has where the steps lead."""
-    for key, base in steps:
-        own = opened(node)
-        node = own.get(key, base) if isinstance(own, dict) else own[key]
-        node = base if node is None else node
-    return node
+def _own_fields(node: Any) -> dict[Any, Any]:
+    if is_section(type(node)):
+        fields, given = fields_of(type(node)), getattr(node, "model_fields_set", vars(node))
+        return {f.alias or n: getattr(node, n) for n, f in fields.items() if n in given}
+    return dict(node)

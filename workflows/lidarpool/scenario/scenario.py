@@ -253,7 +253,7 @@ class Scenario(Section):
         for section in self.sensors.values() or (self.sensor,):
             if section.calibration is None:
                 with mistakes.noted(), prefixed(self._source):
-                    one = section.mounted(self._folder, CENTRE, self.noise, self.returns)
+                    one = section.mounted(self.path, CENTRE, self.noise, self.returns)
                     (one.returns or self.returns).of(one.sensor.optics)
         for path in self.files if mistakes.lines else ():
             if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have

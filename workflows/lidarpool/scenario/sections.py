@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
@@ -36,6 +36,7 @@ from ..sensor.models import datasheet, load_sensor
 from ..sensor.sensor import Fov, Layers, MaxRange, MinRange, RaysPerRevolution
 
 COPIES_MOST = 1_000_000  # of one entry
+PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
 Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
@@ -376,14 +377,12 @@ class SensorSection(Section):
         """Whether its model is a file of the user's."""
         return self.model is not None and self.model.endswith((".yaml", ".yml"))
 
-    def _found(self, folder: Path) -> str | Path | None:
-        """Return its model, a user's file from a folder."""
-        if self.model is None or not self.has_own_model:
-            return self.model
-        return folder / Path(self.model).expanduser()
+    def _found(self, path: PathOf) -> str | Path | None:
+        """Return its model, of a user's file its path."""
+        return self.model and (path(self.model) if self.has_own_model else self.model)
 
-    def sensor(self, folder: Path) -> Sensor:
-        """Return the lidar, its files from a folder; LidarpoolError if they cannot be used.
+    def sensor(self, path: PathOf) -> Sensor:
+        """Return the lidar; LidarpoolError if its files, whose paths are given, cannot be used.
 
         Equal sections have the same one, unless their files have changed.
         """
@@ -395,15 +394,15 @@ class SensorSection(Section):
         if self.model is None and self.calibration is None:
             azimuths = self.columns or self.rays_per_revolution
             return _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
-        model = self._found(folder)
-        unit = None if self.calibration is None else folder / Path(self.calibration).expanduser()
+        model = self._found(path)
+        unit = None if self.calibration is None else path(self.calibration)
         states = file_states(file for file in (model, unit) if isinstance(file, Path))
         given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}
         return _loaded(states, model=model, **given, **limits)
 
     def mounted(
         self,
-        folder: Path,
+        path: PathOf,
         mount: Pose,
         noise: NoiseSection,
         returns: ReturnsSection,
@@ -414,8 +413,8 @@ class SensorSection(Section):
         With `performance: datasheet` it has noise and returns of its own: those of the data sheet,
         but for the fields that the sections give.
         """
-        carried = Mounted(self.sensor(folder), mount, name)
-        model = self._found(folder)
+        carried = Mounted(self.sensor(path), mount, name)
+        model = self._found(path)
         if self.performance == "ideal" or model is None:
             return carried
         sheet = datasheet(model)

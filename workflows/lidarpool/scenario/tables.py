@@ -6,7 +6,6 @@ import csv
 import json
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, get_args, get_origin
 
@@ -25,16 +24,8 @@ _REAL = re.compile(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?")
 _WORDS = {"true": True, "false": False}
 
 
-@dataclass(frozen=True)
-class Row:
-    """A row of a table."""
-
-    line: int
-    entry: Any  # of the list, checked
-
-
-def read_rows(path: Path, kind: Any) -> list[Row]:
-    """Read a table whose columns are fields of an entry, with dots where they are nested.
+def read_rows(path: Path, kind: Any) -> list[Any]:
+    """Read entries of a list from a table, whose columns are their fields: box, at.0.position.
 
     A cell is a number, true or false, or a list or mapping as in YAML, else text; an empty one
     leaves the field out. Lines that begin with # are remarks.
@@ -82,7 +73,7 @@ def read_rows(path: Path, kind: Any) -> list[Row]:
             mistakes.lines.append(told)
             continue
         try:
-            rows.append(Row(line, _checked(adapter, dict(zip(head, row, strict=False)))))
+            rows.append(_checked(adapter, dict(zip(head, row, strict=False))))
         except ValidationError as error:
             found = validation_errors(error, model)
             mistakes.lines += [f"{path}, line {line}: {words}" for words in found]

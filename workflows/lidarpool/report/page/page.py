@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping
-from datetime import UTC, datetime
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Any
 
 import yaml
@@ -22,12 +20,10 @@ from ...scenario.scenario import Scenario
 from ...sensor import Noise, Returns
 from ...sensor.weather import Weather
 from ..cloud_numbers import CountedCloud
-from ..report import STAGES, in_order
 from . import words
 from .timeline import make_timeline
 
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
-_NONE: Mapping[str, str] = MappingProxyType({})
 
 
 def write_page(
@@ -55,24 +51,22 @@ def write_page(
         changed=_changed,
         kinds={"returns": Returns, "noise": Noise, "weather": Weather},
         scenario=_written(scenario) if scenario else "",
-        **of_tasks(result.stages),
+        stages=result.stages,
     )
     path.write_text(text, encoding="utf-8")
 
 
-def of_tasks(stages: Iterable[StageTotals]) -> dict[str, Any]:
-    """Return what templates show of the tasks of a run: when it began, stages, timeline."""
-    ordered, begun = in_order(stages), ""
-    if ordered:
-        first = datetime.fromtimestamp(min(stage.start for stage in ordered), UTC)
-        begun = f"{first:%Y-%m-%d %H:%M UTC}"
-    return {"begun": begun, "stages": ordered, "timeline": make_timeline(ordered)}
+def rendered(
+    template: str,
+    *,
+    pictures: Mapping[str, str] | None = None,
+    stages: Sequence[StageTotals] = (),
+    **values: Any,
+) -> str:
+    """Fill a template for HTML, Markdown or a terminal.
 
-
-def rendered(template: str, *, pictures: Mapping[str, str] = _NONE, **values: Any) -> str:
-    """Fill a template for HTML, Markdown or a terminal; `pictures` are elements of HTML.
-
-    All other values are escaped as the format needs. A missing one is an error.
+    `pictures` are elements of HTML, and `stages` are for a timeline. All other values are escaped
+    as the format needs; a missing one is an error.
     """
     escaped = words.markdown if template.endswith(".md") else words.printable
     environment = Environment(
@@ -95,8 +89,11 @@ def rendered(template: str, *, pictures: Mapping[str, str] = _NONE, **values: An
     environment.filters["labels"] = lambda names: dict(
         zip(names, without_common_prefix([*names]), strict=True)
     )
-    images = {name: Markup(image) for name, image in pictures.items()}
-    return environment.get_template(template).render(pictures=images, names=STAGES, **values)
+    return environment.get_template(template).render(
+        pictures={name: Markup(image) for name, image in (pictures or {}).items()},
+        timeline=make_timeline(stages),
+        **values,
+    )
 
 
 def _written(scenario: Scenario) -> str:

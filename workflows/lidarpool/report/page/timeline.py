@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ from poolpart import TaskRecord
 from ...base.words import counted, natural
 from ...pipeline.task_book import StageTotals, union
 from ...render.stage import nice_step
-from ..report import STAGES
+from ..report import STAGES, in_order
 from .words import duration
 
 WIDTH = 1000  # units of the drawing, which the page scales
@@ -45,10 +46,12 @@ class Group(NamedTuple):
 class Timeline(NamedTuple):
     """All groups on one axis: the stages, then each partition's workers."""
 
+    begun: str  # when the first task was, UTC
     seconds: float  # from the first start to the last stop
     ticks: Sequence[tuple[float, str]]  # per cent of the width, label
     groups: Sequence[Group]
-    tasks: int
+    stages: Sequence[StageTotals]  # in the order of the pipeline
+    names: Mapping[str, str] = STAGES
     row: int = ROW  # height of a row
 
 
@@ -56,6 +59,7 @@ def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
     """Lay out the tasks of a run, of which some have records; None if nothing ran."""
     if not stages:
         return None
+    stages = in_order(stages)
     begin = min(stage.start for stage in stages)
     seconds = max(1e-6, max(stage.stop for stage in stages) - begin)
 
@@ -112,4 +116,5 @@ def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
         groups.append(Group(partition, detail, rows))
     marks = np.arange(0, seconds, nice_step(seconds / 6))
     ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
-    return Timeline(seconds, ticks, groups, sum(stage.tasks for stage in stages))
+    begun = f"{datetime.fromtimestamp(begin, UTC):%Y-%m-%d %H:%M UTC}"
+    return Timeline(begun, seconds, ticks, groups, stages)
