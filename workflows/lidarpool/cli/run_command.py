@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -43,6 +42,7 @@ from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .logs import set_logs
+from .options import show
 from .terminal import Terminal
 
 
@@ -85,10 +85,8 @@ def _run_survey(
     output = SurveyOutput(options.out, job, built.scenario, only == "cloud", judge)
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
-        if terminal.as_json:
-            click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
-        else:
-            _tell_result(options.out, result, job, report)
+        lines = _of_result(options.out, result, job, report)
+        show(summary(options.out, report), lines, terminal.as_json)
         if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
                 page.stay(folder / CLOUD)
@@ -156,13 +154,16 @@ def no_hits(job: Job) -> str:
     return f"no ray hit anything: check poses, ranges and units; {where}; {seen}"
 
 
-def _tell_result(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:
+def _of_result(
+    out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]
+) -> Iterator[str]:
+    """Say in lines of text what a survey has given."""
     for note in report["notes"]:
-        click.echo(f"note: {note}")
+        yield f"note: {note}"
     if not result.hits:
-        click.echo(f"note: {no_hits(job)}")
+        yield f"note: {no_hits(job)}"
     on = report["hits_on_surfaces"]
-    click.echo(
+    yield (
         f"{counted(job.survey.scan_count, 'scan')}, {counted(result.rays, 'ray')}, "
         f"{counted(on, 'hit')} on {counted(len(job.scene.all_names), 'object')}"
         f"{f' and {result.hits - on:,} on none' if result.hits > on else ''}, "
@@ -176,21 +177,18 @@ def _tell_result(out: Path | Storage, result: RunResult, job: Job, report: dict[
         possible = "no path is possible, the obstacles leave no way"
         if math.isfinite(plan.shortest_possible):
             possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
-        click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
-    click.echo(f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}")
+        yield f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
+    yield f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}"
 
 
 def _tell_campaign(out: Path | Storage, run: CampaignRun, *, as_json: bool) -> None:
-    if as_json:
-        names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
-        told = {"folder": str(out), "jobs": run.done, "failed": [row.name for row in run.failed]}
-        told |= {name: getattr(run, name) for name in names}
-        click.echo(json.dumps(told, indent=1, allow_nan=False))
-        return
-    for note in run.notes:
-        click.echo(f"note: {note}")
-    click.echo(
+    names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
+    told = {"folder": str(out), "jobs": run.done, "failed": [row.name for row in run.failed]}
+    told |= {name: getattr(run, name) for name in names}
+    lines = [
+        *(f"note: {note}" for note in run.notes),
         f"{counted(run.done, 'job')}, {counted(run.rays, 'ray')}, "
-        f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)"
-    )
-    click.echo(f"data set in {click.format_filename(str(out))}: see README.md there")
+        f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
+        f"data set in {click.format_filename(str(out))}: see README.md there",
+    ]
+    show(told, lines, as_json)
