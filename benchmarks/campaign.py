@@ -73,7 +73,7 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
     (folder / "base.yaml").write_text(BASE % (rays, layers))
     (folder / "campaign.yaml").write_text(CAMPAIGN % jobs)
     campaign = Campaign.load(folder / "campaign.yaml")
-    local = local_client(gpu_workers=None, lidar_slots=5, other_workers=None, planning=False)
+    local = local_client({"LIDAR": 5})
     with local as client:
         pids = client.run(lambda dask_worker: (dask_worker.state.total_resources, os.getpid()))
         lidar = next(pid for resources, pid in pids.values() if resources.get("LIDAR"))
