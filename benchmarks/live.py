@@ -22,13 +22,13 @@ from distributed import Client
 
 from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
-from lidarpool.run.job import Job
+from lidarpool.run.conductor import Conductor, Kept
+from lidarpool.run.jobs import OneJob
 from lidarpool.run.local import local_cluster
+from lidarpool.run.options import RunOptions
 from lidarpool.run.page import Page
-from lidarpool.run.result import RunResult
-from lidarpool.run.run import drive
-from lidarpool.run.store import RunStore
-from lidarpool.run.watch import Waiting
+from lidarpool.run.screen import Screen
+from lidarpool.scenario.job import Job
 
 NEWS_S = 0.5  # as the page asks
 SCENE, POINTS = "surface?colour=grey", "points?colour=z&most=200000"
@@ -41,34 +41,17 @@ def job(poses: int) -> Job:
     return Job(Scene.seed(), survey, Planning((25, 25), (-30, -20), trials=4))
 
 
-def plain(client: Client, work: Job) -> float:
-    """Seconds of a survey without a page."""
-    return driven(client, RunStore(work), Page()).survey_seconds
+def plain(client: Client, work: Job, page: Page | None = None) -> float:
+    """Seconds of a survey, without a page by default."""
+    screen, options = Screen(lambda progress: None), RunOptions(client=client)
+    return Conductor(OneJob(work), options, Kept(), screen, page or Page())().survey_seconds
 
 
 def watched(client: Client, work: Job) -> tuple[float, int]:
     """Seconds of a survey with a page that somebody looks at, and bytes that were sent."""
     with live_page(port=0, browser=False) as live, looking(live.page.url) as taken:
-        store = RunStore(work)
-        live.begun(store)
-        result = driven(client, store, live)
-        live.finish(result.seconds, result)
-    return result.survey_seconds, sum(taken)
-
-
-def driven(client: Client, store: RunStore, page: Page) -> RunResult:
-    """Do a run that tells a page."""
-    result, _ = drive(
-        client,
-        store,
-        print,
-        Waiting(),
-        own=True,
-        on_frame=lambda frame: None,
-        page=page,
-        show=lambda progress: None,
-    )
-    return result
+        seconds = plain(client, work, live)
+    return seconds, sum(taken)
 
 
 @contextmanager

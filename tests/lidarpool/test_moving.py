@@ -20,7 +20,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.run.identity import identity_of
-from lidarpool.run.job import Job
+from lidarpool.scenario.job import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import Returns

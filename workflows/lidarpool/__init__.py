@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from .pipeline import Frame
     from .plan import Plan, Planning
     from .report.comparison import Comparison, compare
-    from .run.campaign import CampaignRun
+    from .run.result import CampaignRun
     from .run.store import remove_run
     from .scenario.job import Job
     from .scene.actors import Actor
@@ -108,7 +108,7 @@ _MODULES = {
     "pipeline": ("Frame",),
     "plan": ("Plan", "Planning"),
     "report.comparison": ("Comparison", "compare"),
-    "run.campaign": ("CampaignRun",),
+    "run.result": ("CampaignRun",),
     "run.store": ("remove_run",),
     "scenario.job": ("Job",),
     "scene.actors": ("Actor",),
