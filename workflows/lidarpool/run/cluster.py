@@ -68,7 +68,7 @@ class Cluster:
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         try:
-            pool, casting, backend, software = find_workers(
+            self._pool, self._casting, self.backend, self.software = find_workers(
                 client,
                 needed,
                 store.backend or options.backend,
@@ -78,7 +78,9 @@ class Cluster:
                 left,
                 writing=store.only is None,
             )
-            store.cast_with(backend, software)
+            store.cast_with(self.backend, self.software)
+            if store.only is not None:  # others are checked one by one
+                self.check(store.only.job)
         except LidarpoolError:
             want_nothing(client, (GPU, LIDAR, OTHER))
             raise
@@ -86,13 +88,11 @@ class Cluster:
             if client.status != "running" or isinstance(error, CommClosedError):
                 raise self._told_lost() from error
             raise
-        self.backend, self.software = backend, software
-        self._pool, self._casting = pool, casting
-        names = sorted({name for worker in pool for name in worker.partitions})
+        names = sorted({name for worker in self._pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
         # Slots of LIDAR that the long stages leave, as they are at the start.
         self.spare = max(1, self.partitions[LIDAR].slots - 2 - options.collectors)
-        note = gpu_note(pool, casting, backend)
+        note = gpu_note(self._pool, self._casting, self.backend)
         self.notes: list[str] = [note] if note else []
         self._callers_error: BaseException | None = None
 

@@ -144,7 +144,8 @@ class Run:
                 continue
             self._made[found.job.number] = self._store.points_of(found.job), found.sweeps
             try:
-                self._cluster.check(found.job)
+                if self._writer is not None:
+                    self._cluster.check(found.job)
                 self._begin(found)
             except JobError as error:  # too large for the workers, or it cannot be pickled
                 self._fail(found.job.number, error, rows)
