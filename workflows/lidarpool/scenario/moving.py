@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Strict, model_validator
@@ -12,7 +12,7 @@ from ..base.arrays import Floats
 from ..base.declared import Text, TextOrTexts, declared, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
-from ..sensor import Pose, Sensor, Track, load_trajectory
+from ..sensor import Mounted, Pose, Sensor, Track, load_trajectory
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
@@ -55,6 +55,10 @@ class CarriedSection(SensorSection):
         """Make the sensor, which starts at its own time; errors as of `SensorSection`."""
         made = super().sensor(path)
         return replace(made, start_ns=self.start_s * 1e9) if self.start_s else made
+
+    def mounted(self, *given: Any) -> Mounted:
+        """Return it on its carrier, as `SensorSection` does, with its time steps."""
+        return replace(super().mounted(*given), steps=self.steps)
 
 
 class TimedPose(Section, Pose):
