@@ -14,10 +14,10 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-from pydantic import PrivateAttr, Strict, ValidationError
+from pydantic import PrivateAttr, ValidationError
 
 from ..base.arrays import Floats
-from ..base.declared import Text, declared, told
+from ..base.declared import Several, Text, declared, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import validation_errors
 from ..base.words import counted, did_you_mean
@@ -144,8 +144,7 @@ class Scenario(Section):
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
     sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
     poses: Annotated[
-        tuple[PoseEntry, ...] | None,
-        Strict(False),
+        Several[PoseEntry] | None,
         told(
             "poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
@@ -172,8 +171,7 @@ class Scenario(Section):
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
-        tuple[ActorSection, ...],
-        Strict(False),
+        Several[ActorSection],
         told(
             "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
@@ -202,8 +200,7 @@ class Scenario(Section):
         ),
     ] = None
     materials: Annotated[
-        tuple[Material, ...],
-        Strict(False),
+        Several[Material],
         told(
             "materials of objects, by name; the last entry for an object counts",
             [{"objects": "*", "reflectance": 0.3}, {"objects": "Window*", "transparent": "pass"}],
