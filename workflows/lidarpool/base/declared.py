@@ -1,8 +1,8 @@
 """Declarations of quantities that users set: what a scenario file needs beyond Python's types.
 
 A quantity is a field of a dataclass: `Annotated[type, told(description, limits)] = default`.
-`checked_fields` lets the dataclass refuse values outside the limits, and a section of a scenario
-inherits the fields (`lidarpool.scenario.sections`).
+`checked_fields` lets the dataclass refuse values outside the limits, and be a section of a
+scenario; other sections inherit its fields (`lidarpool.scenario.sections`).
 """
 
 from __future__ import annotations
