@@ -6,10 +6,10 @@ from dataclasses import replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Strict, model_validator
+from pydantic import model_validator
 
 from ..base.arrays import Floats
-from ..base.declared import Text, TextOrTexts, declared, is_text, short, told
+from ..base.declared import Several, Text, TextOrTexts, declared, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
 from ..sensor import Mounted, Pose, Sensor, Track, load_trajectory
@@ -89,8 +89,7 @@ class TrajectorySection(Section):
         told("whether poses have camera axes (z ahead); by default those of KITTI have"),
     ] = None
     points: Annotated[
-        tuple[TimedPose, ...],
-        Strict(False),
+        Several[TimedPose],
         told("instead of a file: time_s, position and angles, world metres"),
     ] = ()
     interpolation: Annotated[
