@@ -16,6 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import psutil
 
 from lidarpool import Campaign
@@ -57,6 +58,14 @@ class Samples:
         self._me, self._worker = psutil.Process(), psutil.Process(lidar)
         self._next = 0.0
 
+    @property
+    def growth(self) -> float:
+        """Memory of the driver, MiB for each job of the last half: a line through the samples."""
+        half = len(self.jobs) // 2
+        if len({*self.jobs[half:]}) < 2:
+            return 0.0
+        return float(np.polyfit(self.jobs[half:], self.driver[half:], 1)[0])
+
     def __call__(self, progress: Progress) -> None:
         """Take a sample, if it is time to."""
         now = time.monotonic()
@@ -73,7 +82,7 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
     (folder / "base.yaml").write_text(BASE % (rays, layers))
     (folder / "campaign.yaml").write_text(CAMPAIGN % jobs)
     campaign = Campaign.load(folder / "campaign.yaml")
-    local = local_client(gpu_workers=None, lidar_slots=5, other_workers=None, planning=False)
+    local = local_client({"LIDAR": 5})
     with local as client:
         pids = client.run(lambda dask_worker: (dask_worker.state.total_resources, os.getpid()))
         lidar = next(pid for resources, pid in pids.values() if resources.get("LIDAR"))
@@ -95,7 +104,7 @@ def measure(jobs: int, rays: int, layers: int, folder: Path) -> tuple[dict[str, 
         "finishing_s": run.seconds - wall,
         "casting_tasks": next((s.tasks for s in run.stages if s.stage == "intersect"), 0),
         "misplaced": sum(stage.violations for stage in run.stages),
-        "driver_growth_mib": samples.driver[-1] - samples.driver[len(samples.driver) // 10],
+        "growth_bytes_a_job": MIB * samples.growth,
     }
     return figures, samples
 

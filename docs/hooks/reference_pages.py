@@ -46,7 +46,7 @@ _SECTIONS = {
     "navigation: mount": "InstrumentPose",
     "cloud": "CloudOptions",
     "output": "OutputSection",
-    "output: write": "ExportSection",
+    "output: write": "Format",
     "planning": "PlanningSection",
     "planning: obstacles": "Obstacle",
     "pool": "PoolSection",

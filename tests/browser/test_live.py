@@ -25,7 +25,7 @@ ALL = float("inf")
 @pytest.fixture(scope="module")
 def client():
     """Return the client of a small cluster."""
-    with local_client(gpu_workers=1, lidar_slots=4, other_workers=1) as client:
+    with local_client({"LIDAR": 4}, gpu_workers=1, other_workers=1) as client:
         yield client
 
 

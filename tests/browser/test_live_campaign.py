@@ -33,7 +33,7 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
     campaign, looked = Campaign(make, COUNT, keep="folder", title="Heights"), threading.Event()
     ended = []
     with (
-        local_client(gpu_workers=1, lidar_slots=5, other_workers=None, planning=False) as client,
+        local_client({"LIDAR": 5}, gpu_workers=1) as client,
         live_page(COUNT, campaign.names, "Heights", port=0, browser=False) as live,
     ):
         making = Making(tmp_path / "set", own=False, wait_s=120.0)

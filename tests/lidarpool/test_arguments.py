@@ -109,7 +109,12 @@ WRONG = {
     Gnss: [(0, "rate_hz is 0"), (10, "roof", "mount"), (10, Pose((0, 0, 2)), -1, "horizontal")],
     Imu: [("fast", "rate_hz"), (200, (0, 0, 1), "mount"), (200, Pose((0, 0, 1)), -1, "gyroscope")],
     Navigation: [("imu", "imu"), (Imu(), 10, "gnss"), (None, None, "down", "gravity_m_s2")],
-    Noise: [("0.1", "range_m is '0.1'"), ([1], "a number"), (0, 0, 0, 0, None, 1.5, "seed is 1.5")],
+    Noise: [
+        ("0.1", "range_m is '0.1'"),
+        ([1], "a number"),
+        (np.True_, "a number"),
+        (0, 0, 0, 0, None, 1.5, "seed is 1.5"),
+    ],
     Optics: [
         ("red", "wavelength_nm"),
         (905.0, "x", "0 to 1000, or two such"),

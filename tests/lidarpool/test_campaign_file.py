@@ -461,7 +461,7 @@ WRONG = {
     "log of 0": ({KM: {"log_uniform": [0, 1]}}, "both above 0"),
     "two kinds": ({KM: {"uniform": [1, 2], "choice": [1]}}, "give one of uniform, log_uniform"),
     "none": ({KM: {}}, "give one of uniform, log_uniform"),
-    "a value": ({KM: 3}, "it must be how it is chosen"),
+    "a value": ({KM: 3}, "it must be a way of choosing"),
     "misspelt": ({KM: {"unifrom": [1, 2]}}, "Did you mean 'uniform'?"),
     "no values": ({KM: {"choice": []}}, "is []; it must be a list of values"),
     "weights": ({KM: {"choice": [1, 2], "weights": [1]}}, "as many weights as"),

@@ -37,20 +37,16 @@ ROWS = [row(k) for k in range(30)]
 ROWS[3] = JobRow(3, "03", "train", ROWS[3].values, "no <b>surface</b> | in range\nmove the sensor")
 
 
-def write(place, rows, picture=None, versions=None, layout="kitti", **given):
-    """Write the card of a campaign and a run, of which some may be given."""
-    campaign = {
+def write(place, rows, picture=None, versions=None, **given):
+    """Write the card of a campaign and its run, of which some may be given."""
+    of = SimpleNamespace(**{
         "title": "Drives", "count": 31, "seed": 7, "names": NAMES, "license": "CC-BY-4.0",
-        "command": "campaign.yaml", "description": "", "keep": SimpleNamespace(format=layout),
-    }  # fmt: skip
-    run = {"sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "seconds": 0.0, "resumed": 0}
-    run |= {"notes": (), "stages": ()}
-    campaign, run = (
-        SimpleNamespace(**one | {name: given[name] for name in one if name in given})
-        for one in (campaign, run)
-    )
+        "command": "campaign.yaml", "description": "", "keep": SimpleNamespace(format="kitti"),
+        "sensors": {"roof": "velodyne/vlp16, 10 Hz"}, "seconds": 0.0, "resumed": 0, "notes": (),
+        "stages": (),
+    } | given)  # fmt: skip
     versions = versions or {"lidarpool": "1.2 (sources 01234567)"}
-    return write_card(place, campaign, run, rows, versions, picture)
+    return write_card(place, of, of, rows, versions, picture)
 
 
 @pytest.fixture(scope="module")
@@ -138,7 +134,7 @@ def test_letters_of_users_are_escaped(tmp_path):
     write(
         Storage.at(tmp_path, durable=False), rows, title=EVIL, names=names, sensors={EVIL: EVIL},
         license=EVIL, notes=[EVIL], versions={EVIL: EVIL, "lidarpool": EVIL}, command=EVIL,
-        description=EVIL, layout=EVIL,
+        description=EVIL, keep=SimpleNamespace(format=EVIL),
     )  # fmt: skip
     page = (tmp_path / "report.html").read_text()
     assert "<script" not in page and "\u202e" not in page

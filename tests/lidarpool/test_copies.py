@@ -224,7 +224,7 @@ WRONG = {
     "neither": ({"name": "A", "at": [[0, 0]]}, "give either file or box."),
     "no place": (TREE, "give one of at, table and scatter."),
     "two": (TREE | {"at": [[0, 0]], "table": "a.csv"}, "give one of at, table and scatter."),
-    "short": (TREE | {"at": [[0]]}, "at least 2 entries"),
+    "short": (TREE | {"at": [[0]]}, "at least 2 items"),
     "text": (TREE | {"at": ["here"]}, "is 'here'; it must be"),
     "outside": (
         TREE | {"at": [[0, 0], [99, 1], [99, 2]]},
@@ -233,7 +233,7 @@ WRONG = {
     ),
     "flat": (TREE | {"at": [{"position": [0, 0], "scale": [1, 0, 1]}]}, "would flatten"),
     "name": (TREE | {"scatter": {"count": 1, "surfaces": "Hil"}}, "'Hil', but no object has"),
-    "ordered": (TREE | {"scatter": {"count": 1, "within": [5, 0, 4, 1]}}, "x and y come first"),
+    "ordered": (TREE | {"scatter": {"count": 1, "within": [5, 0, 4, 1]}}, "the lowest x and y"),
     "factors": (TREE | {"scatter": {"count": 1, "scale": [2, 1]}}, "the largest factor"),
     "full": (
         TREE | {"scatter": {"count": 200, "spacing_m": 5}},

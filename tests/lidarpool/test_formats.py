@@ -715,8 +715,8 @@ def test_a_cloud_is_saved_in_the_format_of_its_ending(cloud, sweeps, tmp_path):
     before = sorted(tmp_path.rglob("*"))
     for told, path, more in (
         (r"has no format: use .ply, .las, .*, or give a format", "x.xyz", {}),
-        ("format is 'xyz'; .* ply, las", "x", {"format": "xyz"}),
-        ("layout is 'sick'; .* velodyne", "x.mcap", {"layout": "sick"}),
+        ("format is 'xyz'; .* 'ply', 'las'", "x", {"format": "xyz"}),
+        ("layout is 'sick'; .* 'velodyne'", "x.mcap", {"layout": "sick"}),
         ("is a folder: remove it, or give another path", "kitti", {"format": "kitti"}),
         ("is a folder", "result", {"format": "laz"}),
         ("precision_m is -1; it must be a length in metres", "x.las", {"precision_m": -1}),

@@ -9,7 +9,7 @@ BAD = {
     "target within": ({"centres": [(0, 0), (-30, -21)], "radii": 2}, "target .* within disc 1"),
     "no way to go": ({"start": (1, 2), "target": (1, 2)}, "nothing to plan"),
     "start not finite": ({"start": (np.nan, 0)}, "start\\[0\\] is nan; it must be a finite number"),
-    "target in space": ({"target": (0, 0, 0)}, "target is .* at most 2 entries"),
+    "target in space": ({"target": (0, 0, 0)}, "target is .* at most 2 items"),
     "start a word": ({"start": "here"}, "start is 'here'"),
     "centres not finite": ({"centres": [(0, np.inf)], "radii": 1}, "centres is .*inf"),
     "centres in space": ({"centres": [(0, 0, 0)], "radii": 1}, r"centres is .*\(m, 2\)"),

@@ -200,7 +200,7 @@ BAD = [
     ("sensor: {model: ouster/os1-64, layers: 64}", "a model defines the beams: leave out layers"),
     ("sensor: {columns: 512, rays_per_revolution: 512}", "mean the same: give one of them"),
     ("sensor: [1]", r"sensor is \[1\]; it must be a mapping"),
-    ("poses: []", r"poses is \[\]; it must have at least 1 entry"),
+    ("poses: []", r"poses is \[\]; it must have at least 1 item, not 0"),
     ("poses: [0, 0, 1]", r"poses\[0\] is 0; it must be x, y and z in metres"),
     ("poses: [[0, 0]]", r"poses\[0\]\.position\[2\] is missing"),
     ("poses: [{position: [0, 0, 0], yaw: 5}]", r"poses\[0\]\.yaw is not.*'yaw_deg'"),

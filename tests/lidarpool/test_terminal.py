@@ -9,13 +9,12 @@ from io import StringIO
 import pytest
 
 import lidarpool.cli.commands
-from lidarpool.cli.terminal import PlainLines, shown_progress, shown_status
-from lidarpool.run.bars import bars_here
-from lidarpool.run.progress import Progress
+from lidarpool.cli.terminal import PlainLines, Terminal
+from lidarpool.run.progress import Progress, bars_here
 
 
 def progress(seconds: float, scans: int, trials: int = 0) -> Progress:
-    return Progress(100, scans, scans, scans, scans, 7 * scans, 10, trials, seconds)
+    return Progress(seconds, 100, scans, scans, scans, scans, 7 * scans, 10, trials)
 
 
 @pytest.mark.parametrize("kind", ["xterm", "dumb"])
@@ -27,7 +26,7 @@ def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
     monkeypatch.setenv("TERM", kind)
     stream = os.fdopen(slave, "w")
     monkeypatch.setattr(sys, "stderr", stream)
-    with shown_progress() as show:
+    with Terminal().progress() as show:
         show(progress(60.0 * 3, 3))
         said = os.read(master, 1 << 16)
         os.close(master)
@@ -35,7 +34,7 @@ def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
             os.write(slave, b"x")
         show(progress(60.0 * 6, 6))
         show(progress(60.0 * 9, 9))
-    with shown_status("writing"):
+    with Terminal().status("writing"):
         pass
     assert said
     with suppress(OSError):  # what it could not write it tries to write once more

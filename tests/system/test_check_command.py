@@ -21,7 +21,9 @@ from tests.lidarpool.meshes import PLY
 import lidarpool.cli.forecast
 from lidarpool import Mounted, Returns, Sensor, Survey, Track, simulate
 from lidarpool.cli.forecast import forecast, sample_survey
-from lidarpool.run.job import make_job
+from lidarpool.run.options import RunOptions
+from lidarpool.scenario.build import build
+from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Cutout, Mesh
@@ -53,10 +55,9 @@ def check(tmp_path, lidarpool) -> Callable[..., Any]:
 
 
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
-    scenario = Scenario.from_data(SHORT)
-    job = make_job(scenario, no_plan=True)
+    job = job_of(build(Scenario.from_data(SHORT), plans=False))
     with Client(cluster, set_as_default=False) as client:
-        made = forecast(scenario, job, tmp_path, client)
+        made = forecast(job, RunOptions(backend="numpy", out=tmp_path), client)
         result = simulate(
             job.scene, job.survey, client=client, backend="numpy", folder=tmp_path / "run"
         )
@@ -103,7 +104,7 @@ def cast(rig: Rig, first: int) -> Iterator[Any]:
 
 
 def test_an_estimate_from_few_rays_is_near(monkeypatch):
-    job = make_job(Scenario(), no_plan=True)
+    job = job_of(build(Scenario(), plans=False))
     monkeypatch.setattr(lidarpool.cli.forecast, "SAMPLE_RAYS", 40_000)
     part = sample_survey(job.scene, job.survey, "numpy")
     assert 30_000 < part["rays"] < 50_000

@@ -21,9 +21,8 @@ import psutil
 import pytest
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
-import lidarpool.cli.run_command
-import lidarpool.report.output
 from lidarpool import read_cloud
+from lidarpool.cli.terminal import Terminal
 from lidarpool.report.output import FILES
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
@@ -196,13 +195,13 @@ def test_json_is_one_document_and_all_of_stdout(run, tmp_path):
 
 
 def test_warnings_of_libraries_are_not_on_the_terminal(run, monkeypatch):
-    shown_progress = lidarpool.cli.run_command.shown_progress
+    progress = Terminal.progress
 
-    def warn(quiet: bool) -> Any:
+    def warn(terminal: Terminal) -> Any:
         logging.getLogger("distributed.worker").warning("memory is nearly full")
-        return shown_progress(quiet)
+        return progress(terminal)
 
-    monkeypatch.setattr(lidarpool.cli.run_command, "shown_progress", warn)
+    monkeypatch.setattr(Terminal, "progress", warn)
     outcome = run("--no-plan")
     assert outcome.code == 0
     assert "memory is nearly full" not in outcome.err + outcome.out

@@ -25,7 +25,7 @@ def test_workers_are_forked_from_one_process_also_in_place_of_others():
     others = set(psutil.Process().children(recursive=True))  # of the tests' own cluster
     preload = forkserver._forkserver._preload_modules
     method = dask.config.get("distributed.worker.multiprocessing-method")
-    with local_client(gpu_workers=1, lidar_slots=4, other_workers=0) as client:
+    with local_client({"LIDAR": 4}, gpu_workers=1) as client:
         first = client.run(os.getpid)
         for pid in first.values():
             os.kill(pid, signal.SIGKILL)

@@ -1,15 +1,15 @@
 """Declarations of quantities that users set: what a scenario file needs beyond Python's types.
 
 A quantity is a field of a dataclass: `Annotated[type, told(description, limits)] = default`.
-`checked_fields` lets the dataclass refuse values outside the limits, and a section of a scenario
-inherits the fields (`lidarpool.scenario.sections`).
+`checked_fields` lets the dataclass refuse values outside the limits, and be a section of a
+scenario; other sections inherit its fields (`lidarpool.scenario.sections`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import fields
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
 from pydantic import (
     BeforeValidator,
@@ -27,8 +27,14 @@ Text = Annotated[str, Field(min_length=1)]
 # Nothing on Earth is farther from the origin of its map.
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
 Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
+
+T = TypeVar("T")
 # YAML has only lists, which strict validation does not accept as tuples.
-Triple = Annotated[tuple[Coordinate, Coordinate, Coordinate], Strict(False)]
+Several = Annotated[tuple[T, ...], Strict(False)]
+Two = Annotated[tuple[T, T], Strict(False)]
+Three = Annotated[tuple[T, T, T], Strict(False)]
+Four = Annotated[tuple[T, T, T, T], Strict(False)]
+Triple = Three[Coordinate]
 
 # A field that may be empty in a scenario, because lidarpool then fills it in.
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
@@ -70,7 +76,7 @@ def allowed(words: str) -> WrapValidator:
 
 def must_be(words: str) -> PydanticCustomError:
     """Return an error of a validator that says what is allowed; the value is said before it."""
-    return PydanticCustomError("allowed", "it must be {words}", {"words": words})
+    return PydanticCustomError("allowed", "Input should be {words}", {"words": words})
 
 
 def is_text(value: Any) -> bool:
@@ -79,5 +85,5 @@ def is_text(value: Any) -> bool:
 
 
 # A list of texts, or one of them without the list.
-Texts = Annotated[tuple[Text, ...], Strict(False)]
+Texts = Several[Text]
 TextOrTexts = Annotated[Texts, short(is_text, lambda v: [v], Text | Texts)]

@@ -9,9 +9,9 @@ import reprlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import fields as dataclass_fields
 from datetime import datetime
-from functools import cache, wraps
+from functools import cache, partial, reduce, wraps
 from pathlib import Path
-from types import NoneType, UnionType
+from types import MappingProxyType, NoneType, UnionType
 from typing import (
     Annotated,
     Any,
@@ -26,20 +26,15 @@ from typing import (
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
-from pydantic import (
-    AfterValidator,
-    BaseModel,
-    ConfigDict,
-    GetCoreSchemaHandler,
-    GetPydanticSchema,
-    Strict,
-    TypeAdapter,
-    ValidationError,
-    WrapValidator,
-)
+from pydantic import ConfigDict, GetCoreSchemaHandler, WrapValidator
 from pydantic.fields import FieldInfo
-from pydantic_core import ErrorDetails, PydanticKnownError, core_schema
-from typing_extensions import TypedDict
+from pydantic_core import (
+    ErrorDetails,
+    PydanticKnownError,
+    SchemaValidator,
+    ValidationError,
+    core_schema,
+)
 
 from .arrays import AnyArray
 from .errors import LidarpoolError
@@ -53,7 +48,6 @@ Place = tuple[int | str, ...]
 
 # No others, finite numbers, no conversion of text to numbers.
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
-_PYTHON = ConfigDict(strict=True, allow_inf_nan=False, validate_by_name=True)
 
 # {class: an example}
 _EXAMPLES = {
@@ -83,6 +77,7 @@ _ALLOWED = {
     "int_from_float": "a whole number",
     "int_type": "a whole number",
     "model_type": "a mapping",
+    "none_required": "None",
     "string_type": "text",
     "Mapping": "a dict",
     "PathLike": "a path",
@@ -91,6 +86,15 @@ _ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 _ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
+# {class: what makes its schema, and the limits that it takes}
+_SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
+    bool: (core_schema.bool_schema, ()),
+    int: (core_schema.int_schema, _LIMITS),
+    float: (core_schema.float_schema, (*_LIMITS, "allow_inf_nan")),
+    str: (core_schema.str_schema, ("min_length",)),
+    datetime: (core_schema.datetime_schema, ()),
+    NoneType: (core_schema.none_schema, ()),
+}
 _LETTERS = 160  # of a value that is shown
 
 
@@ -149,7 +153,11 @@ def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema
 def _check(thing: Any, given: Mapping[str, Any]) -> None:
     """Refuse values, other than defaults, that do not fit the annotations of a thing."""
     usual = _usual(thing)
-    given = {name: value for name, value in given.items() if value is not usual.get(name, usual)}
+    given = {
+        name: bool(value) if isinstance(value, np.bool_) else value  # to pydantic, else a number
+        for name, value in given.items()
+        if value is not usual.get(name, usual)
+    }
     if not given:
         return
     validator, hints = _python(thing)
@@ -180,47 +188,50 @@ def _usual(thing: Any) -> dict[str, Any]:
 
 
 @cache
-def _python(thing: Any) -> tuple[Any, dict[str, Any]]:
+def _python(thing: Any) -> tuple[SchemaValidator, dict[str, Any]]:
     """Return what validates the arguments of a function, or the fields of a dataclass."""
     known = get_type_hints(thing, include_extras=True)
     hints = {name: known[name] for name in _usual(thing) if name in known}
-    table: Any = TypedDict
-    table = table(thing.__name__, {n: _instances(h) for n, h in hints.items()}, total=False)
-    table.__pydantic_config__ = _PYTHON
-    return TypeAdapter(table).validator, hints
+    # Without `TypeAdapter`, whose import takes longer than all else of the first `Scanner`.
+    field = partial(core_schema.typed_dict_field, required=False)
+    config = core_schema.CoreConfig(strict=True, allow_inf_nan=False)
+    table = {name: field(_schema(hint)) for name, hint in hints.items()}
+    return SchemaValidator(core_schema.typed_dict_schema(table, config=config)), hints
 
 
-def _instances(hint: Any) -> Any:
-    """Return an annotation as pydantic is to check it in Python.
+def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
+    """Make pydantic's schema of an annotation in Python.
 
     Of a class there must be an instance, of a protocol its attributes; arrays are not checked here.
     """
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        notes = [note for note in hint.__metadata__ if not isinstance(note, GetPydanticSchema)]
-        return Annotated[(_instances(args[0]), *notes)]
+        schema = _schema(args[0], _limits(hint, (*_LIMITS, "min_length", "allow_inf_nan")))
+        wraps: list[Any] = [n.func for n in hint.__metadata__ if isinstance(n, WrapValidator)]
+        return reduce(lambda s, w: core_schema.no_info_wrap_validator_function(w, s), wraps, schema)
     if origin in (Union, UnionType):
-        kinds = tuple(map(_instances, args))
-        return Any if Any in kinds else Union[kinds]  # noqa: UP007 - of as many as there are
+        return core_schema.union_schema([_schema(one, limits) for one in args])
     if origin in (Sequence, Collection, Iterable, tuple):
-        kinds = tuple(one if one is ... else _instances(one) for one in args)
-        if Any in kinds:
-            return Any
-        items: Any = tuple.__class_getitem__(kinds if origin is tuple else (*kinds, ...))
-        return Annotated[items, Strict(False), WrapValidator(_once)]
-    if origin is Literal or hint in (bool, int, float, str, NoneType, datetime):
-        return hint
-    if origin is Callable or origin is Mapping:
-        return Callable if origin is Callable else _instance(Mapping)
-    if not isinstance(hint, type) or hint is Any:
-        return Any
+        items = [_schema(one) for one in args if one is not ...]
+        if core_schema.any_schema() in items:
+            return items[0]
+        more = None if origin is tuple and ... not in args else 0
+        listed = core_schema.tuple_schema(
+            items, variadic_item_index=more, min_length=limits.get("min_length"), strict=False
+        )
+        return core_schema.no_info_wrap_validator_function(_once, listed)
+    if origin is Literal:
+        return core_schema.literal_schema([*args])
+    if hint in _SCALARS:
+        make, takes = _SCALARS[hint]
+        return make(**{name: limit for name, limit in limits.items() if name in takes})
+    if origin is Callable:
+        return core_schema.callable_schema()
+    if hint is Any or not isinstance(origin or hint, type) or origin is np.ndarray:
+        return core_schema.any_schema()
     if getattr(hint, "_is_protocol", False):
-        return Annotated[Any, _having(hint)]
-    return _instance(os.PathLike if hint is Path else hint)
-
-
-def _instance(kind: type) -> Any:
-    return Annotated[Any, GetPydanticSchema(lambda *_: core_schema.is_instance_schema(kind))]
+        return core_schema.no_info_plain_validator_function(_having(hint))
+    return core_schema.is_instance_schema(os.PathLike if hint is Path else origin or hint)
 
 
 def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
@@ -228,8 +239,8 @@ def _once(value: Any, handler: Callable[[Any], Any]) -> Any:
     return value if isinstance(value, Iterator) else handler(value)
 
 
-def _having(protocol: type) -> AfterValidator:
-    """Refuse values without the attributes of a protocol."""
+def _having(protocol: type) -> Callable[[Any], Any]:
+    """Return what refuses values without the attributes of a protocol."""
     names = [name for name in vars(protocol) if not name.startswith("_")]
 
     def having(value: Any) -> Any:
@@ -238,7 +249,7 @@ def _having(protocol: type) -> AfterValidator:
             raise PydanticKnownError("is_instance_of", {"class": protocol.__name__})
         return value
 
-    return AfterValidator(having)
+    return having
 
 
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
@@ -315,25 +326,21 @@ def _allowed(detail: ErrorDetails, hint: Any) -> str:
         inner = [*classes_in(hint)]
         of = next((f" of {_ITEMS[one]}" for one in inner if one in _ITEMS), "")
         examples = [_EXAMPLES[one.__name__] for one in inner if one.__name__ in _EXAMPLES]
-        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples else "")
-    if kind in ("too_short", "too_long"):
-        few = kind == "too_short"
-        count = counted(context["min_length" if few else "max_length"], "entry", "entries")
-        return f"have at {'least' if few else 'most'} {count}"
+        return f"be a list{of}" + (f", such as [{examples[0]}]" if examples and not of else "")
     if not _LIMITS.keys().isdisjoint(context):
         limits = _limits(hint)
         return f"be {_range(limits if context.items() <= limits.items() else context)}"
-    words = detail["msg"].removeprefix("Input should ").removeprefix("it must ")
-    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words
+    words = detail["msg"].replace(" after validation", "").partition(" should ")[2]
+    return f"be {_ALLOWED[kind]}" if kind in _ALLOWED else words or f"be valid ({detail['msg']})"
 
 
-def _limits(hint: Any) -> dict[str, Any]:
+def _limits(hint: Any, names: Iterable[str] = _LIMITS) -> dict[str, Any]:
     """Limits in an annotation, as pydantic's `Field` has them: {name: limit}."""
     inner = get_args(hint)[:1] if get_origin(hint) is Annotated else get_args(hint)
-    limits = {name: limit for one in inner for name, limit in _limits(one).items()}
+    limits = {name: limit for one in inner for name, limit in _limits(one, names).items()}
     for note in getattr(hint, "__metadata__", ()):
         for limit in (note, *getattr(note, "metadata", ())):
-            limits |= {name: getattr(limit, name) for name in _LIMITS if hasattr(limit, name)}
+            limits |= {name: getattr(limit, name) for name in names if hasattr(limit, name)}
     return limits
 
 
@@ -364,7 +371,7 @@ def _named(hint: Any) -> Fields:
 
 def fields_of(section: Any) -> Fields:
     """Fields of a section of files: {attribute: field}."""
-    return section.model_fields if issubclass(section, BaseModel) else _of_dataclass(section)
+    return getattr(section, "model_fields", None) or _of_dataclass(section)
 
 
 @cache
@@ -375,7 +382,7 @@ def _of_dataclass(section: Any) -> Fields:
 
 def is_section(kind: Any) -> bool:
     """Whether a class is a section of files: a model, or a dataclass with `checked_fields`."""
-    return issubclass(kind, BaseModel) or hasattr(kind, "__pydantic_config__")
+    return hasattr(kind, "model_fields") or hasattr(kind, "__pydantic_config__")
 
 
 def sections_in(annotation: Any) -> Iterator[Any]:

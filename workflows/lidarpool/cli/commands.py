@@ -192,7 +192,8 @@ def _run(
             from ..run.store import RUN_FOLDER
             from ..scenario.campaign import Campaign, is_campaign
             from ..scenario.scenario import Scenario
-            from .run_command import Terminal, run_campaign, run_job, run_scenario
+            from .run_command import run_campaign, run_job, run_scenario
+            from .terminal import Terminal
         if given.get("cluster") is not None:
             given["cluster"] = ClusterFile.load(given["cluster"])
         terminal = Terminal(quiet, verbose, as_json)

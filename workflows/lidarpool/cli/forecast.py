@@ -32,14 +32,13 @@ from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..pipeline.policies import most_scans
 from ..report.output import ROOM_BYTES, further_files, refuse_to_replace
-from ..run.checks import check_memory, find_workers, gpu_note, slots_needed
-from ..run.cluster_file import ClusterFile
+from ..run.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
 from ..run.identity import identity_of
 from ..run.local import default_workers
 from ..run.options import RunOptions
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
-from ..scenario.build import Built, build
+from ..scenario.build import build
 from ..scenario.campaign import Campaign, is_campaign
 from ..scenario.job import Job, job_of
 from ..scenario.scenario import Scenario
@@ -52,7 +51,7 @@ from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
 from ..simulator.world import check_backend_here
 from .run_command import no_hits, options_of
-from .terminal import shown_status
+from .terminal import Terminal
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
 # caster is built (Embree 300, NumPy 350, CUDA 360).
@@ -80,16 +79,16 @@ GOLDEN = (5**0.5 - 1) / 2
 def look_at(
     path: Path,
     number: int | None,
-    no_plan: bool,
-    backend: str | None,
-    out: Path | Storage,
     client: Client | None,
-    file: ClusterFile | None,
+    *,
+    no_plan: bool,
     quiet: bool,
+    **given: Any,
 ) -> tuple[dict[str, Any], Iterator[str]]:
     """Find out what the run of a scenario, a campaign or one of its jobs would do and need.
 
-    Of a campaign, some jobs are looked at, the first and the last among them; they plan no paths.
+    It is a run with the options `given`, see `RunOptions`. Of a campaign, some jobs are looked at,
+    the first and the last among them; they plan no paths.
 
     Returns
     -------
@@ -99,25 +98,27 @@ def look_at(
     if campaign is None and number is not None:
         raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
 
-    def look(number: int | None) -> tuple[Job, dict[str, Any]]:
-        one = None if campaign is None or number is None else campaign
-        read = one.scenario(number) if one and number is not None else Scenario.load(path)
+    terminal = Terminal(quiet)
+
+    def look(one: int = 0) -> tuple[Job, dict[str, Any]]:
+        read = Scenario.load(path) if campaign is None else campaign.scenario(one)
         assert read is not None, "of a file"
-        with shown_status("reading the scene", quiet, logged=False):
-            built = build(read, plans=not no_plan and one is None)
+        with terminal.status("reading the scene", logged=False):
+            built = build(read, plans=campaign is None and not no_plan)
             job = job_of(built)
-        options = options_of(read.pool, backend)
-        with shown_status("casting some rays", quiet):
-            found = forecast(built, job, options, out, client, file)
-        if one is not None and number is not None:
+        with terminal.status("casting some rays"):
+            found = forecast(job, options_of(read.pool, **given), client)
+        found["notes"] += advice(built)
+        found["sources"] = dict(built.found.sources)
+        if campaign is not None:
+            own = {"number": one, "name": campaign.name(one), "split": campaign.split(one)}
             names = ("objects", "triangles", "scans", "rays", "estimate")
-            own = {"number": number, "name": one.name(number), "split": one.split(number)}
-            own |= {"values": one.values(number)} | {name: found[name] for name in names}
+            own |= {"values": campaign.values(one)} | {name: found[name] for name in names}
             found["job"] = own
         return job, found
 
     if campaign is None or number is not None:
-        job, found = look(number)
+        job, found = look(number or 0)
         return found, _of_job(job, found)
     campaign.check_files()
     jobs, notes, mistakes = [], [], Mistakes()
@@ -141,18 +142,11 @@ def look_at(
     return found, _of_campaign(campaign, found)
 
 
-def forecast(
-    built: Built,
-    job: Job,
-    options: RunOptions,
-    out: Path | Storage,
-    client: Client | None = None,
-    file: ClusterFile | None = None,
-) -> dict[str, Any]:
-    """Find out what the run of a job would do and need, and whether it can run.
+def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dict[str, Any]:
+    """Find out what the run of a survey would do and need, and whether it can run.
 
-    It runs on the cluster of `client`, on the one that `file` describes, or on one of this machine
-    with the sizes in `options`. Neither of the latter is started, and `out` is only looked at.
+    It runs on the cluster of `client`, on the one that `options` describe, or on one of this
+    machine. Neither of the latter is started, and the folder of the result is only looked at.
 
     Returns
     -------
@@ -160,7 +154,8 @@ def forecast(
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    formats = job.outputs
+    file, out, formats = options.cluster, options.out, job.outputs
+    assert out is not None, "commands write"
     mistakes, notes = Mistakes(), []
     with mistakes.noted():
         notes += _look_at_folder(out)
@@ -171,11 +166,8 @@ def forecast(
     for one in formats:
         with mistakes.noted():
             one.check_installed()
-    required, casting, backend = (
-        slots_needed(options, planning=job.planning is not None),
-        None,
-        None,
-    )
+    required = slots_needed(options, planning=job.planning is not None)
+    casting, backend = None, None
     memory = 0  # that of machines that are not there yet is unknown
     if file is not None:
         there = file.slots
@@ -189,12 +181,8 @@ def forecast(
                 everybody, casting, backend, _ = find_workers(client, required, options.backend)
             except PoolError as error:
                 raise LidarpoolError(str(error)) from error
+            check_workers(job, options, backend, casting)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
-            for worker in casting:
-                if worker.memory:
-                    each = worker.memory / max(1, worker.resources[GPU])
-                    name = f"the GPU worker at {worker.address}"
-                    check_memory(job, options, backend, each, name)
             notes += filter(None, [gpu_note(everybody, casting, backend)])
     else:
         workers = default_workers(CPU_COUNT, len(visible_gpus()))
@@ -207,9 +195,8 @@ def forecast(
             usable = [name for name, reason in available_backends().items() if not reason]
             backend = usable[0] if options.backend == "auto" else options.backend
             # Dask gives each worker of a local cluster its share, see `poolpart.local_cluster`.
-            check_memory(
-                job, options, backend, MEMORY_LIMIT / CPU_COUNT, "a GPU worker of this machine"
-            )
+            each = MEMORY_LIMIT / CPU_COUNT
+            check_memory(job, options, backend, each, "a GPU worker of this machine")
     slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}
     casters = slots[GPU]["there"] if casting is None else len(casting)
     estimate = None
@@ -246,7 +233,7 @@ def forecast(
     return {
         "can_run": not mistakes.lines,
         "reasons": mistakes.lines,
-        "notes": notes + advice(built),
+        "notes": notes,
         "objects": len(job.scene.all_names),
         "triangles": job.scene.triangles,
         "masked": list(job.scene.masked),
@@ -262,7 +249,6 @@ def forecast(
         "slots": slots,
         "memory": {"needed": needed, "there": memory or None},
         "disk": disk,
-        "sources": dict(built.found.sources),
     }
 
 

@@ -2,17 +2,13 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
-from dataclasses import dataclass, replace
-from functools import partial
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import click
-from distributed import Client
 
 from ..base.declared import declared
 from ..base.errors import LidarpoolError
@@ -35,9 +31,7 @@ from ..report.report import summary
 from ..run.conductor import Conductor
 from ..run.jobs import OneJob
 from ..run.options import RunOptions
-from ..run.progress import Show
 from ..run.result import CampaignRun, RunResult
-from ..run.screen import Screen
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, build
@@ -48,42 +42,8 @@ from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .logs import set_logs
-from .terminal import shown_progress, shown_status, tell
-
-
-@dataclass(frozen=True)
-class Terminal(Screen):
-    """Tells the user of a command."""
-
-    quiet: bool = False
-    verbose: bool = False
-    as_json: bool = False
-
-    def tell(self, words: str) -> None:
-        """Print a note."""
-        if not self.quiet:
-            tell(f"note: {words}")
-
-    def status(self, words: str) -> AbstractContextManager[None]:
-        """Show what is going on while the body runs."""
-        return shown_status(words, self.quiet)
-
-    def progress(self) -> AbstractContextManager[Show]:
-        """Show bars or lines while the body runs."""
-        return shown_progress(self.quiet)
-
-    @contextmanager
-    def starting(
-        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
-    ) -> Iterator[Client]:
-        """Show a status until the cluster has started; its workers log as this process does."""
-        with ExitStack() as stack:
-            with self.status(words):
-                client = stack.enter_context(cluster)
-            if own:  # its workers share the terminal
-                set_logs(self.verbose)
-                client.register_worker_callbacks(partial(set_logs, self.verbose))
-            yield client
+from .options import show
+from .terminal import Terminal
 
 
 def options_of(pool: PoolSection, backend: str | None = None, **given: Any) -> RunOptions:
@@ -103,7 +63,7 @@ def run_scenario(
     options = options_of(scenario.pool, **given)
     if options.own:  # before reading the scene, which may take long
         check_backend_here(options.backend)
-    with shown_status("reading the scene", terminal.quiet, logged=False):
+    with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = job_of(built)
     _run_survey(built, job, options, terminal, only)
@@ -125,10 +85,8 @@ def _run_survey(
     output = SurveyOutput(options.out, job, built.scenario, only == "cloud", judge)
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
-        if terminal.as_json:
-            click.echo(json.dumps(summary(options.out, report), indent=1, allow_nan=False))
-        else:
-            _tell_result(options.out, result, job, report)
+        lines = _of_result(options.out, result, job, report)
+        show(summary(options.out, report), lines, terminal.as_json)
         if options.live and options.stay:
             with local_result(options.out, [CLOUD]) as folder:
                 page.stay(folder / CLOUD)
@@ -196,13 +154,16 @@ def no_hits(job: Job) -> str:
     return f"no ray hit anything: check poses, ranges and units; {where}; {seen}"
 
 
-def _tell_result(out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]) -> None:
+def _of_result(
+    out: Path | Storage, result: RunResult, job: Job, report: dict[str, Any]
+) -> Iterator[str]:
+    """Say in lines of text what a survey has given."""
     for note in report["notes"]:
-        click.echo(f"note: {note}")
+        yield f"note: {note}"
     if not result.hits:
-        click.echo(f"note: {no_hits(job)}")
+        yield f"note: {no_hits(job)}"
     on = report["hits_on_surfaces"]
-    click.echo(
+    yield (
         f"{counted(job.survey.scan_count, 'scan')}, {counted(result.rays, 'ray')}, "
         f"{counted(on, 'hit')} on {counted(len(job.scene.all_names), 'object')}"
         f"{f' and {result.hits - on:,} on none' if result.hits > on else ''}, "
@@ -216,21 +177,18 @@ def _tell_result(out: Path | Storage, result: RunResult, job: Job, report: dict[
         possible = "no path is possible, the obstacles leave no way"
         if math.isfinite(plan.shortest_possible):
             possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
-        click.echo(f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)")
-    click.echo(f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}")
+        yield f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
+    yield f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}"
 
 
 def _tell_campaign(out: Path | Storage, run: CampaignRun, *, as_json: bool) -> None:
-    if as_json:
-        names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
-        told = {"folder": str(out), "jobs": run.done, "failed": [row.name for row in run.failed]}
-        told |= {name: getattr(run, name) for name in names}
-        click.echo(json.dumps(told, indent=1, allow_nan=False))
-        return
-    for note in run.notes:
-        click.echo(f"note: {note}")
-    click.echo(
+    names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
+    told = {"folder": str(out), "jobs": run.done, "failed": [row.name for row in run.failed]}
+    told |= {name: getattr(run, name) for name in names}
+    lines = [
+        *(f"note: {note}" for note in run.notes),
         f"{counted(run.done, 'job')}, {counted(run.rays, 'ray')}, "
-        f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)"
-    )
-    click.echo(f"data set in {click.format_filename(str(out))}: see README.md there")
+        f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
+        f"data set in {click.format_filename(str(out))}: see README.md there",
+    ]
+    show(told, lines, as_json)

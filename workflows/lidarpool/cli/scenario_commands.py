@@ -184,7 +184,10 @@ def check(
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
-            found, lines = look_at(scenario, number, no_plan, backend, out, client, file, as_json)
+            found, lines = look_at(
+                scenario, number, client, no_plan=no_plan, quiet=as_json,
+                backend=backend, out=out, cluster=file,
+            )  # fmt: skip
     except LidarpoolError as error:
         if as_json:
             options.show({"can_run": False, "reasons": [str(error)], "notes": []}, (), True)

@@ -168,7 +168,7 @@ def stations(
     from ..scenario.build import build
     from ..scenario.scenario import Scenario
     from ..sensor.models import full_name, load_sensor
-    from .terminal import shown_status
+    from .terminal import Terminal
 
     folder = Path(f"{scene.stem}-stations") if out is None else out
     there = [folder / name for name in (SCENARIO_FILE, PICTURE_FILE) if (folder / name).exists()]
@@ -176,15 +176,15 @@ def stations(
         raise LidarpoolError(f"{there[0]} exists: give another folder, --out, or --overwrite.")
     model = full_name(model)
     sensor = load_sensor(model)
-    read = Scenario.load(scene)
-    with shown_status("reading the scene", as_json, logged=False):
+    read, terminal = Scenario.load(scene), Terminal(quiet=as_json)
+    with terminal.status("reading the scene", logged=False):
         built = build(read, plans=False)
-    with shown_status("looking from all places", as_json, logged=False):
+    with terminal.status("looking from all places", logged=False):
         plan = plan_stations(
             built.scene, sensor, count=count, coverage=coverage,
             height_m=height, spacing_m=spacing, slant_deg=slant,
         )  # fmt: skip
-    with shown_status("drawing the picture", as_json, logged=False):
+    with terminal.status("drawing the picture", logged=False):
         page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / SCENARIO_FILE

@@ -1,64 +1,84 @@
-"""Progress of a run at the terminal."""
+"""What a command tells at the terminal while it works."""
 
 from __future__ import annotations
 
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any, TextIO, cast
+from contextlib import AbstractContextManager, ExitStack, contextmanager
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
 
+from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.bars import Pace, bars, standing_still
-from ..run.progress import STAGES, Progress, Show
+from ..run.progress import STAGES, Pace, Progress, Show, bars, standing_still
+from ..run.screen import Screen
+from .logs import set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
 # of hours does not fill a log.
 PLAIN_EVERY_S = (2.0, 60.0)
 
 
-@contextmanager
-def shown_progress(quiet: bool = False) -> Iterator[Show]:
-    """Show progress on stderr while the body runs; yields the function that shows it.
+@dataclass(frozen=True)
+class Terminal(Screen):
+    """Tells the user of a command, on stderr."""
 
-    On a terminal, bars by stage with rates and time left; elsewhere occasional lines for survey
-    and planning.
-    """
-    if quiet or sys.stderr is None:
-        yield lambda progress: None
-    elif (console := _terminal()) is not None:
-        with bars(console) as show:
-            yield show
-    else:
-        yield PlainLines(Unheard(sys.stderr))
+    quiet: bool = False
+    verbose: bool = False
+    as_json: bool = False
 
+    @property
+    def _stream(self) -> Any:
+        """Stream for what is told; None to tell nothing."""
+        return None if self.quiet or sys.stderr is None else Unheard(sys.stderr)
 
-@contextmanager
-def shown_status(text: str, quiet: bool = False, logged: bool = True) -> Iterator[None]:
-    """Show a status on stderr while the body runs; in a log, too, if it is `logged`."""
-    if quiet or sys.stderr is None:
-        yield
-    elif (console := _terminal()) is not None:
-        with console.status(text):
+    @property
+    def _console(self) -> Console | None:
+        """Console of a terminal that can move its cursor; None without one."""
+        console = Console(file=self._stream) if self._stream else None
+        return console if console and console.is_terminal and not console.is_dumb_terminal else None
+
+    def tell(self, words: str) -> None:
+        """Print a note."""
+        if self._stream:
+            self._stream.write(f"note: {words}\n")
+
+    @contextmanager
+    def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
+        """Show what is going on while the body runs; in a log, too, if it is `logged`."""
+        if (console := self._console) is not None:
+            with console.status(words):
+                yield
+        else:
+            if logged and self._stream:
+                _tell(self._stream, words)
             yield
-    else:
-        if logged:
-            _tell(Unheard(sys.stderr), text)
-        yield
 
+    @contextmanager
+    def progress(self) -> Iterator[Show]:
+        """Show bars by stage with rates and time left; elsewhere than on a terminal, some lines."""
+        if (console := self._console) is not None:
+            with bars(console) as show:
+                yield show
+        else:
+            yield PlainLines(self._stream) if self._stream else lambda progress: None
 
-def tell(words: str) -> None:
-    """Print a line on stderr; ignore a closed stream."""
-    if sys.stderr is not None:
-        Unheard(sys.stderr).write(f"{words}\n")
-
-
-def _terminal() -> Console | None:
-    """Console of a terminal that can move its cursor; None without one."""
-    console = Console(file=cast(TextIO, Unheard(sys.stderr)))
-    return console if console.is_terminal and not console.is_dumb_terminal else None
+    @contextmanager
+    def starting(
+        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
+    ) -> Iterator[Client]:
+        """Show a status until the cluster has started; its workers log as this process does."""
+        with ExitStack() as stack:
+            with self.status(words):
+                client = stack.enter_context(cluster)
+            if own:  # its workers share the terminal
+                set_logs(self.verbose)
+                client.register_worker_callbacks(partial(set_logs, self.verbose))
+            yield client
 
 
 def _tell(stream: Any, line: str) -> None:

@@ -9,10 +9,11 @@ from dataclasses import dataclass, replace
 from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
+from ..base.declared import told
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, flush
 from ..base.validation import checked_fields
@@ -21,18 +22,25 @@ from ..columns.parts import StoredCloud
 from .folder import staging
 from .pieces import RangeWriter, Workers
 from .sweeps import Sweeps
-from .table import FORMATS, LAYOUTS, FormatRow
+from .table import EXPORTS, FORMATS, LAYOUTS, FormatRow
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
+_FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
 
 
 @dataclass(frozen=True)
 @checked_fields
 class Format:
-    """A format that a cloud is exported to; the layout is that of points in mcap and rosbag2."""
+    """A format that a cloud is exported to; in YAML also just its name."""
 
-    format: Literal[tuple(FORMATS)]  # type: ignore[valid-type]
-    layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
+    format: Annotated[
+        Literal[tuple(FORMATS)],  # type: ignore[valid-type]
+        told(_FILES),
+    ]
+    layout: Annotated[
+        Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
+        told("layout of points in mcap and rosbag2"),
+    ] = "velodyne"
 
     @classmethod
     def of(cls, entry: str | Mapping[str, str]) -> Format:

@@ -28,10 +28,9 @@ from ..export.jobs import JobRow, Value
 from ..pipeline import Frame, Receipt
 from ..report.campaign_figures import Figures
 from ..report.campaign_pictures import draw_results, draw_varied
-from ..run.bars import Pace, standing_still
 from ..run.job_points import JobPoints
 from ..run.page import JobNow, Page
-from ..run.progress import STAGES, Progress, in_words, time_in_words
+from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
 from ..run.result import RunResult
 from .live_job import LiveJob
 from .result_page import wait_for_interrupt

@@ -52,7 +52,7 @@ class RunDriver:
     def __init__(
         self, workers: CastingWorkers, stages: LongStages, db: RunDatabase, storage: Storage
     ) -> None:
-        self._workers, self._stages, self._db, self._storage = workers, stages, db, storage
+        self._workers, self._stages, self._db = workers, stages, db
         self._casting = Casting(workers, stages.collector_count)
         self._collecting = Collecting(stages, storage, db.meta["mark"], self._casting)
         self.batches = self._casting.batches
@@ -112,6 +112,8 @@ class RunDriver:
     @property
     def has_room(self) -> bool:
         """Whether another job should begin, so that stage 1 always has scans to describe."""
+        if len(self.jobs) >= self._casting.most:
+            return False
         if len(self._announced) < ANNOUNCED:
             return True
         jobs = [self.jobs[number] for number in self._announced if number in self.jobs]

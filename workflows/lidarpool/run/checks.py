@@ -122,6 +122,16 @@ def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker
         )
 
 
+def check_workers(
+    job: Job, tasks: TaskOptions, backend: str, casting: Iterable[WorkerInfo]
+) -> None:
+    """Check that casting workers have memory for a job; JobError if not."""
+    for worker in casting:
+        if worker.memory:
+            each = worker.memory / max(1, worker.resources[GPU])
+            check_memory(job, tasks, backend, each, f"the GPU worker at {worker.address}")
+
+
 def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Pool:
     """All workers of the cluster, after checking that they suffice."""
     workers = worker_identities(client)

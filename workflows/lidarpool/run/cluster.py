@@ -16,7 +16,7 @@ from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from ..base.errors import LidarpoolError
 from ..pipeline import GPU, LIDAR, OTHER
 from ..scenario.job import Job
-from .checks import check_memory, find_workers, gpu_note, want_nothing
+from .checks import check_workers, find_workers, gpu_note, want_nothing
 from .connection import connected, local_client, started_client
 from .options import RunOptions
 from .screen import Screen
@@ -42,10 +42,8 @@ def client_of(
     if options.cluster is not None:
         started = started_client(options.cluster, screen.tell)
         return screen.starting(started, f"starting {options.cluster}")
-    local = local_client(
-        gpu_workers=options.gpu_workers, lidar_slots=needed[LIDAR],
-        other_workers=options.other_workers, planning=OTHER in needed, tls=options.tls,
-    )  # fmt: skip
+    workers = options.gpu_workers, options.other_workers
+    local = local_client(needed, *workers, tls=options.tls)
     return screen.starting(local, "starting the workers", own=True)
 
 
@@ -106,11 +104,7 @@ class Cluster:
 
     def check(self, job: Job) -> None:
         """Check that the workers have memory for a job; JobError if not."""
-        for worker in self._casting:
-            if worker.memory:
-                each = worker.memory / max(1, worker.resources[GPU])
-                name = f"the GPU worker at {worker.address}"
-                check_memory(job, self.options, self.backend, each, name)
+        check_workers(job, self.options, self.backend, self._casting)
 
     def call(self, callback: Callable[[T], None], argument: T) -> None:
         """Call a callback of the caller; its OSError must not look like the cluster's."""

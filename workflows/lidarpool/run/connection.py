@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import errno
 import socket
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
 from pathlib import Path
 from typing import NamedTuple
@@ -20,6 +20,7 @@ from poolpart.internals import forked_workers
 from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
 from ..base.interrupts import children_spared, deferred_interrupts
+from ..pipeline import LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile
 from .local import local_cluster
@@ -48,18 +49,17 @@ class TlsFiles(NamedTuple):
 
 
 def local_client(
+    needed: Mapping[str, int],
+    gpu_workers: int | None = None,
+    other_workers: int | None = None,
     *,
-    gpu_workers: int | None,
-    lidar_slots: int,
-    other_workers: int | None,
-    planning: bool = True,
     tls: bool = False,
 ) -> AbstractContextManager[Client]:
     """Client of a cluster on this machine that lasts as long as the body.
 
-    Workers as of `local_cluster`, but by default none of OTHER without `planning`. `tls` encrypts
-    the traffic, with a certificate of its own; PoolError if none can be made, or the workers do not
-    start.
+    Workers as of `local_cluster`, with the slots of LIDAR that are `needed`, and by default none of
+    OTHER if none are. `tls` encrypts the traffic, with a certificate of its own; PoolError if none
+    can be made, or the workers do not start.
     """
 
     @contextmanager
@@ -70,8 +70,8 @@ def local_client(
             closing(
                 local_cluster(
                     gpu_workers=gpu_workers,
-                    lidar_slots=lidar_slots,
-                    other_workers=other_workers if planning or other_workers else 0,
+                    lidar_slots=needed[LIDAR],
+                    other_workers=other_workers if OTHER in needed or other_workers else 0,
                     security=tls,
                     dashboard_port=None,  # is never printed, and Bokeh takes half a second
                 )

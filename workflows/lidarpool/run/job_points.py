@@ -19,6 +19,7 @@ from ..export.sweeps import Sweeps
 from ..pipeline.database import JobParts
 from ..pipeline.messages import Receipt, samples_of_scan, summary_type
 from ..scenario.job import Job
+from .jobs import OneJob
 from .progress import Progress
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ class JobPoints:
     def __init__(self, store: RunStore, job: Job) -> None:
         self.job, self._store = job, store
         self.parts: JobParts = store.db.job(job.number, job.survey.scan_count)
+        self.parts.has_frames = isinstance(store.jobs, OneJob)  # whose frames are handed out
         self.identified = False
         self.resumed = self.parts.scans_done  # scans whose points are of an earlier run
 

@@ -1,9 +1,16 @@
-"""Progress of a run, and its texts."""
+"""Progress of a run, its texts, and its bars at a terminal or in a notebook."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
+from rich.progress import Progress as Bars
+
+from ..base.notebook import cell_display
 
 # Lines of progress: label, name of the count, and of the total, which is the unit.
 STAGES: tuple[tuple[str, str, str], ...] = (
@@ -42,11 +49,6 @@ class Progress:
 Show = Callable[[Progress], None]
 
 
-def is_sure(count: float, whole: float, seconds: float) -> bool:
-    """Whether enough is done, after so many seconds, to estimate the time left."""
-    return count >= SURE_SHARE * whole or seconds >= SURE_S
-
-
 def in_words(rate: float) -> str:
     """Rate with two significant digits at least: 0.25, 3.1, 52, 1,234."""
     return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
@@ -58,3 +60,72 @@ def time_in_words(seconds: float) -> str:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)
     return f"{minutes} min" if minutes < 100 else f"{minutes // 60:,} h {minutes % 60:02} min"
+
+
+class Pace:
+    """Rate of a count since it was first seen, and the time left."""
+
+    def __init__(self) -> None:
+        self._first: tuple[float, int] | None = None
+
+    def rate(self, seconds: float, count: int) -> float:
+        """Rate, 1/s; 0 until something has been counted."""
+        begin, before = self._first = self._first or (seconds, count)
+        return (count - before) / (seconds - begin) if seconds > begin else 0.0
+
+    def left(self, seconds: float, count: int, whole: int) -> str:
+        """Time that is left; empty until enough has been counted, and at the end."""
+        rate = self.rate(seconds, count)
+        sure = rate and (count >= SURE_SHARE * whole or seconds >= SURE_S) and count < whole
+        return time_in_words((whole - count) / rate) if sure else ""
+
+    def told(self, seconds: float, count: int, whole: int) -> str:
+        """Rate and time left; empty until something has been counted."""
+        rate, left = self.rate(seconds, count), self.left(seconds, count, whole)
+        return f"{in_words(rate)}/s{f'  {left} left' if left else ''}" if rate else ""
+
+
+def standing_still(progress: Progress) -> str:
+    """Why the run waits; empty if it does not."""
+    slots = progress.waits_for
+    return f"waits for slots of {slots}, which other runs hold" if slots else ""
+
+
+@contextmanager
+def bars(console: Console) -> Iterator[Show]:
+    """Bars by stage with rates and time left; yields the function that moves them."""
+    columns = (
+        TextColumn("{task.description:<11}"),
+        BarColumn(bar_width=None),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[unit]:<6}"),
+        TextColumn("{task.fields[pace]}", style="progress.remaining"),
+    )
+    with Bars(*columns, console=console) as shown:
+        lines: dict[str, TaskID] = {}
+        paces = {label: Pace() for label, _, _ in STAGES}
+
+        def show(progress: Progress) -> None:
+            """Move the bars; one appears when its total is known."""
+            for label, count, unit in STAGES:
+                done, total = getattr(progress, count), getattr(progress, unit)
+                if total and label not in lines:
+                    lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
+                if label in lines:
+                    pace = paces[label].told(progress.seconds, done, total)
+                    if unit == "scans" and done < total:
+                        pace = standing_still(progress) or pace
+                    shown.update(lines[label], completed=done, pace=pace)
+
+        yield show
+
+
+@contextmanager
+def bars_here() -> Iterator[Show]:
+    """Bars in the cell of a notebook or at the terminal of a script; elsewhere nothing is shown."""
+    console = Console(stderr=cell_display() is None)
+    if console.is_jupyter or (console.is_terminal and not console.is_dumb_terminal):
+        with bars(console) as show:
+            yield show
+    else:
+        yield lambda progress: None

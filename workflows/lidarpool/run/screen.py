@@ -8,8 +8,7 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from distributed import Client
 
-from .bars import bars_here
-from .progress import Progress, Show
+from .progress import Progress, Show, bars_here
 
 logger = logging.getLogger(__name__)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from functools import partial
@@ -29,11 +29,12 @@ from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import CloudOptions
+from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
 from .moving import ActorSection, MountSection
 from .placing import Placing, place
 from .scenario import Scenario
-from .sections import CopiesSection, MeshFile
+from .sections import CopiesSection, MeshFile, SensorSection
 from .standing import Standing
 from .static_scene import Findings, SceneCache, mesh_of, read_static_scene
 from .traffic import VehicleSection, actors_of, read_fcd
@@ -168,22 +169,19 @@ def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
 
 def _sensors(scenario: Scenario, robots: Robots) -> list[Mounted]:
     """Return the sensors on their carrier."""
+    sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
+    mounts = {name: getattr(one, "mount", scenario.mount) for name, one in sections.items()}
     common = scenario.noise, scenario.returns
-    if not scenario.sensors:
-        mount = _mount(scenario, scenario.mount or MountSection(), robots)
-        return [scenario.sensor.mounted(scenario.path, mount, *common)]
-    out = []
-    for name, section in scenario.sensors.items():
-        mount = _mount(scenario, section.mount, robots)
-        carried = section.mounted(scenario.path, mount, *common, name)
-        out.append(replace(carried, steps=section.steps))
-    return out
+    return [
+        section.mounted(scenario.path, _mount(scenario, mounts[name], robots), *common, name)
+        for name, section in sections.items()
+    ]
 
 
-def _mount(scenario: Scenario, mount: MountSection, robots: Robots) -> Pose:
+def _mount(scenario: Scenario, mount: MountSection | None, robots: Robots) -> Pose:
     """Pose of a sensor in the carrier's axes."""
-    if mount.link is None:
-        return mount.pose()
+    if mount is None or mount.link is None:
+        return CENTRE if mount is None else mount.pose()
     carriers = [one for one in scenario.actors if one.trajectory is None and one.is_robot]
     on = [entry for entry in carriers if mount.link in robots[entry.file].links]
     if len(on) != 1:

@@ -198,19 +198,10 @@ class Campaign:
     def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
         """Make a job; the same number gives the same job. Jobs plan no paths.
 
-        Parameters
-        ----------
-        number
-            From 0.
-        cache
-            Static scenes of other jobs, which this one may share.
-        columns
-            Names of columns that the data set needs.
+        `cache` has static scenes of other jobs, which this one may share; `columns` are names of
+        columns that the data set needs.
 
-        Raises
-        ------
-        LidarpoolError
-            If there is no such job, or it cannot be made; the message says why.
+        LidarpoolError if there is no such job, or it cannot be made; the message says why.
         """
         number = self._known(number)
         own = {"number": number, "name": self.name(number), "split": self.split(number)}

@@ -12,9 +12,21 @@ from math import inf, isclose, isfinite, lcm
 from statistics import NormalDist
 from typing import Annotated, Any, Literal
 
-from pydantic import BeforeValidator, Field, Strict, model_validator
+from pydantic import BeforeValidator, Field, model_validator
 
-from ..base.declared import Seed, Share, Text, TextOrTexts, allowed, is_text, must_be, short, told
+from ..base.declared import (
+    Seed,
+    Several,
+    Share,
+    Text,
+    TextOrTexts,
+    Two,
+    allowed,
+    is_text,
+    must_be,
+    short,
+    told,
+)
 from ..base.validation import checked_fields
 from ..export.jobs import Value
 from ..export.table import FORMATS, LAYOUTS
@@ -26,12 +38,12 @@ KEPT = ("kitti", "nuscenes", "mcap", "parquet", "images", "folder")
 
 _SHOWN = 60  # letters of a list or mapping in the table of jobs; longer ones by their position
 
-Interval = Annotated[tuple[float, float], Strict(False)]
-Wholes = Annotated[tuple[int, int], Strict(False)]
+Interval = Two[float]
+Wholes = Two[int]
 
 
 Options = Annotated[
-    Annotated[tuple[Any, ...], Strict(False), Field(min_length=1)]
+    Annotated[Several[Any], Field(min_length=1)]
     | Annotated[dict[Text, Any], Field(min_length=1)]
     | None,
     allowed("a list of values, or a mapping of names to values"),
@@ -81,12 +93,8 @@ class Sample(Section):
         ),
     ]
     count: Annotated[
-        Annotated[
-            Annotated[
-                tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]], Strict(False)
-            ],
-            short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
-        ],
+        Two[Annotated[int, Field(ge=0)]],
+        short(lambda v: type(v) is int, lambda v: [v, v], int | list[int]),
         told("how many rows a job has: a number, or [least, most]"),
     ]
 
@@ -116,9 +124,7 @@ class Choice(Section):
         Options,
         told("one of a list, or of a mapping of names to values", ["velodyne/vlp16", "my.yaml"]),
     ] = None
-    weights: Annotated[
-        tuple[Weight, ...] | None, Strict(False), told("of choice: how likely each is", [3, 1])
-    ] = None
+    weights: Annotated[Several[Weight] | None, told("of choice: how likely each is", [3, 1])] = None
     each: Annotated[
         Options,
         told("all of a list in turn; several of these make a grid, the first changes fastest"),
@@ -208,7 +214,7 @@ _KINDS = tuple(name for name in Choice.model_fields if name != "weights")
 
 def _choice(value: Any) -> Any:
     if not isinstance(value, (dict, Choice)):
-        raise must_be("how it is chosen, {uniform: [0, 1]} or {choice: [1, 4]}")
+        raise must_be("a way of choosing, {uniform: [0, 1]} or {choice: [1, 4]}")
     return value
 
 

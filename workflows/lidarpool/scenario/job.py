@@ -77,8 +77,7 @@ class Job:
 
 def job_of(built: Built, **own: Any) -> Job:
     """Return the job of a built scenario; `own` are further fields, such as `name`."""
-    write = built.scenario.output.write
-    outputs = tuple(Format(one.format, one.layout) for one in write if one.format != "ply")
+    outputs = tuple(one for one in built.scenario.output.write if one.format != "ply")
     return Job(built.scene, built.survey, built.planning, outputs=outputs, **own)
 
 

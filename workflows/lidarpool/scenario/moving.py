@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import Strict, model_validator
+from pydantic import model_validator
 
 from ..base.arrays import Floats
-from ..base.declared import Text, TextOrTexts, declared, is_text, short, told
+from ..base.declared import Several, Text, TextOrTexts, declared, is_text, short, told
 from ..base.errors import LidarpoolError, prefixed
 from ..scene.urdf import SUFFIXES as ROBOTS
-from ..sensor import Pose, Sensor, Track, load_trajectory
+from ..sensor import Mounted, Pose, Sensor, Track, load_trajectory
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose
 from ..sensor.trajectory_files import Duration, Seconds, TrajectoryFormat, quaternions_from_degrees
@@ -56,6 +56,10 @@ class CarriedSection(SensorSection):
         made = super().sensor(path)
         return replace(made, start_ns=self.start_s * 1e9) if self.start_s else made
 
+    def mounted(self, *given: Any) -> Mounted:
+        """Return it on its carrier, as `SensorSection` does, with its time steps."""
+        return replace(super().mounted(*given), steps=self.steps)
+
 
 class TimedPose(Section, Pose):
     """A pose at a time; if no pose has an angle, the carrier faces its direction of travel."""
@@ -85,8 +89,7 @@ class TrajectorySection(Section):
         told("whether poses have camera axes (z ahead); by default those of KITTI have"),
     ] = None
     points: Annotated[
-        tuple[TimedPose, ...],
-        Strict(False),
+        Several[TimedPose],
         told("instead of a file: time_s, position and angles, world metres"),
     ] = ()
     interpolation: Annotated[

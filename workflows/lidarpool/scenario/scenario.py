@@ -9,9 +9,9 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import PrivateAttr, Strict, ValidationError
+from pydantic import PrivateAttr, ValidationError
 
-from ..base.declared import Text, told
+from ..base.declared import Several, Text, told
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import validation_errors
 from ..base.yamlfile import read_yaml
@@ -67,8 +67,7 @@ class Scenario(Section):
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
     sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
     poses: Annotated[
-        tuple[PoseEntry, ...] | None,
-        Strict(False),
+        Several[PoseEntry] | None,
         told(
             "poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
@@ -95,8 +94,7 @@ class Scenario(Section):
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
-        tuple[ActorSection, ...],
-        Strict(False),
+        Several[ActorSection],
         told(
             "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
@@ -125,8 +123,7 @@ class Scenario(Section):
         ),
     ] = None
     materials: Annotated[
-        tuple[Material, ...],
-        Strict(False),
+        Several[Material],
         told(
             "materials of objects, by name; the last entry for an object counts",
             [{"objects": "*", "reflectance": 0.3}, {"objects": "Window*", "transparent": "pass"}],

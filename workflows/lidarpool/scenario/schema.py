@@ -10,6 +10,7 @@ from pydantic.json_schema import GenerateJsonSchema
 
 from .choices import CampaignSection
 from .scenario import Scenario
+from .sections import Section
 
 SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
 
@@ -41,12 +42,8 @@ def scenario_schema() -> dict[str, Any]:
     It does not check combinations of fields (a range that ends before it begins):
     `Scenario.load` does.
     """
-    return {
-        "$schema": GenerateJsonSchema.schema_dialect,
-        **Scenario.model_json_schema(schema_generator=_Plain),
-        "title": "lidarpool scenario",
-        "description": "A lidar survey of a scene, and path planning.",
-    }
+    made = _schema_of(Scenario, "lidarpool scenario")
+    return made | {"description": "A lidar survey of a scene, and path planning."}
 
 
 def campaign_schema() -> dict[str, Any]:
@@ -54,11 +51,12 @@ def campaign_schema() -> dict[str, Any]:
 
     `Campaign.load` also checks that paths lead to fields, and that these take the values.
     """
-    return {
-        "$schema": GenerateJsonSchema.schema_dialect,
-        **CampaignSection.model_json_schema(schema_generator=_Plain),
-        "title": "lidarpool campaign",
-    }
+    return _schema_of(CampaignSection, "lidarpool campaign")
+
+
+def _schema_of(section: type[Section], title: str) -> dict[str, Any]:
+    made = section.model_json_schema(schema_generator=_Plain)
+    return {"$schema": GenerateJsonSchema.schema_dialect, **made, "title": title}
 
 
 def schema_text(schema: dict[str, Any]) -> str:

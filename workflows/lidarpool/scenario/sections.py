@@ -6,26 +6,37 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, Strict, model_validator
+from pydantic import (
+    AfterValidator,
+    BaseModel,
+    BeforeValidator,
+    ConfigDict,
+    Field,
+    model_validator,
+)
 
 from ..base.declared import (
     Angle,
     Coordinate,
+    Four,
     Seed,
+    Several,
     Text,
     TextOrTexts,
+    Three,
     Triple,
+    Two,
     is_text,
     must_be,
     short,
     told,
 )
+from ..base.validation import STRICT
 from ..base.vocabulary import BACKENDS, UNITS_M
-from ..export.table import EXPORTS, FORMATS, LAYOUTS
+from ..export.formats import Format
 from ..plan.planning import Search
 from ..scene.meshfile import Opacity
 from ..scene.transform import Transform
@@ -39,28 +50,27 @@ COPIES_MOST = 1_000_000  # of one entry
 PathOf = Callable[[str], Path]  # of a file that a scenario names
 
 Factor = Annotated[float, Field(ge=-1e9, le=1e9)]
-Pair = Annotated[tuple[Coordinate, Coordinate], Strict(False)]
-Rectangle = Annotated[tuple[Coordinate, Coordinate, Coordinate, Coordinate], Strict(False)]
-Angles = Annotated[tuple[Angle, Angle, Angle], Strict(False)]
-Factors = Annotated[tuple[Factor, Factor, Factor], Strict(False)]
-Row = Annotated[tuple[Factor, Factor, Factor, Factor], Strict(False)]
-Matrix = Annotated[tuple[Row, Row, Row, Row], Strict(False)]
+Pair = Two[Coordinate]
+
+
+def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, float, float]:
+    if sides[0] >= sides[2] or sides[1] >= sides[3]:
+        raise must_be("[x0, y0, x1, y1], the lowest x and y first")
+    return sides
+
+
+Rectangle = Annotated[Four[Coordinate], AfterValidator(_upright)]
+Factors = Three[Factor]
 Scale = Annotated[
     Factors, short(lambda v: type(v) in (int, float), lambda v: [v] * 3, Factor | Factors)
 ]
 Length = Annotated[float, Field(gt=0, le=1e4)]
-Lengths = Annotated[tuple[Length, Length, Length], Strict(False)]
-
-
-def _check_rectangle(name: str, sides: tuple[float, float, float, float] | None) -> None:
-    if sides is not None and (sides[0] >= sides[2] or sides[1] >= sides[3]):
-        raise ValueError(f"{name} is [x0, y0, x1, y1]: the lowest x and y come first.")
 
 
 class Section(BaseModel):
     """Fields of a scenario: no others, finite numbers, no conversion of text to numbers."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    model_config = STRICT | ConfigDict(frozen=True)
 
 
 class MeshFile(Section):
@@ -92,13 +102,17 @@ class MeshFile(Section):
         told("axis of the file that points up; by default that of its format"),
     ] = None
     translation: Annotated[Triple, told("translation in metres, applied last")] = (0, 0, 0)
-    rotation_deg: Annotated[Angles, told("rotation about the world's x, y and z axes, degrees")] = (
+    rotation_deg: Annotated[
+        Three[Angle], told("rotation about the world's x, y and z axes, degrees")
+    ] = (
         0,
         0,
         0,
     )
     scale: Annotated[Scale, told("one factor, or one for each axis; applied first")] = (1, 1, 1)
-    matrix: Annotated[Matrix | None, told("instead of the three: 4 rows of 4, metres")] = None
+    matrix: Annotated[
+        Four[Four[Factor]] | None, told("instead of the three: 4 rows of 4, metres")
+    ] = None
     step_m: Annotated[
         float | None,
         told("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
@@ -126,7 +140,6 @@ class MeshFile(Section):
             raise ValueError(f"give either matrix or {', '.join(sorted(placed))}, not both.")
         if 0 in self.scale:
             raise ValueError("scale must not be 0: it would flatten the mesh.")
-        _check_rectangle("window", self.window)
         return self
 
     def transform(self) -> Transform:
@@ -137,7 +150,7 @@ class MeshFile(Section):
 
 
 MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | MeshFile)]
-MeshEntries = Annotated[tuple[MeshEntry, ...], Strict(False)]
+MeshEntries = Several[MeshEntry]
 
 
 def _pose(value: Any) -> Any:
@@ -152,9 +165,7 @@ def _pose(value: Any) -> Any:
 
 
 PoseEntry = Annotated[Pose, BeforeValidator(_pose, json_schema_input_type=Triple | Pose)]
-Place = Annotated[
-    tuple[Coordinate, ...], Strict(False), Field(min_length=2, max_length=3)
-]  # x and y, perhaps z
+Place = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # x, y, perhaps z
 
 
 class CopySection(Section, Pose):
@@ -191,9 +202,7 @@ class Scatter(Section):
     spacing_m: Annotated[
         float, told("least distance between two, seen from above, metres", ge=0, le=1e6)
     ] = 0.0
-    scale: Annotated[
-        Annotated[tuple[Factor, Factor], Strict(False)], told("least and largest factor")
-    ] = (1, 1)
+    scale: Annotated[Two[Factor], told("least and largest factor")] = (1, 1)
     yaw_deg: Annotated[Angle | None, told("of all of them; by default each has its own")] = None
     seed: Annotated[Seed, told("another seed gives other places")] = 0
 
@@ -201,7 +210,6 @@ class Scatter(Section):
     def _ordered(self) -> Scatter:
         if not 0 < self.scale[0] <= self.scale[1]:
             raise ValueError("scale is the least and the largest factor, both above 0.")
-        _check_rectangle("within", self.within)
         return self
 
 
@@ -213,7 +221,7 @@ class ShapeSection(Section):
         MeshEntry | None, told("its mesh in its own axes, as in scene.files", "car.glb")
     ] = None
     box: Annotated[
-        Lengths | None, told("instead of a file: length, width and height of a box, metres")
+        Three[Length] | None, told("instead of a file: length, width and height of a box, metres")
     ] = None
     semantic_class: Annotated[
         SemanticClass | None,
@@ -232,13 +240,11 @@ class CopiesSection(ShapeSection):
 
     name: Annotated[Text, told("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
-        tuple[
+        Several[
             Annotated[
                 CopySection, BeforeValidator(_pose, json_schema_input_type=Place | CopySection)
-            ],
-            ...,
+            ]
         ],
-        Strict(False),
         told("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
     ] = ()
     table: Annotated[
@@ -286,8 +292,7 @@ class SceneSection(Section):
         ),
     ] = ()
     copies: Annotated[
-        tuple[CopiesSection, ...],
-        Strict(False),
+        Several[CopiesSection],
         told(
             "objects in many places, by lists, tables, or at random",
             [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5, 0], [6, 5, 0]], "class": 4}],
@@ -449,28 +454,11 @@ _GRID = {  # {field of a grid: its default}
 }
 
 
-class ExportSection(Section):
-    """A format to export the cloud to; in YAML also just its name."""
-
-    format: Annotated[
-        Literal[tuple(FORMATS)],  # type: ignore[valid-type]
-        told("; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)),
-    ]
-    layout: Annotated[
-        Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        told("layout of points in mcap and rosbag2"),
-    ] = "velodyne"
-
-
 class OutputSection(Section):
     """Further files of the result; the columns that they need are kept."""
 
     write: Annotated[
-        tuple[
-            Annotated[ExportSection, short(is_text, lambda v: {"format": v}, Text | ExportSection)],
-            ...,
-        ],
-        Strict(False),
+        Several[Annotated[Format, short(is_text, lambda v: {"format": v}, Text | Format)]],
         told("further formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 
@@ -487,8 +475,7 @@ class OutputSection(Section):
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that the formats need."""
-        needed = (FORMATS[one.format].needed(one.layout) for one in self.write)
-        return tuple(dict.fromkeys(chain.from_iterable(needed)))
+        return tuple(dict.fromkeys(name for one in self.write for name in one.needs))
 
 
 class ReturnsSection(Section, Returns):
@@ -519,10 +506,7 @@ class Obstacle(Section):
         return self
 
 
-Obstacles = Annotated[
-    tuple[Annotated[Obstacle, short(is_text, lambda v: {"object": v}, Text | Obstacle)], ...],
-    Strict(False),
-]
+Obstacles = Several[Annotated[Obstacle, short(is_text, lambda v: {"object": v}, Text | Obstacle)]]
 
 
 class _Route:

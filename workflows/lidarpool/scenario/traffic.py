@@ -15,7 +15,7 @@ from xml.parsers import expat
 
 import numpy as np
 
-from ..base.declared import Text, TextOrTexts, Triple, told
+from ..base.declared import Several, Text, TextOrTexts, Triple, told
 from ..base.errors import LidarpoolError
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
@@ -50,8 +50,8 @@ class TrafficSection(Section):
 
     file: Annotated[Text, told("what sumo --fcd-output writes, .xml or .xml.gz")]
     vehicles: Annotated[
-        tuple[VehicleSection, ...],
-        told("shapes of vehicles and persons, by type", strict=False, min_length=1),
+        Several[VehicleSection],
+        told("shapes of vehicles and persons, by type", min_length=1),
     ]
     offset_s: Annotated[Seconds, told("added to all times")] = 0.0
     translation: Annotated[Triple, told("added to all positions, metres")] = (0, 0, 0)

@@ -58,7 +58,7 @@ class Optics:
     exit_diameter_m: Annotated[Diameter, told("width of the beam where it leaves the sensor")] = 0.0
 
     def __post_init__(self) -> None:
-        if isinstance(self.divergence_mrad, Sequence):
+        if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
 
@@ -123,7 +123,7 @@ class Returns:
     ] = None
 
     def __post_init__(self) -> None:
-        if isinstance(self.divergence_mrad, Sequence):
+        if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
             object.__setattr__(self, "divergence_mrad", tuple(self.divergence_mrad))
 
     def of(self, optics: Optics) -> tuple[float, float]:

@@ -66,7 +66,7 @@ class Sensor:
     max_range_m: MaxRange = float("inf")
     name: str = ""
     optics: Optics = field(default_factory=Optics)
-    start_ns: Annotated[float, Field(ge=0, lt=float("inf"))] = 0.0
+    start_ns: Annotated[float, Field(ge=0)] = 0.0
     cycle: ClassVar[str] = "turn"  # name of a cycle
 
     def __post_init__(self) -> None:

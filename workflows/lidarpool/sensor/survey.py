@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
-from ..base.declared import FILLED_IN, told, written_as
+from ..base.declared import FILLED_IN, Several, told, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields, shown
 from ..columns.table import (
@@ -142,7 +142,7 @@ class CloudOptions:
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
-        written_as(Annotated[tuple[Literal[OPTIONAL_NAMES], ...], Strict(False)]),
+        written_as(Several[Literal[OPTIONAL_NAMES]]),
         told(
             "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
