@@ -91,8 +91,7 @@ def simulate(
         A folder to keep the run in, so that nothing is lost if this process or its machine dies;
         its parent must exist. The run stays there at the end: remove it with `remove_run` once
         the result is saved. Without a folder, the points are in a temporary one as long as the
-        result is in use. It may be a URL that fsspec opens, such
-        as ``s3://bucket/run``: then the last seconds before this process died are done again.
+        result is in use. It may be a URL that fsspec opens, such as ``s3://bucket/run``.
     parts
         Place of the parts: a folder that the workers see, or a URL that fsspec opens, such as
         ``s3://bucket/survey``. It needs a `folder`, whose database lists the parts; `remove_run`

@@ -1,8 +1,8 @@
 """The database of a run that is kept in storage which is no disk, such as an object store.
 
 SQLite writes to disks only, so the database is in a temporary folder of the driver, and a copy of
-it is put into the storage every few seconds. A run resumed from a copy recasts what was committed
-after it. No database names the parts of those scans; they are removed at the end.
+it is put into the storage every few seconds. A survey resumed from a copy finds by its parts what
+was committed after it, a campaign the jobs that have ended by their manifests.
 """
 
 from __future__ import annotations
