@@ -161,11 +161,9 @@ def test_surfaces_that_are_not_there_and_colours(tmp_path):
 def table_of(tmp_path, objects, materials=()):
     write(tmp_path / "a.city.json", city(objects))
     data = {"scene": {"files": ["a.city.json"]}, "materials": list(materials)}
-    scenario = Scenario.from_data(data, folder=tmp_path)
-    built = build(scenario)
-    scene = built.scene
-    table = MaterialTable.of(built.survey.materials, scene.all_names)
-    found = zip(scene.names, table.semantic_class, table.reflectance, strict=True)
+    built = build(Scenario.from_data(data, folder=tmp_path))
+    table = MaterialTable.of(built.survey.materials, built.scene.all_names)
+    found = zip(built.scene.names, table.semantic_class, table.reflectance, strict=True)
     return {name: (number, reflectance) for name, number, reflectance in found}
 
 

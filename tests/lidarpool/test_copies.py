@@ -38,12 +38,11 @@ def folder(tmp_path):
 
 @pytest.fixture
 def made(folder):
-    """Return a function that makes the scenario and the scene of entries of `copies`."""
+    """Return a function that builds a scenario with entries of `copies`."""
 
     def make(*copies, scene=None, **others):
         data = {"scene": {"files": "land.glb", **(scene or {}), "copies": [*copies]}, **others}
-        scenario = Scenario.from_data(data, folder=folder)
-        return scenario, build(scenario).scene
+        return build(Scenario.from_data(data, folder=folder))
 
     return make
 
@@ -68,7 +67,7 @@ TREE = {"name": "Tree", "file": "tree.stl"}
 
 def test_a_list_gives_places_turns_and_factors(made):
     turned = {"position": [1, 2, 3], "yaw_deg": 30, "pitch_deg": 5, "scale": [1, 2, 0.5]}
-    _, scene = made(TREE | {"at": [[-3, 4], [5, 6, 7], turned]})
+    scene = made(TREE | {"at": [[-3, 4], [5, 6, 7], turned]}).scene
     assert scene.names == ("Hill", "Roof", "Tree", "Tree.2", "Tree.3")
     assert np.allclose(
         places(scene), [[-3, 4, height(np.array([[-3, 4]]))[0]], [5, 6, 7], [1, 2, 3]]
@@ -98,21 +97,21 @@ def test_a_list_gives_places_turns_and_factors(made):
 )
 def test_a_table_gives_what_a_list_gives(made, folder, text, more):
     (folder / "trees.csv").write_text(text)
-    _, by_table = made(TREE | {"table": {"file": "trees.csv", **more}})
+    by_table = made(TREE | {"table": {"file": "trees.csv", **more}}).scene
     big = {"position": [1, 2, 3], "yaw_deg": 90, "scale": 2}
-    _, by_list = made(TREE | {"at": [big, [4, 5, 6]]})
+    by_list = made(TREE | {"at": [big, [4, 5, 6]]}).scene
     assert fingerprint(by_table) == fingerprint(by_list)
 
 
 def test_a_table_without_z_stands_on_the_surface(made, folder):
     (folder / "trees.csv").write_text("x,y\n1,2\n15,5\n")
-    _, scene = made(TREE | {"table": "trees.csv"})
+    scene = made(TREE | {"table": "trees.csv"}).scene
     assert np.allclose(places(scene)[:, 2], [height(np.array([[1, 2]]))[0], 8])
 
 
 def test_scattered_copies_stand_on_what_is_seen_from_above(made):
     scatter = {"count": 300, "surfaces": "Hill", "spacing_m": 0.6, "scale": [0.5, 1.5]}
-    _, scene = made(TREE | {"scatter": scatter})
+    scene = made(TREE | {"scatter": scatter}).scene
     at = places(scene)
     assert len(at) == 300 and np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
     assert at[:, 0].max() < 10, "not under the roof"
@@ -127,7 +126,7 @@ def test_scattered_copies_stand_on_what_is_seen_from_above(made):
 
 
 def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangle(made):
-    _, scene = made(TREE | {"scatter": {"count": 100, "within": [5, -5, 15, 5], "yaw_deg": 0}})
+    scene = made(TREE | {"scatter": {"count": 100, "within": [5, -5, 15, 5], "yaw_deg": 0}}).scene
     at = places(scene)
     low, high = at[:, 0] < 10, at[:, 0] > 10
     assert low.sum() > 20 and np.abs(at[low, 2] - height(at[low, :2])).max() < 1e-6
@@ -138,7 +137,7 @@ def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangl
 
 def test_a_roof_over_all_of_a_surface_does_not_count(made):
     scatter = {"count": 50, "surfaces": "Hill", "within": [12, -8, 19, 8]}
-    _, scene = made(TREE | {"scatter": scatter})
+    scene = made(TREE | {"scatter": scatter}).scene
     at = places(scene)
     assert np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
 
@@ -146,7 +145,7 @@ def test_a_roof_over_all_of_a_surface_does_not_count(made):
 def test_a_ground_without_files_carries_copies_too(made):
     scatter = {"count": 20, "within": [100, 100, 120, 110]}
     scene_of = {"files": [], "ground": {"height_m": 1.5, "margin_m": 3}}
-    _, scene = made(TREE | {"scatter": scatter}, scene=scene_of)
+    scene = made(TREE | {"scatter": scatter}, scene=scene_of).scene
     assert np.allclose(places(scene)[:, 2], 1.5)
     assert scene.names[-1] == "Ground"
     low, high = scene.object_bounds[-1]
@@ -156,7 +155,7 @@ def test_a_ground_without_files_carries_copies_too(made):
 def test_the_seed_and_the_name_choose_the_places(made):
     def at(**more):
         entry = TREE | {"name": more.pop("name", "Tree"), "scatter": {"count": 40, **more}}
-        return places(made(entry)[1], entry["name"])
+        return places(made(entry).scene, entry["name"])
 
     first = at()
     assert np.array_equal(at(), first) and np.array_equal(at(count=60)[:40], first)
@@ -177,13 +176,13 @@ def test_materials_and_classes_are_those_of_the_names(made):
         {"objects": "Crate.3", "reflectance": 0.4, "class": 7},
     ]
     tree = TREE | {"at": [[9, 0]], "class": 6}
-    scenario, scene = made(crate, tree, materials=materials)
-    table = MaterialTable.of(build(scenario).survey.materials, scene.names)
-    assert scene.names[2:] == ("Crate", "Crate.2", "Crate.3", "Tree")
+    built = made(crate, tree, materials=materials)
+    table = MaterialTable.of(built.survey.materials, built.scene.names)
+    assert built.scene.names[2:] == ("Crate", "Crate.2", "Crate.3", "Tree")
     assert table.semantic_class.tolist() == [1, 1, 5, 5, 7, 6]
     assert table.reflectance.tolist() == [0.2, 0.2, 0.9, 0.9, 0.4, 0.2]
-    scenario, scene = made(crate)
-    table = MaterialTable.of(build(scenario).survey.materials, scene.names)
+    built = made(crate)
+    table = MaterialTable.of(built.survey.materials, built.scene.names)
     assert table.semantic_class.tolist() == [0, 0, 5, 5, 5]
 
 
@@ -194,14 +193,14 @@ def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
     monkeypatch.setattr(
         module, "load_objects", lambda path, **more: read.append(path.name) or plain(path, **more)
     )
-    _, scene = made(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]})
+    scene = made(TREE | {"at": [[0, 0]]}, TREE | {"name": "Bush", "at": [[5, 0]]}).scene
     assert read == ["land.glb", "tree.stl"] and len(scene.instances.parts) == 1
     assert scene.names[2:] == ("Tree", "Bush")
 
 
 def test_copies_are_scanned_where_they_stand(made):
     crate = {"name": "Crate", "box": [2, 2, 3], "at": [{"position": [5, 0, 0], "yaw_deg": 45}]}
-    _, scene = made(crate, scene={"files": []})
+    scene = made(crate, scene={"files": []}).scene
     scanner = Scanner(scene, load_sensor("velodyne/vlp16"), columns=["range"])
     cloud = scanner.sweep((0, 0, 1))
     assert len(cloud) > 100 and abs(cloud["range"].min() - (5 - 2**0.5)) < 0.01
@@ -215,8 +214,7 @@ def test_many_copies_can_be_planned_around(made):
         "scatter": {"count": 1000, "within": [-20, -10, 10, 10]},
     }
     ends = {"start": [-25, 0], "target": [25, 0], "obstacles": ["Crate*"]}
-    scenario, _ = made(crate, planning=ends)
-    planning = build(scenario).planning
+    planning = made(crate, planning=ends).planning
     assert len(planning.radii) == 1000 and np.allclose(planning.radii, 0.05 * 2**0.5)
 
 
@@ -279,7 +277,6 @@ def test_nothing_to_stand_on(made):
 
 
 def test_lists_stand_on_a_ground_that_reaches_under_them(made):
-    _, scene = made(
-        TREE | {"at": [[5, 5], [50, 5]]}, scene={"files": [], "ground": {"height_m": 1}}
-    )
+    ground = {"files": [], "ground": {"height_m": 1}}
+    scene = made(TREE | {"at": [[5, 5], [50, 5]]}, scene=ground).scene
     assert scene.bounds[0, 2] + scene.origin[2] == 1

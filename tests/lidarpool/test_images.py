@@ -274,8 +274,7 @@ def test_what_cannot_be_an_image_says_so(tmp_path):
 
 @pytest.mark.parametrize("entry", ["images", "{format: mcap, layout: images}"])
 def test_a_scenario_keeps_every_return(entry):
-    scenario = Scenario.from_data(load_yaml(f"output: {{write: [{entry}]}}"))
-    survey = build(scenario).survey
+    survey = build(Scenario.from_data(load_yaml(f"output: {{write: [{entry}]}}"))).survey
     assert survey.keep_every == 1
     assert {"ray", "range"} <= {column.name for column in survey.stored_columns}
     thinned = Scenario.from_data(

@@ -209,8 +209,7 @@ def test_a_card_seen_from_behind_is_no_body(far):
 def test_the_unit_of_a_long_object_is_asked_for(tmp_path, file, length, noted):
     capsule = creation.capsule(length * 0.8, length * 0.1)
     (tmp_path / file).write_bytes(capsule.export(file_type=file[-3:]))
-    read = Scenario.load(tmp_path / file)
-    built = build(read)
+    built = build(Scenario.load(tmp_path / file))
     notes = " ".join(advice(built))
     assert "looks like an object" in notes and ("give the file's unit (mm?)" in notes) == noted
 

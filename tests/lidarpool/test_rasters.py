@@ -329,24 +329,21 @@ def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
     assert checked.exit_code == 0, checked.output
     assert "file        hill.tif: 60 x 60 pixels of 2 m, EPSG:2056\n" in checked.output
     assert "note: hill.tif has 2 bands: the first is taken for heights\n" in checked.output
-    scenario = Scenario.load(tmp_path / "hill.tif")
-    built = build(scenario)
-    scene = built.scene
+    built = build(Scenario.load(tmp_path / "hill.tif"))
     # In the middle, 1, 2 and 3 m above the ground.
     np.testing.assert_allclose(
         [pose.position for pose in built.placing.poses],
         [(X0 + 60, Y0 - 60, 102.95 + above) for above in (1, 2, 3)],
     )
     assert built.survey.epsg == 2056 and advice(built)[1:] == []
-    at = np.array([X0 + 60, Y0 - 60, 110]) - scene.origin
-    cloud = Scanner(scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
+    at = np.array([X0 + 60, Y0 - 60, 110]) - built.scene.origin
+    cloud = Scanner(built.scene, Sensor.grid(), precision_m=0.001).sweep(tuple(at))
     x, _, z = cloud.positions.T
     assert len(cloud) > 1000
     np.testing.assert_allclose(z, 100 + ((x - X0) / 2 - 0.5) / 10, atol=0.002)
     heights[20:40, 20:40] = np.nan
     write(tmp_path / "hole.tif", heights)
-    scenario = Scenario.load(tmp_path / "hole.tif")
-    scene = build(scenario).scene
+    built = build(Scenario.load(tmp_path / "hole.tif"))
     at = np.array(built.placing.poses[0].position)
     assert np.hypot(*(at[:2] - [X0 + 60, Y0 - 60])) < 23
     assert at[2] == pytest.approx(101 + ((at[0] - X0) / 2 - 0.5) / 10)

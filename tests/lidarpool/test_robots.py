@@ -480,10 +480,8 @@ def test_a_scenario_has_its_robot_and_its_sensor_on_a_link(folder):
         "mount": {"link": "lidar", "position": [0, 0, 0.036], "yaw_deg": 90},
         "materials": [{"objects": "*"}, {"objects": "Rover/*wheel", "reflectance": 0.1}],
     }  # fmt: skip
-    scenario = Scenario.from_data(data, folder=folder)
-    built = build(scenario)
-    scene = built.scene
-    actors = {actor.name: actor for actor in scene.actors}
+    built = build(Scenario.from_data(data, folder=folder))
+    actors = {actor.name: actor for actor in built.scene.actors}
     assert [name for name in actors if name.startswith("Rover/")][:2] == [
         "Rover/base_link", "Rover/front_left_wheel",
     ]  # fmt: skip

@@ -47,8 +47,7 @@ def crate(tmp_path):
 def everything(loaded):
     """Build all that a scenario describes."""
     built = build(loaded)
-    scene = built.scene
-    return scene, built.survey, built.planning
+    return built.scene, built.survey, built.planning
 
 
 @pytest.mark.parametrize("source", ["python", "file", "empty sections"])
@@ -119,12 +118,11 @@ def test_mesh_files_are_placed(scenario, crate):
         """
     )
     built = build(loaded)
-    scene = built.scene
-    assert scene.names == ("crate", "crate.2", "crate.3", "crate.4", "Ground")
-    sizes = np.ptp(scene.object_bounds, axis=1)
+    assert built.scene.names == ("crate", "crate.2", "crate.3", "crate.4", "Ground")
+    sizes = np.ptp(built.scene.object_bounds, axis=1)
     np.testing.assert_allclose(sizes[:4], [[2, 4, 6], [0.02, 0.06, 0.04], [2, 6, 8], [2, 4, 6]])
-    np.testing.assert_allclose(scene.object_bounds[3].mean(axis=0), [7, 8, 9])
-    np.testing.assert_allclose(scene.object_bounds[4], [[-2, -4, -4], [11.01, 11, -4]])
+    np.testing.assert_allclose(built.scene.object_bounds[3].mean(axis=0), [7, 8, 9])
+    np.testing.assert_allclose(built.scene.object_bounds[4], [[-2, -4, -4], [11.01, 11, -4]])
     assert built.planning is None
 
 
@@ -278,10 +276,8 @@ def test_what_is_left_out_of_a_scene_is_in_the_advice(scenario, tmp_path):
         place = np.diag([size, size, size, 1.0])
         made.add_geometry(trimesh.creation.box((1, 2, 1)), node_name=f"N{size}", transform=place)
     (tmp_path / "m.glb").write_bytes(made.export(file_type="glb"))
-    read = scenario("scene: m.glb")
-    built = build(read)
-    scene = built.scene
-    assert scene.names == ("N1",)
+    built = build(scenario("scene: m.glb"))
+    assert built.scene.names == ("N1",)
     assert "m.glb scales N0 to zero: left out" in advice(built)[0]
 
 
@@ -431,8 +427,7 @@ def test_it_is_told_that_gltf_was_turned_and_what_to_say(tmp_path, size, generat
 
 def test_a_start_is_a_time_of_yaml_or_text(scenario):
     for text in ("2026-11-21T10:00:00Z", "'2026-11-21T12:00:00+02:00'"):
-        loaded = scenario(f"cloud: {{epsg: 25832, start: {text}}}")
-        survey = build(loaded).survey
+        survey = build(scenario(f"cloud: {{epsg: 25832, start: {text}}}")).survey
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
     with pytest.raises(LidarpoolError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")

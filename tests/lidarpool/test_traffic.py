@@ -155,10 +155,9 @@ def scenario(folder, text=FCD, traffic=(), **sections):
 def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     read = scenario(tmp_path)
     built = build(read)
-    scene = built.scene
-    assert [actor.name for actor in scene.actors] == ["car (a.1)", "Person (p)", "car (a.1)"]
-    assert scene.all_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
-    first, person, again = (actor.trajectory for actor in scene.actors)
+    assert [actor.name for actor in built.scene.actors] == ["car (a.1)", "Person (p)", "car (a.1)"]
+    assert built.scene.all_names[2:] == ("car (a.1)", "Person (p)", "car (a.1).2")
+    first, person, again = (actor.trajectory for actor in built.scene.actors)
     assert [way.presence_ns for way in (first, person, again)] == [
         (0, 1e9), (1e9, 2e9), (3e9, 4e9)
     ]  # fmt: skip
@@ -260,14 +259,12 @@ def test_a_carrier_follows_surfaces_and_must_stay_on_them(tmp_path, far):
 
 
 def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_path):
-    read = scenario(tmp_path)
-    built = build(read)
-    scene = built.scene
-    first, _, again = (actor.mesh for actor in scene.actors)
+    built = build(scenario(tmp_path))
+    first, _, again = (actor.mesh for actor in built.scene.actors)
     assert first.vertices is again.vertices
     survey = built.survey
     result = SimpleNamespace(
-        scene=scene, survey=survey, hit_counts=np.arange(scene.counters), trials=(),
+        scene=built.scene, survey=survey, hit_counts=np.arange(built.scene.counters), trials=(),
         sample_rays=np.zeros((0, 2, 3)), planning=None, plan=None,
     )  # fmt: skip
     Pictured.of(result).save(tmp_path / "p.npz")

@@ -230,10 +230,8 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     objects, lines = told(path)
     assert lines == ["m.usda moves Car: taken where they are at first, and still"]
     assert bounds(objects)[0, 0] == 1
-    scenario = Scenario.load(path)
-    built = build(scenario)
-    scene = built.scene
-    assert not scene.actors and scene.bounds[0, 0] == 1
+    built = build(Scenario.load(path))
+    assert not built.scene.actors and built.scene.bounds[0, 0] == 1
     assert "nothing stands in the scene" in advice(built)[0]
     uneven = Transform.place(scale=(1, 2, 1))
     with pytest.raises(LidarpoolError, match="'Car' moves, and its placement scales it unevenly"):

@@ -78,10 +78,8 @@ def test_the_drive_of_three_sensors_and_ten_actors_can_be_made(tmp_path):
     write_scene(tmp_path / "city.glb", city(20_000))
     for name in ("city-drive.yaml", "car.obj", "pedestrian.obj"):
         (tmp_path / name).write_bytes((ROOT / "examples" / name).read_bytes())
-    scenario = Scenario.load(tmp_path / "city-drive.yaml")
-    built = build(scenario)
-    scene = built.scene
-    survey = built.survey
+    built = build(Scenario.load(tmp_path / "city-drive.yaml"))
+    scene, survey = built.scene, built.survey
     assert [carried.name for carried in survey.carried] == ["roof", "left", "right"]
     assert len(scene.actors) == 10
     assert 15e6 < survey.ray_count < 15.2e6
@@ -111,10 +109,8 @@ def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster, no_pictures)
     points = report["points_by_object"]
     assert points["Pedestrian"] > 0 and points["Oncoming car"] > 0
     cloud = read_cloud(out / "cloud.ply")
-    scenario = Scenario.load(town / "drive.yaml")
-    built = build(scenario)
-    scene = built.scene
-    survey = built.survey
+    built = build(Scenario.load(town / "drive.yaml"))
+    scene, survey = built.scene, built.survey
     batches = list(Rig(scene, survey, report["backend"]).cast(0, survey.scan_count))
     for column in survey.stored_columns[3:]:
         made = np.concatenate([column.make(batch) for batch in batches])

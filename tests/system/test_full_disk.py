@@ -29,14 +29,12 @@ pool: {backend: embree}
 @pytest.fixture(scope="module")
 def run(cluster: str) -> Callable[..., Any]:
     """Run the scenario from Python."""
-    scenario = Scenario.from_data(yaml.safe_load(SCENARIO))
-    built = build(scenario)
-    scene = built.scene
+    built = build(Scenario.from_data(yaml.safe_load(SCENARIO)))
 
     def run(**options: Any) -> Any:
         with Client(cluster, set_as_default=False) as client:
             return simulate(
-                scene, built.survey, built.planning, client=client,
+                built.scene, built.survey, built.planning, client=client,
                 backend="embree", **options,
             )  # fmt: skip
 

@@ -97,11 +97,9 @@ for point, times in json.loads(sys.argv[2]):
 @pytest.fixture(scope="module")
 def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes:
     """Cloud of the scenario in one go."""
-    scenario = Scenario.from_data(yaml.safe_load(SCENARIO))
-    built = build(scenario)
-    scene = built.scene
+    built = build(Scenario.from_data(yaml.safe_load(SCENARIO)))
     with Client(cluster, set_as_default=False) as client:
-        result = simulate(scene, built.survey, client=client, backend="numpy")
+        result = simulate(built.scene, built.survey, client=client, backend="numpy")
     path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"
     result.points.save(path)
     return path.read_bytes()

@@ -56,10 +56,8 @@ def test_copies_of_a_scenario_are_those_of_a_run(cluster_client, same_cloud):
         "cloud": {"columns": ["range", "class", "intensity", "triangle"], "keep_every": 1},
     }
     data["scene"]["copies"][0]["scatter"] |= {"within": [-20, -20, 20, 20]}
-    scenario = Scenario.from_data(data)
-    built = build(scenario)
-    scene = built.scene
-    survey = built.survey
+    built = build(Scenario.from_data(data))
+    scene, survey = built.scene, built.survey
     cloud = simulate(scene, survey, client=cluster_client).cloud
     assert len({*cloud["object"].tolist()}) > 50 and {*cloud["class"].tolist()} == {0, 4}
     bin_["at"][0]["position"] = [9, 9, 0]
