@@ -7,11 +7,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidarpool.run.job import Job
 
 from lidarpool import Scene, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.run.connection import local_client
-from lidarpool.run.job import Job
 from lidarpool.run.run import drive
 from lidarpool.run.store import RunStore
 from lidarpool.run.watch import Waiting

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from distributed import Client
+from lidarpool.run.job import Job
 from tests.clusters import thread_cluster
 from tests.lidarpool.committing import commit
 from tests.pages import ask
@@ -20,7 +21,6 @@ from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.live.live_job import LiveJob
 from lidarpool.live.live_page import LivePage, live_page
 from lidarpool.run.conductor import conducted
-from lidarpool.run.job import Job
 from lidarpool.run.progress import Progress
 from lidarpool.run.store import RunStore
 from lidarpool.scene.mesh import Mesh

@@ -19,7 +19,7 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.run.identity import identity_of
+from lidarpool.run.jobs import identity_of
 from lidarpool.scenario.job import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh

@@ -5,28 +5,25 @@ from __future__ import annotations
 import json
 import re
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
-from ..base.fingerprint import fingerprint
 from ..base.software import difference, software
-from ..base.storage import TEMPORARY, Storage
+from ..base.storage import Storage
 from ..base.words import counted
 from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
 from ..export.folder import result_folder
 from ..export.jobs import JobRow, read_table, write_table
 from ..export.loader import read_index, sweeps
-from ..pipeline import LIDAR
 from ..pipeline.database import FILE
 from ..run.conductor import Conductor, Output
 from ..run.job_points import listed
 from ..run.result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, drop_run
-from ..run.writer import JobWriter
 from ..scenario.campaign import Campaign, hashes
 from .campaign_report import write_card
 from .sweep_picture import draw_sweep
@@ -48,11 +45,11 @@ class DataSetOutput(Output[CampaignRun]):
 
     place: Path | Storage
     campaign: Campaign
+    dataset: DataSet = field(init=False)
 
     def __post_init__(self) -> None:
         out = replace(Storage.at(self.place), durable=False)
         self.dataset = DataSet(out, self.campaign.keep.format, self.campaign.keep.layout)
-        self.columns = self.dataset.columns
         # Of a finished data set: its record, and what is wrong with jobs, {number: a clause}.
         self._made: Mapping[str, Any] | None = None
         self._wrong: dict[int, str] = {}
@@ -122,35 +119,15 @@ class DataSetOutput(Output[CampaignRun]):
         rows: list[JobRow] = []
         with explained(f"{self.dataset.place} cannot be read"):
             for row, made in self.dataset.rows(known):
-                if made.get("identity") != _identity(store):
+                if made.get("identity") != store.made_with["identity"]:
                     continue
                 if not store.backend:
                     store.cast_with(made["backend"], made["casting"])
-                if made == _made_with(store):
+                if made == store.made_with:
                     rows.append(row)
         store.adopt(rows)
 
-    # -- jobs, and the end -------------------------------------------------------------------
-
-    def writer(self, conductor: Conductor[CampaignRun]) -> Callable[..., JobWriter]:
-        """Have jobs written into the data set."""
-        store, cluster = conductor.store, conductor.cluster
-        assert cluster is not None, "something is left"
-        dataset = replace(self.dataset, made_with=_made_with(store))
-        mark = store.db.meta["mark"]
-        # What a killed run leaves of it is removed as that of any killed writer.
-        probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
-        with explained(f"{dataset.place} cannot be written"):
-            dataset.place.prepare()
-            dataset.place.write(*probe)
-        conductor.stack.callback(_remove_probe, dataset.place, probe[0])
-
-        def make(of_parts: tuple[str, bytes]) -> JobWriter:
-            probes = ((dataset.place, *probe), (store.storage, *of_parts))
-            sources = cluster.software["lidarpool"]
-            return JobWriter(cluster.client, cluster.partitions[LIDAR], dataset, probes, sources)
-
-        return make
+    # -- the end ------------------------------------------------------------------------------
 
     def finish(self, conductor: Conductor[CampaignRun]) -> CampaignRun:
         """Write what all jobs share, and remove the run unless jobs have failed."""
@@ -180,20 +157,6 @@ class DataSetOutput(Output[CampaignRun]):
         saved = sweeps(place.url)
         picture = draw_sweep(next(iter(saved))) if len(saved) else None
         write_card(place, campaign, run, store.rows(), store.casting or software(), picture)
-
-
-def _identity(store: RunStore) -> str:
-    return fingerprint(dict(store.identity))
-
-
-def _made_with(store: RunStore) -> dict[str, Any]:
-    """Return what the bytes of all jobs depend on, for their manifests."""
-    return {"identity": _identity(store), "backend": store.backend, "casting": store.casting}
-
-
-def _remove_probe(place: Storage, name: str) -> None:
-    with suppress(OSError):
-        place.remove([name])
 
 
 def _look(

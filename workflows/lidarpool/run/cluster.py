@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from distributed import Client
 from distributed.client import FutureCancelledError
@@ -21,7 +21,8 @@ from .connection import connected, local_client, started_client
 from .options import RunOptions
 from .screen import Screen
 from .store import RunStore
-from .watch import Waiting
+from .tasks import Tasks
+from .watch import Waiting, Watch
 
 T = TypeVar("T")
 
@@ -101,6 +102,14 @@ class Cluster:
             f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
             "the tasks of this run; it has ended without a result."
         )
+
+    def tasks(self, name: str) -> Tasks[Any]:
+        """Tasks for a partition, none yet."""
+        return Tasks(self.client, self.partitions[name], self.software["lidarpool"])
+
+    def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
+        """Watch workers of partitions from now on, see `Watch`."""
+        return Watch(self.client, names, lasting, self.options.patience_s, self._screen.tell)
 
     def check(self, job: Job) -> None:
         """Check that the workers have memory for a job; JobError if not."""

@@ -9,12 +9,14 @@ from typing import Generic, TypeVar
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
-from ..pipeline import LIDAR, Frame
+from ..export.dataset import DataSet
+from ..export.jobs import JobRow
+from ..pipeline import Frame
 from ..pipeline.database import FILE
 from ..simulator.world import check_backend_here
 from .checks import slots_needed
 from .cluster import Cluster, client_of
-from .jobs import JobMaker, Jobs, Made
+from .jobs import JobMaker, Jobs, Made, OneJob
 from .options import RunOptions
 from .page import Page
 from .ranges import LidarWorkers
@@ -23,7 +25,6 @@ from .run import Run
 from .screen import Screen
 from .store import RunStore, drop_run
 from .watch import Waiting
-from .writer import JobWriter
 
 R = TypeVar("R")
 
@@ -31,7 +32,7 @@ R = TypeVar("R")
 class Output(Generic[R]):
     """Where what a run makes goes."""
 
-    columns: tuple[str, ...] | None = None  # that clouds of a data set must have
+    dataset: DataSet | None = None  # that jobs are written into; else the only job's parts stay
 
     def held(self) -> AbstractContextManager[object]:
         """Lock the place while the body runs."""
@@ -43,10 +44,6 @@ class Output(Generic[R]):
 
     def look(self, conductor: Conductor[R]) -> None:
         """Compare what is there with what the store says is done."""
-
-    def writer(self, conductor: Conductor[R]) -> Callable[[tuple[str, bytes]], JobWriter] | None:
-        """Return what has jobs written once they are cast; None if the only job's parts stay."""
-        return None
 
     def finish(self, conductor: Conductor[R]) -> R:
         """Write what is to be written in the end, and return the result."""
@@ -88,6 +85,7 @@ class Conductor(Generic[R]):
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
         self.run: Run | None = None
         self._first: Made | None = None  # job, of which slots and scans are wanted
+        self._maker: JobMaker | None = None  # of the others
 
     def __call__(self) -> R:
         """Do it."""
@@ -136,23 +134,16 @@ class Conductor(Generic[R]):
         self.stack.enter_context(self._cluster_stack)
 
     def _make_first_job(self) -> None:
-        """Wait for a job that can be made, which stays the next to be taken."""
-        only = self.store.only
-        if only is not None and only.complete:
+        """Wait for a job that can be made."""
+        if (only := self.store.only) is not None:
+            self._first = None if only.complete else Made(only.job)
+        if isinstance(self.jobs, OneJob) or self.output.dataset is None:
             return
-        self._maker = JobMaker(self.jobs, self.store.left, self.output.columns)
+        self._maker = JobMaker(self.jobs, self.store.left, self.output.dataset.columns)
         self.stack.callback(self._maker.close)
-        while True:
-            try:
-                found = self._maker.take(wait=True)
-            except EOFError:
-                return
-            if isinstance(found, Made):
-                break
-            assert found is not None, "it was waited for"
+        while isinstance(found := self._maker.take(wait=True), JobRow):
             self.store.end([found])
             self.page.ended(found)
-        self._maker.put_back(found)
         self._first = found
 
     def _reach_cluster(self) -> None:
@@ -161,7 +152,7 @@ class Conductor(Generic[R]):
         job, options, store = self._first.job, self.options, self.store
         if options.own:
             check_backend_here(store.backend or options.backend, store.advice)
-        writing = self.output.columns is not None
+        writing = self.output.dataset is not None
         needed = slots_needed(options, planning=job.planning is not None, writing=writing)
         if options.cluster is not None:
             options.cluster.require(needed)
@@ -173,13 +164,15 @@ class Conductor(Generic[R]):
         self.page.follow(self.cluster.partitions)
 
     def _cast_what_is_left(self) -> None:
-        if self.cluster is None:
+        if self.cluster is None or self._first is None:
             return
-        on_frame = None if self.output.columns is not None else self._frame
-        writer = self.output.writer(self)
-        self.run = Run(self.cluster, self.store, self._maker, self.page, on_frame, writer)
+        run = self.run = Run(self.cluster, self.store, self.page, self._first, self._maker)
+        if self.output.dataset is None:
+            run.on_frame = self._frame
+        else:
+            run.write_into(self.output.dataset)
         with self.screen.progress() as show:
-            self.run.cast(show, self.screen.tell)
+            run.cast(show)
 
     def _frame(self, frame: Frame) -> None:
         self.page.on_frame(frame)
@@ -200,10 +193,7 @@ class Conductor(Generic[R]):
 
     def lidar_workers(self) -> LidarWorkers | None:
         """Return workers that write formats of many files; None if there is no cluster."""
-        if self.cluster is None:
-            return None
-        partition, patience_s = self.cluster.partitions[LIDAR], self.options.patience_s
-        return LidarWorkers(self.cluster.client, partition, patience_s, self.screen.tell)
+        return None if self.cluster is None else LidarWorkers(self.cluster)
 
     def result_is_in(self, place: object) -> None:
         """Have any later error or interrupt say that the result is complete."""

@@ -3,57 +3,40 @@
 from __future__ import annotations
 
 import time
-from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from queue import Empty, Full, Queue
 from threading import Event, Thread
-from typing import NamedTuple, Protocol
+from typing import NamedTuple
 
 from ..base.errors import LidarpoolError
+from ..base.fingerprint import fingerprint
 from ..export.jobs import JobRow, Value
 from ..export.sweeps import Sweeps
+from ..pipeline import JobError
+from ..scenario.campaign import Campaign
 from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
-from .identity import identity_of
 
 READY = 16  # jobs that are made ahead: small ones are cast several at a time,
 SCENES = 2  # and they have so many scenes at most
 STOP_S = 10.0  # for a job that is being made when the run ends
 
 
-class Jobs(Protocol):
-    """What a run does: a campaign, or `OneJob`."""
+CONTENT = ("scene", "survey", "planning")  # the fields of a job that its result depends on
 
-    @property
-    def count(self) -> int:
-        """How many."""
 
-    @property
-    def title(self) -> str:
-        """Title of all; may be empty."""
+def identity_of(job: Job) -> dict[str, str]:
+    """Fingerprints of the inputs of a job: those with the same ones give the same bytes.
 
-    @property
-    def names(self) -> Sequence[str]:
-        """Names of what differs from job to job."""
-
-    @property
-    def identity(self) -> Mapping[str, str]:
-        """Hashes of what all results depend on."""
-
-    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Make a job; LidarpoolError if it cannot be made."""
-
-    def values(self, number: int) -> Mapping[str, Value]:
-        """Values of a job; LidarpoolError if it cannot be made."""
-
-    def name(self, number: int) -> str:
-        """Name of a job in files."""
-
-    def split(self, number: int) -> str:
-        """Name of its split."""
+    JobError if a sensor, column or trajectory has a field without a fingerprint.
+    """
+    try:
+        return {name: fingerprint(getattr(job, name)) for name in CONTENT}
+    except LidarpoolError as error:
+        raise JobError(str(error)) from error
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,74 +53,54 @@ class OneJob:
         """Fingerprints of scene, survey and planning."""
         return identity_of(self.only)
 
-    def job(self, number: int, cache: SceneCache | None = None, columns: Sequence[str] = ()) -> Job:
-        """Return it."""
-        return self.only
 
-    def values(self, number: int) -> Mapping[str, Value]:
-        """None."""
-        return {}
-
-    def name(self, number: int) -> str:
-        """Its name."""
-        return self.only.name
-
-    def split(self, number: int) -> str:
-        """None."""
-        return ""
+Jobs = OneJob | Campaign  # what a run does
 
 
-def failed_row(jobs: Jobs, number: int, error: object) -> JobRow:
+def failed_row(campaign: Campaign, number: int, error: object) -> JobRow:
     """Row of a job that has failed, perhaps because it cannot be made."""
     values: Mapping[str, Value] = {}
     with suppress(Exception):  # which is what has failed
-        values = jobs.values(number)
-    return JobRow(number, jobs.name(number), jobs.split(number), dict(values), str(error))
+        values = campaign.values(number)
+    name, split = campaign.name(number), campaign.split(number)
+    return JobRow(number, name, split, dict(values), str(error))
 
 
 class Made(NamedTuple):
-    """A job that was made, and its sweeps, which take a while."""
+    """A job that was made, and its sweeps if it is for a data set: they take a while."""
 
     job: Job
-    sweeps: Sweeps | None
+    sweeps: Sweeps | None = None
 
 
 class JobMaker:
-    """Makes jobs in a thread, a few ahead; `numbers` are those that are left.
+    """Makes jobs of a campaign in a thread, a few ahead; `numbers` are those that are left.
 
-    The data set wants clouds to have these `columns`, None where there is no data set.
+    The data set wants clouds to have these `columns`.
     """
 
-    def __init__(self, jobs: Jobs, numbers: Iterable[int], columns: Sequence[str] | None) -> None:
-        self._jobs, self._numbers, self._columns = jobs, numbers, columns
+    def __init__(self, campaign: Campaign, numbers: Iterable[int], columns: Sequence[str]) -> None:
+        self._campaign, self._numbers, self._columns = campaign, numbers, columns
         self._cache = SceneCache()
         self._ready: Queue[Made | JobRow | BaseException | None] = Queue(READY)
-        self._put_back: deque[Made] = deque()
         self._stopped = Event()
+        self.ended = False  # whether the last was taken
         self._thread = Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
 
     def take(self, *, wait: bool = False) -> Made | JobRow | None:
-        """Return the next job, or the row of one that cannot be made; None if none is ready.
+        """Return the next job, or the row of one that cannot be made.
 
-        EOFError after the last. With `wait` it waits for one.
+        None if there is none yet, unless it is to `wait`, and after the last.
         """
-        if self._put_back:
-            return self._put_back.popleft()
         try:
-            found = self._ready.get(block=wait)
+            found = None if self.ended else self._ready.get(block=wait)
         except Empty:
             return None
-        if found is None:
-            self._ready.put(None)
-            raise EOFError
+        self.ended |= found is None
         if isinstance(found, BaseException):
             raise found
         return found
-
-    def put_back(self, made: Made) -> None:
-        """Let a job be taken again."""
-        self._put_back.append(made)
 
     def _work(self) -> None:
         last: BaseException | None = None
@@ -151,16 +114,14 @@ class JobMaker:
 
     def _made(self, number: int) -> Made | JobRow:
         try:
-            if self._columns is None:
-                return Made(self._jobs.job(number), None)
-            job = self._jobs.job(number, self._cache, self._columns)
+            job = self._campaign.job(number, self._cache, self._columns)
             return Made(job, Sweeps.of(job.survey, job.scene))
         except MemoryError:
             raise
         except Exception as error:
             # A class of the user's own may raise anything: the other jobs go on.
             told = str(error) if isinstance(error, LidarpoolError) else repr(error)
-            return failed_row(self._jobs, number, told)
+            return failed_row(self._campaign, number, told)
 
     def _put(self, found: Made | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():

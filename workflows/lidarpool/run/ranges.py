@@ -4,23 +4,21 @@ from __future__ import annotations
 
 import time
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 
-from distributed import Client, Future, Reschedule
+from distributed import Reschedule
 
-from poolpart import Partition, Recorder, TaskRecord, fetch_available, own_client
+from poolpart import Recorder, TaskRecord, fetch_available, own_client
 
 from ..base.errors import LidarpoolError
-from ..base.software import call_alike, software
 from ..export.pieces import RangeWriter, Span, Written
 from ..pipeline import EXPORT, LIDAR
 from ..pipeline.failures import raise_if_failed
-from ..pipeline.task_book import TaskBook
 from ..pipeline.workers import share
+from .cluster import Cluster
 from .result import RunResult
-from .watch import Watch
 
 LOOK_EVERY_S = 0.01
 FETCH_S = 1.0
@@ -28,14 +26,10 @@ ENDS_S = 10.0  # for ranges that are being written when the others are stopped
 
 
 class LidarWorkers:
-    """Has the workers of LIDAR write ranges of files; `patience_s` and `tell` as of `Watch`."""
+    """Has the workers of LIDAR write ranges of files."""
 
-    def __init__(
-        self, client: Client, partition: Partition, patience_s: float, tell: Callable[[str], None]
-    ) -> None:
-        self._client, self._partition = client, partition
-        self._patience_s, self._tell = patience_s, tell
-        self._book, self._sources = TaskBook(), software()["lidarpool"]
+    def __init__(self, cluster: Cluster) -> None:
+        self._cluster, self._tasks = cluster, cluster.tasks(LIDAR)
 
     def __call__(self, writer: RangeWriter, spans: Sequence[Span]) -> dict[Span, Written]:
         """Write ranges; returns what was written of those whose workers see the folder.
@@ -43,31 +37,24 @@ class LidarWorkers:
         The range of a worker that dies is written by another. LidarpoolError if one cannot write,
         several die of a range, or there is none for too long.
         """
-        waiting, most = deque(spans), 2 * self._partition.slots
-        running: dict[Future, Span] = {}
+        partition, running = self._tasks.partition, self._tasks.running
+        waiting, most = deque(spans), 2 * partition.slots
         written: dict[Span, Written] = {}
-        watch = Watch(self._client, [LIDAR], patience_s=self._patience_s, tell=self._tell)
+        watch = self._cluster.watch([LIDAR])
         # Workers fetch it from the one that has it: as an argument of the tasks it would make Dask
         # send them all to that worker.
-        shared = share(self._partition, writer, priority=10)
+        shared = share(partition, writer, priority=10)
         try:
             while waiting or running:
                 while waiting and len(running) < most:
                     span = waiting.popleft()
-                    future = self._partition.submit(
-                        call_alike, self._sources, _write_range, shared.key, span
-                    )
-                    running[future] = span
+                    self._tasks.submit(span, _write_range, shared.key, span)
                 for future in (shared, *running):
                     raise_if_failed(future, f"Writing {writer.place}")
-                ended = {future.key: future for future in running if future.status == "finished"}
-                for key, (made, record) in fetch_available(self._client, [*ended]).items():
-                    span = running.pop(ended[key])
-                    self._book.add(record)
-                    if made is not None:
-                        written[span] = made
+                done = self._tasks.take_done()
+                written |= {span: made for span, made in done if made is not None}
                 watch.look(time.monotonic())
-                if not ended:
+                if not done:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
             raise LidarpoolError(f"The cluster was lost while it wrote {writer.place}.") from error
@@ -77,11 +64,12 @@ class LidarWorkers:
                 until = time.monotonic() + ENDS_S
                 while any(f.status == "pending" for f in running) and time.monotonic() < until:
                     time.sleep(LOOK_EVERY_S)
+                running.clear()
         return written
 
     def recorded(self, result: RunResult) -> RunResult:
         """Return a result with the tasks that wrote ranges."""
-        return replace(result, stages=(*result.stages, *self._book.stages.values()))
+        return replace(result, stages=(*result.stages, *self._tasks.book.stages.values()))
 
 
 @lru_cache(maxsize=1)

@@ -13,6 +13,7 @@ from distributed.client import FutureCancelledError
 from distributed.comm.core import CommClosedError
 
 from ..base.errors import LidarpoolError
+from ..export.dataset import DataSet
 from ..export.jobs import JobRow
 from ..export.sweeps import Sweeps
 from ..pipeline import (
@@ -31,12 +32,12 @@ from ..scenario.job import Job
 from ..simulator.memory import MB, scans_that_fit
 from .cluster import Cluster
 from .job_points import JobPoints
-from .jobs import JobMaker, Made, failed_row
+from .jobs import JobMaker, Made, OneJob, failed_row
 from .page import JobNow, Page
 from .progress import Progress, Show
 from .store import RunStore
+from .tasks import Tasks
 from .trials import TrialPump
-from .watch import Watch
 from .writer import JobFiles, JobWriter, Written
 
 PROGRESS_EVERY_S = 0.1
@@ -46,23 +47,25 @@ SPARE = 32  # jobs under way beside two for each GPU slot
 
 
 class Run:
-    """The jobs that are left of a run, on a cluster.
+    """The jobs that are left of a run, on a cluster: the `first`, and those of `maker`.
 
-    `maker` makes them; `writer` has them written into a data set, None if there is only one, whose
-    parts are kept. `on_frame` is called with its frames.
+    They are written into a data set; without `write_into` there is only one, whose parts are kept.
     """
 
     def __init__(
         self,
         cluster: Cluster,
         store: RunStore,
-        maker: JobMaker,
         page: Page,
-        on_frame: Callable[[Frame], None] | None,
-        writer: Callable[[tuple[str, bytes]], JobWriter] | None,
+        first: Made,
+        maker: JobMaker | None = None,
     ) -> None:
-        self._cluster, self._store, self._maker, self._page = cluster, store, maker, page
-        self._on_frame, options, run = on_frame, cluster.options, uuid.uuid4().hex[:8]
+        self._cluster, self._store, self._page = cluster, store, page
+        self._first, self._maker = first, maker
+        self.on_frame: Callable[[Frame], None] | None = (
+            None  # is called with frames of the only job
+        )
+        options, run = cluster.options, uuid.uuid4().hex[:8]
         stages = LongStages(
             cluster.client,
             cluster.partitions[LIDAR],
@@ -78,10 +81,10 @@ class Run:
             cluster.client, cluster.partitions[GPU], run, cluster.backend, cluster.software
         )
         self._driver = RunDriver(workers, stages, store.db, store.storage)
-        self._writer = writer and writer(stages.probe)
+        self._probe = stages.probe
+        self._writer: JobWriter | None = None
         self._trials: TrialPump | None = None
         self._made: dict[int, tuple[JobPoints, Sweeps | None]] = {}  # {number: job under way}
-        self._all_made = False
         self._scans_begun = self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
         self.kept: JobState | None = None  # the job whose parts are kept, once it is committed
@@ -89,12 +92,17 @@ class Run:
         self.notes: list[str] = []
         self.stages: tuple[StageTotals, ...] = ()
 
+    def write_into(self, dataset: DataSet) -> None:
+        """Have jobs written into a data set once they are cast."""
+        tasks: Tasks[list[JobFiles]] = self._cluster.tasks(LIDAR)
+        self._writer = JobWriter(tasks, dataset, self._store, self._probe)
+
     # -- jobs come and go --------------------------------------------------------------------
 
     @property
     def finished(self) -> bool:
         """True once all jobs have ended."""
-        return self._all_made and not self._made
+        return (self._maker is None or self._maker.ended) and not self._made
 
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
@@ -130,39 +138,34 @@ class Run:
     def _admit(self, rows: list[JobRow]) -> bool:
         """Take on jobs that are ready, if there is room for them."""
         moved = False
-        while not self._all_made and self._has_room:
-            try:
-                found = self._maker.take()
-            except EOFError:
-                self._all_made = True
-                break
-            if found is None:
-                break
+        while self._maker and self._has_room and (found := self._maker.take()) is not None:
             moved = True
             if isinstance(found, JobRow):
                 rows.append(found)
-                continue
-            self._made[found.job.number] = self._store.points_of(found.job), found.sweeps
-            try:
-                if self._writer is not None:
-                    self._cluster.check(found.job)
-                self._begin(found)
-            except JobError as error:  # too large for the workers, or it cannot be pickled
-                self._fail(found.job.number, error, rows)
+            else:
+                self._begin(found, rows)
         return moved
 
     @property
     def _has_room(self) -> bool:
         return self._driver.has_room and len(self._made) < SPARE + 2 * self._driver.slot_count
 
-    def _begin(self, made: Made) -> None:
-        job, (points, _) = made.job, self._made[made.job.number]
-        cluster, jobs = self._cluster, self._store.jobs
-        on_frame = self._on_frame
+    def _begin(self, made: Made, rows: list[JobRow]) -> None:
+        points = self._store.points_of(made.job)
+        self._made[made.job.number] = points, made.sweeps
+        try:
+            if self._writer is not None:  # else it was checked before anything was started
+                self._cluster.check(made.job)
+            self._cast(made.job, points)
+        except JobError as error:  # too large for the workers, or it cannot be pickled
+            self._fail(made.job.number, error, rows)
+
+    def _cast(self, job: Job, points: JobPoints) -> None:
+        cluster, on_frame = self._cluster, self.on_frame
         if self._writer is None and job.planning is not None:
             self._plan(job, points)
         # Of a campaign's job many follow, so that its batches need not be divided among all.
-        left = jobs.count - self._store.db.ended_count
+        left = self._store.jobs.count - self._store.db.ended_count
         self._driver.begin(
             job.number,
             job.scene,
@@ -185,11 +188,10 @@ class Run:
 
     def _plan(self, job: Job, points: JobPoints) -> None:
         assert job.planning is not None
-        partition, sources = self._cluster.partitions[OTHER], self._cluster.software["lidarpool"]
-        done = points.parts.trials
-        self._trials = TrialPump(self._cluster.client, partition, job.planning, sources, done)
+        tasks: Tasks[int] = self._cluster.tasks(OTHER)
+        self._trials = TrialPump(tasks, job.planning, points.parts.trials)
         self._trials.step()  # first: no slot of OTHER waits for the survey
-        partition.want(0)  # from now on its trials wait for workers
+        tasks.partition.want(0)  # from now on its trials wait for workers
 
     def _files_of(self, state: JobState) -> JobFiles:
         """Return what a job that is committed is written from."""
@@ -218,7 +220,7 @@ class Run:
 
     def _fail(self, number: int, error: LidarpoolError, rows: list[JobRow]) -> None:
         """Note that a job has failed; if there is only one, so has the run."""
-        if self._writer is None:
+        if isinstance(self._store.jobs, OneJob):
             raise error
         rows.append(failed_row(self._store.jobs, number, error))
 
@@ -267,13 +269,13 @@ class Run:
 
     # -- to the end --------------------------------------------------------------------------
 
-    def cast(self, show: Show, tell: Callable[[str], None]) -> None:
+    def cast(self, show: Show) -> None:
         """Do all jobs; on any error, everything has been stopped."""
         cluster, driver = self._cluster, self._driver
         try:
             with cluster.partitions_page(), cluster.stopping(self._stop):
                 driver.open()
-                self._loop(show, tell)
+                self._loop(show)
                 stages = TaskBook()
                 for record in driver.finish():
                     stages.add(record)
@@ -286,25 +288,22 @@ class Run:
         self._save()
         self._store.save(now=True)
         self._store.tidy()
-        others = [one.book for one in (self._writer, self._trials) if one is not None]
-        books = [driver.book, *others, stages]
+        books = [driver.book, stages]
+        if self._writer is not None:
+            books.insert(1, self._writer.book)
+            self.notes += filter(None, [self._writer.note])
+        if self._trials is not None:
+            books.insert(1, self._trials.tasks.book)
         self.stages = tuple(totals for book in books for totals in book.stages.values())
         self.notes += [*cluster.notes, *driver.notes]
-        if self._writer is not None and self._writer.hidden:
-            place = self._writer.dataset.place
-            self.notes.append(f"no worker of {LIDAR} sees {place}: the driver wrote the data set")
 
-    def _loop(self, show: Show, tell: Callable[[str], None]) -> None:
+    def _loop(self, show: Show) -> None:
         """Step everything until all have finished."""
         driver, started, pause_s = self._driver, time.monotonic(), 0.0
-        self._admit_first()
-        watch = Watch(
-            self._cluster.client,
-            [GPU, OTHER] if self._trials else [GPU],
-            lasting=[LIDAR],
-            patience_s=self._cluster.options.patience_s,
-            tell=tell,
-        )
+        rows: list[JobRow] = []
+        self._begin(self._first, rows)  # and its trials
+        self._commit(rows)
+        watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         told = saved = float("-inf")
         while not (driver.ended and (self._trials is None or "planning" in self.times)):
             moved = False
@@ -330,11 +329,6 @@ class Run:
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
             (time.sleep if driver.ended else driver.wait)(pause_s)
         self.notes += watch.notes
-
-    def _admit_first(self) -> None:
-        rows: list[JobRow] = []
-        self._admit(rows)
-        self._commit(rows)
 
     def _save(self) -> None:
         if self._trials is not None:

@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from ..base.errors import LidarpoolError, explained
 from ..base.fingerprint import fingerprint
@@ -30,9 +31,8 @@ from ..pipeline.database import (
 from ..pipeline.failures import storing
 from ..scenario.job import Job
 from ..simulator.world import AUTO_TAKES
-from .identity import difference, identity_of
 from .job_points import JobPoints
-from .jobs import Jobs, OneJob
+from .jobs import CONTENT, Jobs, OneJob, identity_of
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
@@ -218,7 +218,7 @@ class RunStore:
 
     def _check_same(self, here: Mapping[str, str], identity: str) -> None:
         """Check that the run that is there is the same."""
-        if other := difference(here, json.loads(identity)):
+        if other := _difference(here, json.loads(identity)):
             raise LidarpoolError(
                 f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
                 "give another folder."
@@ -243,6 +243,12 @@ class RunStore:
             self.db.set(backend=backend, casting=json.dumps(casting))
             with storing(self.storage):
                 self._write_mark()
+
+    @property
+    def made_with(self) -> dict[str, Any]:
+        """What the bytes of all jobs depend on, for the manifests of a data set."""
+        identity = fingerprint(dict(self.identity))
+        return {"identity": identity, "backend": self.backend, "casting": self.casting}
 
     @property
     def kept(self) -> str:
@@ -394,6 +400,18 @@ class RunStore:
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
+
+
+def _difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
+    """Describe the difference of an earlier run in a clause; empty if there is none."""
+    for name, value in here.items():
+        if there.get(name) != value:
+            if name in CONTENT:
+                return f"it is of another {name}"
+            if name != "lidarpool":
+                return f"it is of another campaign: its {name} differs"
+            return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
+    return ""
 
 
 def _hash_of(job: Job) -> str:

@@ -5,18 +5,15 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future as Done
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import replace
 from typing import Any, NamedTuple
 
-from distributed import Client, Future
+from poolpart import Recorder, TaskRecord
 
-from poolpart import Partition, Recorder, TaskRecord, fetch_available, look_for_tasks
-
-from ..base.errors import LidarpoolError
-from ..base.software import call_alike
+from ..base.errors import LidarpoolError, explained
+from ..base.storage import TEMPORARY
 from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet, Listing
 from ..export.jobs import JobRow
@@ -24,6 +21,8 @@ from ..export.sweeps import Sweeps
 from ..pipeline import EXPORT, LIDAR, JobError
 from ..pipeline.failures import raise_if_failed, was_killed
 from ..pipeline.task_book import TaskBook
+from .store import RunStore
+from .tasks import Tasks
 
 WRITING = 2  # tasks that wait to be done, for each free slot of LIDAR
 TOGETHER, TOGETHER_POINTS = 32, 1_000_000  # jobs that one task writes, and their points
@@ -73,62 +72,78 @@ def _written(dataset: DataSet, job: JobFiles) -> Written:
         return JobError(told)
 
 
-@dataclass(eq=False)
 class JobWriter:
-    """Has LIDAR workers write jobs into the data set; what they cannot see is written here."""
+    """Has LIDAR workers write jobs into a data set; what they cannot see is written here.
 
-    client: Client
-    partition: Partition
-    dataset: DataSet
-    probes: tuple[Any, Any]
-    sources: str
-    book: TaskBook = field(default_factory=TaskBook)
-    waiting: deque[JobFiles] = field(default_factory=deque)
-    writing: dict[Future, list[JobFiles]] = field(default_factory=dict)
-    here: dict[Done[Written], JobFiles] = field(default_factory=dict)
-    hidden: bool = False  # whether a worker did not see the data set
-    _thread: ThreadPoolExecutor = field(default_factory=lambda: ThreadPoolExecutor(1, "write"))
-    _moved_at: float = field(default_factory=time.monotonic)
+    `of_parts` is a file among the parts of the `store`, name and content: who does not see it, or
+    another in the data set, writes nothing.
+    """
+
+    def __init__(
+        self,
+        tasks: Tasks[list[JobFiles]],
+        dataset: DataSet,
+        store: RunStore,
+        of_parts: tuple[str, bytes],
+    ) -> None:
+        self._tasks, place, mark = tasks, dataset.place, store.db.meta["mark"]
+        self._dataset = replace(dataset, made_with=store.made_with)
+        # What a killed run leaves of it is removed as that of any killed writer.
+        probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
+        self._probes = (place, *probe), (store.storage, *of_parts)
+        with explained(f"{place} cannot be written"):
+            place.prepare()
+            place.write(*probe)
+        self.waiting = deque[JobFiles]()
+        self._here: dict[Future[Written], JobFiles] = {}
+        self._thread = ThreadPoolExecutor(1, "write")
+        self._moved_at = time.monotonic()
+        self._hidden = False  # whether a worker did not see the data set
+
+    @property
+    def book(self) -> TaskBook:
+        """Tasks that have written jobs."""
+        return self._tasks.book
+
+    @property
+    def note(self) -> str:
+        """Say that the driver wrote the data set; empty if it did not."""
+        if not self._hidden:
+            return ""
+        return f"no worker of {LIDAR} sees {self._dataset.place}: the driver wrote the data set"
 
     @property
     def jobs(self) -> Iterator[JobRow]:
         """Jobs that wait or are being written."""
-        yield from (job.row for jobs in self.writing.values() for job in jobs)
-        yield from (job.row for job in (*self.here.values(), *self.waiting))
+        yield from (job.row for jobs in self._tasks.running.values() for job in jobs)
+        yield from (job.row for job in (*self._here.values(), *self.waiting))
 
     def step(self, slots: int) -> list[tuple[JobFiles, Written]]:
         """Submit what there is room for; returns the rows of jobs, or why they were not written.
 
         Errors of single jobs are JobErrors; others are of the place, or of a worker's software.
         """
-        while self.waiting and len(self.writing) < WRITING * slots:
+        while self.waiting and len(self._tasks.running) < WRITING * slots:
             jobs = self._next()
-            future = self.partition.submit(
-                call_alike, self.sources, write_jobs, self.dataset, self.probes, jobs, priority=5
-            )
-            self.writing[future] = jobs
+            arguments = self._dataset, self._probes, jobs
+            self._tasks.submit(jobs, write_jobs, *arguments, priority=5)
         ended: list[tuple[JobFiles, Written]] = []
-        done = {f.key: f for f in self.writing if f.status == "finished"}
-        for key, (rows, record) in fetch_available(self.client, [*done]).items() if done else ():
-            jobs = self.writing.pop(done[key])
-            self.book.add(record)
+        for jobs, rows in self._tasks.take_done():
             if rows is None:
-                self.hidden = True
+                self._hidden = True
                 self._write_here(jobs)
             else:
                 ended += zip(jobs, rows, strict=True)
-        for future in [f for f in self.writing if f.status not in ("pending", "finished")]:
-            jobs = self.writing.pop(future)
-            if future.status == "error" and was_killed(future):
+        for jobs, future in self._tasks.take_failed():
+            if was_killed(future):
                 self._write_here(jobs)
                 continue
             try:
                 raise_if_failed(future, "writing it")
-                self.waiting += jobs  # lost: it is done again
             except LidarpoolError as error:
                 ended += [(job, error) for job in jobs]
-        for result in [one for one in self.here if one.done()]:
-            ended.append((self.here.pop(result), result.result()))
+        for result in [one for one in self._here if one.done()]:
+            ended.append((self._here.pop(result), result.result()))
         self._relieve(bool(ended))
         return ended
 
@@ -146,24 +161,25 @@ class JobWriter:
     def _relieve(self, moved: bool) -> None:
         """Write jobs here if none has begun for long: all slots are held, or have gone."""
         now = time.monotonic()
-        if moved or self.here or not self.writing:
+        if moved or self._here or not self._tasks.running:
             self._moved_at = now
         elif now - self._moved_at > BEGIN_S:
             self._moved_at = now
-            keys = [future.key for future in self.writing]
-            seen = look_for_tasks(self.client, self.partition.name, keys)
+            seen = self._tasks.look()
             if any(at.started and not seen.out_of_reach(key) for key, at in seen.tasks.items()):
                 return
-            future = next(iter(self.writing))
-            jobs = self.writing.pop(future)
+            future, jobs = self._tasks.running.popitem()
             future.cancel()
             self._write_here(jobs)
 
     def _write_here(self, jobs: Sequence[JobFiles]) -> None:
-        self.here |= {self._thread.submit(_written, self.dataset, job): job for job in jobs}
+        self._here |= {self._thread.submit(_written, self._dataset, job): job for job in jobs}
 
     def close(self) -> None:
         """Write nothing more."""
         with suppress(Exception):  # report the first error
-            self.client.cancel([*self.writing])
+            self._tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
+        place, name, _ = self._probes[0]
+        with suppress(OSError):
+            place.remove([name])
