@@ -387,25 +387,6 @@ def test_files_beside_the_database_stay_without_a_word(unfinished):
     assert names(unfinished) == {"report.json"}
 
 
-def test_nothing_behind_a_link_is_deleted(unfinished, tmp_path):
-    parts, elsewhere = unfinished / "parts", tmp_path / "elsewhere"
-    parts.rename(elsewhere)
-    parts.symlink_to(elsewhere)
-    put(elsewhere)
-    before = content(elsewhere)
-    for use in (
-        remove_run,
-        lambda folder: opened(folder, resume=True),
-        lambda folder: opened(folder),
-    ):
-        with pytest.raises(LidarpoolError, match=f"{parts} is a link, and nothing behind"):
-            use(unfinished)
-    assert content(elsewhere) == before
-    parts.unlink()
-    elsewhere.rename(parts)
-    assert opened(unfinished, resume=True).only.resumed == 4
-
-
 @pytest.mark.parametrize("where", ["parts", "run.db", "run.db-journal"])
 @pytest.mark.parametrize("use", [remove_run, "resume", "new"])
 def test_another_run_behind_a_link_stays(where, use, folder, tmp_path):

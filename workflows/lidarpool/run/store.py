@@ -296,7 +296,6 @@ class RunStore:
             return found
         points = self._points[job.number] = JobPoints(self, job)
         if isinstance(self.jobs, OneJob):
-            points.parts.has_frames = True
             return points  # is checked once the run itself is known to be the same
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
