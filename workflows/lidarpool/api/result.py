@@ -69,16 +69,15 @@ class Result(RunResult):
             If a file cannot be written, the folder holds the result of another survey, or a
             format lacks a package or column.
         """
-        from ..export.folder import output_place, result_folder
+        from ..export.folder import output_place
         from ..export.formats import Format
-        from ..report.output import further_files, refuse_to_replace, write_result
+        from ..report.output import SurveyOutput
 
-        place = output_place(folder)
-        wanted = [Format.of(entry) for entry in formats if entry != "ply"]
-        with result_folder(place) as local:
-            further = further_files(self.survey, wanted)
-            refuse_to_replace(place, lambda: self.identity, further, overwrite=overwrite)
-            write_result(local, place, self, only_cloud=only_cloud, formats=wanted)
+        wanted = [Format.of(entry) for entry in formats]
+        output = SurveyOutput(output_place(folder), self.survey, wanted, only_cloud)
+        with output.held():
+            output.refuse(lambda: self.identity, overwrite=overwrite)
+            output.write(self)
 
     @checked
     def pictures(

@@ -31,7 +31,7 @@ from ..export.navigation import instrument_bytes
 from ..pipeline import GPU, LIDAR, OTHER
 from ..pipeline.database import FILE
 from ..pipeline.policies import most_scans
-from ..report.output import ROOM_BYTES, further_files, refuse_to_replace
+from ..report.output import ROOM_BYTES, SurveyOutput
 from ..run.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
 from ..run.jobs import identity_of
 from ..run.local import default_workers
@@ -160,7 +160,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     with mistakes.noted():
         notes += _look_at_folder(out)
     try:
-        refuse_to_replace(out, lambda: identity_of(job), further_files(job.survey, formats))
+        SurveyOutput(out, job.survey, formats).refuse(lambda: identity_of(job))
     except LidarpoolError as error:
         notes.append(str(error).rstrip("."))
     for one in formats:

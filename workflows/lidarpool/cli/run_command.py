@@ -82,7 +82,9 @@ def _run_survey(
     for note in advice(built):
         terminal.tell(note)
     jobs = OneJob(job)
-    output = SurveyOutput(options.out, job, built.scenario, only == "cloud", judge)
+    output = SurveyOutput(
+        options.out, job.survey, job.outputs, only == "cloud", built.scenario, judge
+    )
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
         lines = _of_result(options.out, result, job, report)

@@ -23,7 +23,7 @@ from ..pipeline.database import FILE
 from ..run.conductor import Conductor, Output
 from ..run.job_points import listed
 from ..run.result import CampaignRun
-from ..run.store import RUN_FOLDER, RunStore, drop_run
+from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import Campaign, hashes
 from .campaign_report import write_card
 from .sweep_picture import draw_sweep
@@ -84,7 +84,7 @@ class DataSetOutput(Output[CampaignRun]):
         if whole != self.campaign.count or self._wrong or not _is_indexed(out, whole):
             return None
         if RUN_FOLDER in there:  # a killed run has not removed all of itself
-            drop_run(kept)
+            remove_run(kept)
         conductor.screen.tell(f"{out} is complete: nothing is left to do")
         for row in read_table(out):
             conductor.page.ended(row)
@@ -273,7 +273,7 @@ def _remove_dataset(out: Storage, kept: Storage) -> None:
         out.tidy()
         # First what says that it is finished, and last what says that it is a data set.
         out.prune(sorted(own, key=lambda name: (name == CAMPAIGN_FILE, name != INDEX_FILE)))
-    drop_run(kept)
+    remove_run(kept)
 
 
 def failures(run: CampaignRun, most: int = 5) -> str:

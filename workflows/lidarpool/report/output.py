@@ -7,7 +7,7 @@ from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass, replace
-from functools import cache, partial
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,6 @@ from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
-from ..scenario.job import Job
 from ..scenario.scenario import Scenario
 from ..sensor import Survey
 from .cloud_numbers import CountedCloud
@@ -46,19 +45,19 @@ _FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
 class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     """The result of a survey in its folder or storage, `place`; gives it with its report.
 
-    `judge` returns a note on the result; others as of `write_result`.
+    `formats` are written beside the cloud, `only_cloud` leaves out pictures and page, and `judge`
+    returns a note on the result.
     """
 
     place: Path | Storage
-    job: Job
-    scenario: Scenario | None = None
+    survey: Survey
+    formats: Sequence[Format]
     only_cloud: bool = False
+    scenario: Scenario | None = None
     judge: Callable[[RunResult], str] = lambda result: ""
 
-    @property
-    def formats(self) -> list[Format]:
-        """Formats that the cloud is written in as well."""
-        return [one for one in self.job.outputs if one.format != "ply"]
+    def __post_init__(self) -> None:
+        self.formats = [one for one in self.formats if one.format != "ply"]
 
     @contextmanager
     def held(self) -> Iterator[None]:
@@ -72,10 +71,35 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     def begin(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""
         if not conductor.goes_on:
-            further = further_files(self.job.survey, self.formats)
-            overwrite = conductor.options.overwrite
-            identity = partial(getattr, conductor.jobs, "identity")
-            refuse_to_replace(self.place, identity, further, overwrite=overwrite)
+            self.refuse(lambda: conductor.jobs.identity, overwrite=conductor.options.overwrite)
+
+    def refuse(self, identity: Callable[[], Mapping[str, str]], *, overwrite: bool = False) -> None:
+        """Refuse a place that holds the result of another survey, or files of no result.
+
+        `identity` returns that of this result, see `RunResult.identity`: large scenes take a
+        moment. LidarpoolError if there is a result of another scene or survey, or one that cannot
+        be read, or a file that this result would replace and that no report there lists, each
+        unless `overwrite`; or a folder that would be replaced and holds files of others.
+        """
+        place, storage = self.place, Storage.at(self.place)
+        advice = "give another folder with --out, or replace it with --overwrite (in Python "
+        advice += "overwrite=True)."
+        with explained(f"{place} cannot be read"):
+            try:
+                there = set(storage.entries())
+            except NotADirectoryError:
+                return
+        earlier, listed = _earlier(storage)
+        if REPORT in there and not overwrite:
+            here = identity()
+            if earlier != {name: here[name] for name in _SURVEY}:
+                raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
+        further = _further_files(self.survey, self.formats)
+        foreign = [name for name in (*FILES, *further) if name in there and name not in listed]
+        if foreign and not overwrite:
+            lists = f"{place} holds {foreign[0]}, which no result there lists"
+            raise LidarpoolError(f"{lists}: {advice}")
+        refuse_strangers(storage, {*further, *listed})
 
     def finish(
         self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]
@@ -96,57 +120,87 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
 
         what = "the cloud" if self.only_cloud else "the cloud, the pictures and the report"
         with conductor.screen.status(f"writing {what}"):
-            report = write_result(
-                self._folder, self.place, result, self.scenario, in_place, self.only_cloud,
-                self.formats, workers,
-            )  # fmt: skip
-        return result, report
+            return result, self.write(result, in_place, workers)
+
+    def write(
+        self,
+        result: RunResult,
+        then: Callable[[], object] = lambda: None,
+        workers: LidarWorkers | None = None,
+    ) -> dict[str, Any]:
+        """Write cloud, pictures and report into the held place, and return the report.
+
+        They are made in a temporary folder within the folder and moved into place once all are on
+        the disk, so that an earlier result stays whole if one cannot be written. Pictures of an
+        earlier result that this one does not make are removed. `then` is called when all are in
+        place, before a pending interrupt is raised. `workers` write formats of many files.
+
+        Where `place` is a storage, all is put into it, report.json last. Files of workers go there
+        directly, and an earlier result is removed before.
+
+        LidarpoolError if a file cannot be written.
+        """
+        place, folder, formats = self.place, self._folder, self.formats
+        storage = place if isinstance(place, Storage) else None
+        _, earlier = _earlier(Storage.at(storage or folder))
+        points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
+        cloud = CountedCloud(points, len(result.scene.all_names))
+        advice = "make room or give another folder with --out"
+        with (
+            explained(f"The result cannot be written to {place}", advice),
+            staging(folder, place) as staged,
+            nullcontext() if self.only_cloud else _Pictures(result, staged) as pictures,
+        ):
+            drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
+            instruments = sweeps.instruments
+            further = _further_files(result.survey, formats)
+            files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
+            refuse_strangers(Storage.at(storage or folder), {*further, *earlier})
+
+            @cache
+            def clear(storage: Storage) -> None:
+                """Remove once what an earlier result has there and this one would not replace."""
+                for name in (REPORT, PAGE, *_stale(earlier, files)):
+                    storage.discard(name)
+
+            sweeps.save(staged / SWEEPS_FILE)
+            if instruments is not None:
+                write_instruments(staged, result.survey, result.scene.origin)
+                sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
+            Format("ply").write(staged / CLOUD, cloud, sweeps)
+            for one in sorted(formats, key=lambda one: one.in_pieces):
+                if storage and workers and one.in_pieces:
+                    clear(storage)
+                    one.put(storage, points, sweeps, workers)
+                else:
+                    one.write(
+                        staged / one.file, points, sweeps, workers=None if storage else workers
+                    )
+            if workers:
+                result = workers.recorded(result)
+            report = make_report(result, files, cloud)
+            report["notes"] += [note for one in formats for note in one.notes(points)]
+            if pictures:
+                pictures.write_page(report, result, cloud, self.scenario)
+            text = json.dumps(report, indent=1, allow_nan=False) + "\n"
+            (staged / REPORT).write_text(text, encoding="utf-8")
+            if storage is None:
+                _move(staged, folder, files, earlier, then)
+            else:
+                clear(storage)
+                for name in (*_FURTHER, *FILES):
+                    if (staged / name).exists():
+                        storage.put(staged / name, name)
+                with deferred_interrupts():
+                    then()
+        return report
 
 
-def further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
+def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
     """Name the files that a result has besides those that all have."""
     instruments = Instruments.of(survey)
     measured = [] if instruments is None else instruments.files
     return [*(one.file for one in formats), *measured]
-
-
-def refuse_to_replace(
-    place: Path | Storage,
-    identity: Callable[[], Mapping[str, str]],
-    further: Sequence[str] = (),
-    *,
-    overwrite: bool = False,
-) -> None:
-    """Refuse a folder that holds the result of another survey, or files of no result.
-
-    `identity` returns that of this result, see `RunResult.identity`: large scenes take a moment.
-    `further` are its `further_files`.
-
-    Raises
-    ------
-    LidarpoolError
-        If there is a result of another scene or survey, or one that cannot be read, or a file that
-        this result would replace and that no report there lists, each unless `overwrite`; or a
-        folder that would be replaced and holds files of others.
-    """
-    storage = Storage.at(place)
-    advice = "give another folder with --out, or replace it with --overwrite (in Python "
-    advice += "overwrite=True)."
-    with explained(f"{place} cannot be read"):
-        try:
-            there = set(storage.entries())
-        except NotADirectoryError:
-            return
-    earlier, listed = _earlier(storage)
-    if REPORT in there and not overwrite:
-        here = identity()
-        if earlier != {name: here[name] for name in _SURVEY}:
-            raise LidarpoolError(f"{place} holds the result of another survey: {advice}")
-    names = (*FILES, *further)
-    foreign = [name for name in names if name in there and name not in listed]
-    if foreign and not overwrite:
-        raise LidarpoolError(f"{place} holds {foreign[0]}, which no result there lists: {advice}")
-    refuse_strangers(storage, {*further, *listed})
 
 
 def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
@@ -160,82 +214,6 @@ def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
         return identity, frozenset(report["files"])
     except (OSError, ValueError, TypeError, LookupError):
         return {}, frozenset()
-
-
-def write_result(
-    folder: Path,
-    place: Path | Storage,
-    result: RunResult,
-    scenario: Scenario | None = None,
-    then: Callable[[], object] = lambda: None,
-    only_cloud: bool = False,
-    formats: Sequence[Format] = (),
-    workers: LidarWorkers | None = None,
-) -> dict[str, Any]:
-    """Write cloud, pictures and report, and return the report.
-
-    They are made in a temporary folder within `folder` and moved into place once all are on the
-    disk, so that an earlier result stays whole if one cannot be written. Pictures of an earlier
-    result that this one does not make are removed. `then` is called when all are in place, before
-    a pending interrupt is raised. `only_cloud` leaves out pictures and page; `formats` are
-    written as well, those of many files by `workers`, if there are any.
-
-    Where `place` is a storage, all is put into it, report.json last; `folder` is a temporary one
-    then. Files of workers go there directly, and an earlier result is removed before.
-
-    LidarpoolError if a file cannot be written.
-    """
-    storage = place if isinstance(place, Storage) else None
-    _, earlier = _earlier(Storage.at(storage or folder))
-    points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
-    cloud = CountedCloud(points, len(result.scene.all_names))
-    advice = "make room or give another folder with --out"
-    with (
-        explained(f"The result cannot be written to {place}", advice),
-        staging(folder, place) as staged,
-        nullcontext() if only_cloud else _Pictures(result, staged) as pictures,
-    ):
-        drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
-        instruments = sweeps.instruments
-        further = further_files(result.survey, formats)
-        files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
-        refuse_strangers(Storage.at(storage or folder), {*further, *earlier})
-
-        @cache
-        def clear(storage: Storage) -> None:
-            """Remove once what an earlier result has there and this one would not replace."""
-            for name in (REPORT, PAGE, *_stale(earlier, files)):
-                storage.discard(name)
-
-        sweeps.save(staged / SWEEPS_FILE)
-        if instruments is not None:
-            write_instruments(staged, result.survey, result.scene.origin)
-            sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
-        Format("ply").write(staged / CLOUD, cloud, sweeps)
-        for one in sorted(formats, key=lambda one: one.in_pieces):
-            if storage and workers and one.in_pieces:
-                clear(storage)
-                one.put(storage, points, sweeps, workers)
-            else:
-                one.write(staged / one.file, points, sweeps, workers=None if storage else workers)
-        if workers:
-            result = workers.recorded(result)
-        report = make_report(result, files, cloud)
-        report["notes"] += [note for one in formats for note in one.notes(points)]
-        if pictures:
-            pictures.write_page(report, result, cloud, scenario)
-        text = json.dumps(report, indent=1, allow_nan=False) + "\n"
-        (staged / REPORT).write_text(text, encoding="utf-8")
-        if storage is None:
-            _move(staged, folder, files, earlier, then)
-        else:
-            clear(storage)
-            for name in (*_FURTHER, *FILES):
-                if (staged / name).exists():
-                    storage.put(staged / name, name)
-            with deferred_interrupts():
-                then()
-    return report
 
 
 def _move(

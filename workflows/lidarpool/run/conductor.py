@@ -13,6 +13,7 @@ from ..export.dataset import DataSet
 from ..export.jobs import JobRow
 from ..pipeline import Frame
 from ..pipeline.database import FILE
+from ..plan import best
 from ..simulator.world import check_backend_here
 from .checks import slots_needed
 from .cluster import Cluster, client_of
@@ -20,10 +21,10 @@ from .jobs import JobMaker, Jobs, Made, OneJob
 from .options import RunOptions
 from .page import Page
 from .ranges import LidarWorkers
-from .result import RunResult, result_of
+from .result import RunResult
 from .run import Run
 from .screen import Screen
-from .store import RunStore, drop_run
+from .store import RunStore, remove_run
 from .watch import Waiting
 
 R = TypeVar("R")
@@ -120,7 +121,7 @@ class Conductor(Generic[R]):
     def _open_store(self) -> None:
         options = self.options
         if options.fresh and options.folder is not None:
-            drop_run(Storage.at(options.folder))
+            remove_run(options.folder)
         checking = "checking the points of the earlier run"
         with self.screen.status(checking) if self.goes_on else nullcontext():
             place = options.folder, options.parts
@@ -187,9 +188,32 @@ class Conductor(Generic[R]):
 
     def result(self) -> RunResult:
         """Return the result of the only job, which is committed."""
-        only = self.store.only
+        only, run = self.store.only, self.run
         assert only is not None, "there is one"
-        return result_of(self.store, only, self.run, self.notes, time.monotonic() - self.started)
+        job = only.job
+        trials = tuple(sorted(only.parts.trials, key=lambda trial: trial.trial))
+        times = run.times if run else {}
+        return RunResult(
+            scene=job.scene,
+            survey=job.survey,
+            planning=job.planning,
+            points=only.points(),
+            plan=best(trials, job.planning) if job.planning else None,
+            trials=trials,
+            backend=self.store.backend,
+            rays=job.survey.ray_count,
+            hits=only.parts.hits,
+            stages=run.stages if run else (),
+            resumed=only.resumed,
+            notes=tuple(self.notes),
+            identity=self.store.identity,
+            _hit_counts=only.hit_counts,
+            sample_rays=only.sample_rays(),
+            seconds=time.monotonic() - self.started if run else 0.0,
+            survey_seconds=times.get("survey", 0.0),
+            planning_seconds=times.get("planning", 0.0),
+            replayed=run.kept.offered_again if run and run.kept else 0,
+        )
 
     def lidar_workers(self) -> LidarWorkers | None:
         """Return workers that write formats of many files; None if there is no cluster."""

@@ -22,36 +22,12 @@ from .connection import TlsFiles
 class RunOptions(TaskOptions):
     """How jobs are run, on what, and what becomes of an earlier run; the defaults are those of all.
 
-    Parameters
-    ----------
-    out
-        Folder or URL of the result or data set; None if nothing is written.
-    folder
-        Place of what the run keeps until its result is complete, a folder or URL; None for a
-        temporary folder that goes with the last user of the points.
-    parts
-        Another place for the parts, a path or URL.
-    resume, fresh
-        Whether to go on with an unfinished run, or to drop it.
-    retry_failed, verify
-        Of a data set: resume, and do failed jobs again; compare every byte of what is done.
-    overwrite
-        Replace the result of another survey, or a finished data set.
-    client, scheduler, cluster
-        The cluster: a client of it, its address, or the file of one to start. By default a local
-        one is started.
-    files, tls
-        Certificates for the scheduler; whether to encrypt the traffic of a local cluster.
-    gpu_workers, other_workers
-        Workers of a local cluster.
-    wait_s, patience_s
-        How long to wait for partitions that are empty at the start, and for those that become empty
-        later, seconds.
-    live, stay
-        Whether to show the live page, and to keep it at the end.
+    Those of Python are described at `simulate` and `Campaign.run`, and are options of commands.
     """
 
-    out: Path | Storage | None = None
+    out: Path | Storage | None = None  # of the result or data set; None if nothing is written
+    # Of what the run keeps until its result is complete; None for a temporary folder that goes with
+    # the last user of the points.
     folder: str | Path | Storage | None = None
     parts: str | Path | None = None
     resume: bool = False
@@ -60,16 +36,16 @@ class RunOptions(TaskOptions):
     verify: bool = False
     overwrite: bool = False
     client: Client | None = None
-    scheduler: str | None = None
-    cluster: ClusterFile | None = None
+    scheduler: str | None = None  # address, with certificates for it
     files: TlsFiles | None = None
+    cluster: ClusterFile | None = None  # to be started
     tls: bool = False
     gpu_workers: int | None = None
     other_workers: int | None = None
     wait_s: Annotated[float, Field(ge=0)] = WAIT_S
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
     live: bool = False
-    stay: bool = True
+    stay: bool = True  # of the live page, at the end
 
     @property
     def own(self) -> bool:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
-from typing import TYPE_CHECKING
 
 from poolpart import TaskRecord
 
@@ -14,14 +13,9 @@ from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..export.jobs import JobRow
 from ..pipeline.task_book import StageTotals
-from ..plan import Plan, Planning, Trial, best
+from ..plan import Plan, Planning, Trial
 from ..scene.scene import Scene
 from ..sensor import Survey
-
-if TYPE_CHECKING:
-    from .job_points import JobPoints
-    from .run import Run
-    from .store import RunStore
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,36 +88,6 @@ class RunResult:
     def hit_counts(self) -> Ints:
         """Hits by `counters` of the scene, read when first asked for."""
         return self._hit_counts()
-
-
-def result_of(
-    store: RunStore, only: JobPoints, run: Run | None, notes: Sequence[str], seconds: float
-) -> RunResult:
-    """Make the result of the only job of a run, which is committed; `run` if it was cast now."""
-    job = only.job
-    trials = tuple(sorted(only.parts.trials, key=lambda trial: trial.trial))
-    kept, times = (run.kept, run.times) if run else (None, {})
-    return RunResult(
-        scene=job.scene,
-        survey=job.survey,
-        planning=job.planning,
-        points=only.points(),
-        plan=best(trials, job.planning) if job.planning else None,
-        trials=trials,
-        backend=store.backend,
-        rays=job.survey.ray_count,
-        hits=only.parts.hits,
-        stages=run.stages if run else (),
-        resumed=only.resumed,
-        notes=tuple(notes),
-        identity=store.identity,
-        _hit_counts=only.hit_counts,
-        sample_rays=only.sample_rays(),
-        seconds=seconds if run else 0.0,
-        survey_seconds=times.get("survey", 0.0),
-        planning_seconds=times.get("planning", 0.0),
-        replayed=kept.offered_again if kept else 0,
-    )
 
 
 @dataclass(frozen=True)

@@ -137,18 +137,16 @@ class Run:
 
     def _admit(self, rows: list[JobRow]) -> bool:
         """Take on jobs that are ready, if there is room for them."""
-        moved = False
-        while self._maker and self._has_room and (found := self._maker.take()) is not None:
+        moved, most = False, SPARE + 2 * self._driver.slot_count
+        while self._maker and self._driver.has_room and len(self._made) < most:
+            if (found := self._maker.take()) is None:
+                break
             moved = True
             if isinstance(found, JobRow):
                 rows.append(found)
             else:
                 self._begin(found, rows)
         return moved
-
-    @property
-    def _has_room(self) -> bool:
-        return self._driver.has_room and len(self._made) < SPARE + 2 * self._driver.slot_count
 
     def _begin(self, made: Made, rows: list[JobRow]) -> None:
         points = self._store.points_of(made.job)

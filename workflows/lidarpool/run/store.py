@@ -434,7 +434,7 @@ def _parts_of(place: Storage, parts: str) -> Storage:
 
 
 @checked
-def remove_run(folder: str | Path) -> None:
+def remove_run(folder: str | Path | Storage) -> None:
     """Remove a stored run and its parts, wherever they are, and nothing else.
 
     Other files among the parts stay. If its database is damaged, its parts are found only in its
@@ -450,11 +450,7 @@ def remove_run(folder: str | Path) -> None:
     LidarpoolError
         If another run uses it, it cannot be removed, or there is a link in place of its files.
     """
-    drop_run(Storage.at(folder))
-
-
-def drop_run(place: Storage) -> None:
-    """Remove a stored run, see `remove_run`."""
+    place = Storage.at(folder)
     with tempfile.TemporaryDirectory(prefix="lidarpool-") as temporary:
         path = _database(place if place.is_local else Storage.at(temporary))
         if not place.is_local:
