@@ -7,14 +7,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from lidarpool.run.job import Job
 
 from lidarpool import Scene, Survey
 from lidarpool.live.live_page import live_page
+from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.connection import local_client
-from lidarpool.run.run import drive
-from lidarpool.run.store import RunStore
-from lidarpool.run.watch import Waiting
+from lidarpool.run.jobs import OneJob
+from lidarpool.run.options import RunOptions
+from lidarpool.run.screen import Screen
+from lidarpool.scenario.job import Job
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -31,13 +32,12 @@ def client():
 
 @pytest.fixture
 def live(monkeypatch):
-    """Return a page, and the store that it follows, of a survey of many small batches."""
+    """Return a page, and the job that it follows, a survey of many small batches."""
     monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
     survey = Survey(poses=[(0, 0, 1 + step / 20) for step in range(SCANS // 36)])
-    job = Job(Scene.seed(), survey)
-    store = RunStore(job)
+    job = OneJob(Job(Scene.seed(), survey))
     with live_page(port=0, browser=False) as live:
-        yield live, store
+        yield live, job
 
 
 class Driven:
@@ -47,30 +47,38 @@ class Driven:
     any run. Few batches are ahead of the frames, so that it is far from its end then.
     """
 
-    def __init__(self, client, live, store, most=1):
+    def __init__(self, client, live, job, most=1):
         self.error, self.most = None, most
         begun = time.monotonic()
+        options, screen = RunOptions(client=client), Screen(lambda progress: None)
+        conductor = Conductor(job, options, Kept(), screen, live, self.on_frame)
+        self.conductor = conductor
 
         def on_frame(frame):
-            while store.db.point_count >= self.most:
-                now = replace(store.progress(), seconds=time.monotonic() - begun)
+            while self.points.parts.point_count >= self.most:
+                now = replace(self.points.progress(), seconds=time.monotonic() - begun)
                 live.on_progress(now, list)  # KeyboardInterrupt if somebody has stopped it
                 time.sleep(0.05)
 
-        live.begun(store)
+        self._on_frame = on_frame
 
         def run():
             try:
-                result, _ = drive(
-                    client, store, print, Waiting(), own=True, on_frame=on_frame,
-                    page=live, show=lambda progress: None,
-                )  # fmt: skip
-                live.finish(result.seconds, result)
+                conductor()
             except BaseException as error:
                 self.error = error
 
         self.thread = threading.Thread(target=run)
         self.thread.start()
+
+    def on_frame(self, frame):
+        """Stand still, if it is time to."""
+        self._on_frame(frame)
+
+    @property
+    def points(self):
+        """What is committed."""
+        return self.conductor.store.only
 
     def ended(self):
         """Wait for its end."""
@@ -93,20 +101,20 @@ def points_in(text):
 
 @pytest.mark.sample
 def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
-    live, store = live
+    live, job = live
     tab, other = opened(new_tab, live), opened(new_tab, live)
-    run = Driven(client, live, store)
+    run = Driven(client, live, job)
     try:
         first = tab.wait_for(points_in)
         run.most = first + 1
         tab.wait_for(lambda text: points_in(text) > first)
-        assert not store.complete
+        assert not run.points.complete
     finally:
         run.most = ALL
         run.ended()
     assert run.error is None
-    assert store.complete
-    total = f"{store.db.point_count:,} points"
+    assert run.points.complete
+    total = f"{run.points.parts.point_count:,} points"
     tab.wait_for(lambda text: "done" in text and total in text)
     other.wait_for(lambda text: "done" in text and total in text)
     tab.wait_for(lambda _: len(colours(tab.picture(tmp_path / "live.png"))) > 200)
@@ -116,9 +124,9 @@ def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
 
 
 def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
-    live, store = live
+    live, job = live
     tab = opened(new_tab, live)
-    run = Driven(client, live, store)
+    run = Driven(client, live, job)
     try:
         tab.wait_for(points_in)
         tab.click("Stop")
@@ -127,7 +135,7 @@ def test_stop_ends_the_run_as_an_interrupt_does(client, live, new_tab):
         live.stopped.set()
         run.ended()
     assert isinstance(run.error, KeyboardInterrupt)
-    assert not store.complete
+    assert not run.points.complete
 
 
 def colours(picture):

@@ -2,15 +2,17 @@
 
 import re
 import threading
-from contextlib import nullcontext
 
 import numpy as np
 import pytest
 
 from lidarpool import Campaign, Job, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
-from lidarpool.report.campaign_output import Making, make_dataset
+from lidarpool.report.campaign_output import DataSetOutput
+from lidarpool.run.conductor import Conductor
 from lidarpool.run.connection import local_client
+from lidarpool.run.options import RunOptions
+from lidarpool.run.screen import Screen
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
@@ -36,7 +38,8 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
         local_client({"LIDAR": 5}, gpu_workers=1) as client,
         live_page(COUNT, campaign.names, "Heights", port=0, browser=False) as live,
     ):
-        making = Making(tmp_path / "set", own=False, wait_s=120.0)
+        output = DataSetOutput(tmp_path / "set", campaign)
+        options = RunOptions(client=client, wait_s=120.0, folder=tmp_path / "set" / "run")
 
         def hold(progress):
             """Stand still once a job is done, until the browser has shown it."""
@@ -44,9 +47,7 @@ def test_jobs_are_counted_listed_drawn_and_shown(new_tab, tmp_path):
                 looked.wait(300)
 
         def drive():
-            client_of = lambda *_: nullcontext(client)  # noqa: E731
-            progress = nullcontext(hold)
-            ended.append(make_dataset(campaign, making, client_of, progress, print, live))
+            ended.append(Conductor(campaign, options, output, Screen(hold), live)())
 
         tab = new_tab(live.page.url)
         tab.wait_for(lambda text: "Heights" in text and "starting" in text)

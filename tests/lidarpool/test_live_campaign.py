@@ -3,7 +3,7 @@
 import time
 import urllib.error
 import urllib.request
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 
 import pytest
 import trimesh
@@ -14,9 +14,12 @@ from tests.pages import ask
 from lidarpool import Campaign, Job, Scene, Sensor, Survey
 from lidarpool.export.jobs import JobRow
 from lidarpool.live.live_page import ENDED_MOST, FAILED_MOST, UNDER_WAY_MOST, live_page
-from lidarpool.report.campaign_output import Making, make_dataset
+from lidarpool.report.campaign_output import DataSetOutput
+from lidarpool.run.conductor import Conductor
+from lidarpool.run.options import RunOptions
 from lidarpool.run.page import JobNow
 from lidarpool.run.progress import Progress
+from lidarpool.run.screen import Screen
 from lidarpool.scene.mesh import Mesh
 
 LONG_S = 120.0
@@ -33,10 +36,7 @@ def make(number, rng):
 
 
 def progress(done, count, seconds):
-    zero = dict.fromkeys(
-        ("scans", "generated", "cast", "framed", "collected", "points", "trials", "trials_done"), 0
-    )
-    return Progress(**zero, seconds=seconds, jobs=count, jobs_done=done)
+    return Progress(seconds, jobs=count, jobs_done=done)
 
 
 def row(number, **given):
@@ -114,10 +114,10 @@ def test_a_campaign_is_watched_to_its_end(tmp_path):
             states.add(told["state"])
             assert told["done"] + told["failed"] <= 6
 
-        making = Making(tmp_path / "set", own=False, backend="numpy", wait_s=LONG_S)
         campaign = Campaign(make, 6, keep="folder", title="Walls")
-        connect = lambda *_: nullcontext(client)  # noqa: E731
-        run = make_dataset(campaign, making, connect, nullcontext(look), print, live)
+        output = DataSetOutput(tmp_path / "set", campaign)
+        options = RunOptions(client=client, backend="numpy", folder=tmp_path / "set" / "run")
+        run = Conductor(campaign, options, output, Screen(look), live)()
         assert (run.done, len(run.failed)) == (5, 1)
         told = ask(live.page.url, "jobs")
         assert (told["done"], told["failed"], told["over"]) == (5, 1, True)

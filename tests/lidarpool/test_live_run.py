@@ -4,13 +4,12 @@ import subprocess
 import sys
 import time
 import urllib.request
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
 import trimesh
 from distributed import Client
-from lidarpool.run.job import Job
 from tests.clusters import thread_cluster
 from tests.lidarpool.committing import commit
 from tests.pages import ask
@@ -20,9 +19,13 @@ from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
 from lidarpool.live.live_job import LiveJob
 from lidarpool.live.live_page import LivePage, live_page
-from lidarpool.run.conductor import conducted
+from lidarpool.run.conductor import Conductor, Kept
+from lidarpool.run.jobs import OneJob
+from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress
+from lidarpool.run.screen import Screen
 from lidarpool.run.store import RunStore
+from lidarpool.scenario.job import Job
 from lidarpool.scene.mesh import Mesh
 
 LONG_S = 120.0
@@ -31,17 +34,17 @@ SCENE = Scene.from_meshes([Mesh("Wall", WALL.vertices, WALL.faces)])
 WETNESS = Column("wetness", "float32", "%", "how wet it is", source="intensity")
 
 
-def make_job(scans: int) -> Job:
+def make_job(scans: int) -> OneJob:
     """Make a survey from two poses, 1 m and 5 m up, in cells of half a metre."""
     poses = [(0, 0, 1), (0, 0, 5)]
-    return Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5))
+    return OneJob(Job(SCENE, Survey(Sensor.grid(), poses, steps=scans // 2, precision_m=0.5)))
 
 
 @contextmanager
 def shown(store: RunStore):
     """Yield the page of a run that nobody looks at."""
     with live_page(port=0, browser=False) as live:
-        live.begun(store)
+        live.begun(store.only)
         yield live
 
 
@@ -66,35 +69,35 @@ def displayed(live: LivePage) -> int:
 
 def test_points_are_bounded_and_even_and_hits_exact_where_all_parts_are_read():
     store = RunStore(make_job(100))
-    live = LiveJob(store, most=500)
+    live = LiveJob(store.only, most=500)
     for scan in range(100):
         commit(store, scan, [33], [scan % 10], [165])
-        live.add([store.db.part_of(scan)])
+        live.add([store.only.parts.part_of(scan)])
         live.gather()
     assert 150 < len(live.cloud) <= 500
     by_tenth = np.histogram(live.cloud["scan"], bins=10, range=(0, 100))[0]
     assert by_tenth.min() > 0.3 * by_tenth.mean()
-    assert np.array_equal(live.hit_counts(), store.hit_counts())
+    assert np.array_equal(live.hit_counts(), store.only.hit_counts())
 
 
 def test_a_part_that_cannot_be_read_is_left_out_and_the_others_are_shown():
     store = RunStore(make_job(4))
-    live = LiveJob(store)
+    live = LiveJob(store.only)
     for scan in range(3):
         commit(store, scan, [5], [7], [25])
-    store.storage.remove([store.db.part_of(1).name])
-    live.add(store.db.ordered)
+    store.storage.remove([store.only.parts.part_of(1).name])
+    live.add(store.only.parts.ordered)
     live.gather()
     assert len(live.cloud) == 10
 
 
 def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
     job = make_job(100)
-    first = RunStore(job, tmp_path / "run")
+    first = RunStore(job, place=tmp_path / "run")
     for scan in range(60):
         commit(first, scan, [10], [7], [50])
     first.db.close()
-    store = RunStore(job, tmp_path / "run", resume=True)
+    store = RunStore(job, place=tmp_path / "run", resume=True)
     with shown(store) as live:
         # Before there is a cluster, what is left of the first is there to see.
         told = news(live)
@@ -107,8 +110,8 @@ def test_a_resumed_run_shows_what_the_earlier_one_has_left(tmp_path):
 def test_a_run_is_watched_from_its_first_part_to_its_path():
     planning = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=2, iterations=20)
     survey = Survey(poses=[(0, 0, 1), (0, 0, 3)], columns=["intensity", WETNESS])
-    job = Job(SCENE, survey, planning, backend="numpy")
-    seen, busy, scans, words = [], set(), [], []
+    job = OneJob(Job(SCENE, survey, planning))
+    seen, busy, scans = [], set(), []
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
         Client(cluster, set_as_default=False) as client,
@@ -120,17 +123,10 @@ def test_a_run_is_watched_from_its_first_part_to_its_path():
             seen.append(progress)
             busy.update(label.split(",")[0] for label, *_ in news(live)["slots"])
 
-        with conducted(
-            RunStore(job),
-            lambda waiting: nullcontext(client),
-            own=False,
-            progress=nullcontext(show),
-            page=nullcontext(live),
-            tell=words.append,
-            on_frame=lambda frame: scans.append(frame.scan),
-        ) as (result, workers):
-            live.finish(result.seconds, result)
-        assert (scans, workers) == ([*range(survey.scan_count)], None)
+        options, on_frame = RunOptions(client=client, backend="numpy"), scans.append
+        run = Conductor(job, options, Kept(), Screen(show), live, lambda f: on_frame(f.scan))
+        result = run()
+        assert scans == [*range(survey.scan_count)]
         told = news(live)
         assert (told["over"], told["points"]) == (True, len(result.points))
         assert told["state"] == "done"

@@ -12,7 +12,6 @@ from tests.lidarpool.casting import cast_between
 from tests.lidarpool.test_echoes import beam_along_x, cast, wall
 
 from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
-from lidarpool.columns.parts import pack, unpack
 from lidarpool.columns.table import AXES, CAUSES, SCAN
 from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.report.cloud_numbers import CountedCloud
@@ -233,7 +232,7 @@ def test_what_does_not_fit_together_is_refused():
 def cloud_of(made, scene=None):
     """Cloud of all scans of a survey, as its part has it."""
     rig = Rig(scene or fence(), made, "numpy")
-    part = unpack(bytes(pack(columns_of(list(rig.cast(0, made.scan_count))))))
+    part = columns_of(list(rig.cast(0, made.scan_count)))
     table = (SCAN, *(c for c in made.stored_columns if c not in AXES and c.name != WAVEFORM))
     return part.cloud(table, made.precision_m, np.zeros(3))
 
