@@ -25,8 +25,6 @@ from ..run.job_points import listed
 from ..run.result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, remove_run
 from ..scenario.campaign import Campaign, hashes
-from .campaign_report import write_card
-from .sweep_picture import draw_sweep
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
@@ -147,6 +145,9 @@ class DataSetOutput(Output[CampaignRun]):
 
     def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
         """Write what all jobs share, and last what says that the data set is complete."""
+        from .campaign_report import write_card  # Matplotlib takes as long as all other imports
+        from .sweep_picture import draw_sweep
+
         campaign, place = self.campaign, self.dataset.place
         made: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         made |= {"backend": store.backend, "sensors": run.sensors}
