@@ -19,11 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from distributed import Client
+from lidarpool.run.job import Job
 
 from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
-from lidarpool.run.job import Job
-from lidarpool.run.local import local_cluster
+from lidarpool.run.connection import local_cluster
 from lidarpool.run.page import Page
 from lidarpool.run.result import RunResult
 from lidarpool.run.run import drive

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from lidarpool.run.job import Job
 from tests.lidarpool.casting import cast_between
 
 from lidarpool import (
@@ -20,7 +21,6 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.run.jobs import identity_of
-from lidarpool.run.job import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import Returns

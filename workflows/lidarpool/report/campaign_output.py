@@ -133,9 +133,8 @@ class DataSetOutput(Output[CampaignRun]):
         """Write what all jobs share, and remove the run unless jobs have failed."""
         store, cast = conductor.store, conductor.run
         seconds = time.monotonic() - conductor.started
-        run = CampaignRun.of(store.rows(), seconds, store.resumed)
-        stages = cast.stages if cast else ()
-        run = replace(run, stages=stages, notes=tuple(conductor.notes), sensors=store.sensors)
+        more = {"stages": cast.stages if cast else (), "notes": tuple(conductor.notes)}
+        run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         self._write_shared(store, run)
         if run.failed:
             store.save(now=True)

@@ -16,7 +16,7 @@ from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from ..base.errors import LidarpoolError
 from ..pipeline import GPU, LIDAR, OTHER
 from ..scenario.job import Job
-from .checks import check_workers, find_workers, gpu_note, want_nothing
+from .checks import check_workers, find_workers, gpu_note
 from .connection import connected, local_client, started_client
 from .options import RunOptions
 from .screen import Screen
@@ -68,7 +68,14 @@ class Cluster:
         self.client, self.options, self._screen = client, options, screen
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
+        if client.asynchronous:
+            raise LidarpoolError(
+                "The client is asynchronous: give one made without asynchronous=True."
+            )
+        self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
+            for name, slots in needed.items():  # partitions may grow with their work
+                self.partitions[name].want(max(slots, left) if name == GPU else slots)
             pool, casting, backend, software = find_workers(
                 client,
                 needed,
@@ -76,12 +83,11 @@ class Cluster:
                 store.advice,
                 store.casting if store.kept else {},
                 waiting,
-                left,
                 writing=store.only is None,
             )
             store.cast_with(backend, software)
         except LidarpoolError:
-            want_nothing(client, (GPU, LIDAR, OTHER))
+            self._want_nothing()
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
@@ -96,6 +102,13 @@ class Cluster:
         note = gpu_note(pool, casting, backend)
         self.notes: list[str] = [note] if note else []
         self._callers_error: BaseException | None = None
+
+    def _want_nothing(self) -> None:
+        """Let partitions shrink that have grown for the run."""
+        if self.client.status == "running":
+            with suppress(PoolError, OSError):
+                for partition in self.partitions.values():
+                    partition.want(0)
 
     def _told_lost(self) -> LidarpoolError:
         return LidarpoolError(
@@ -162,7 +175,7 @@ class Cluster:
                 raise self._told_lost() from error
             raise
         finally:
-            want_nothing(self.client, self.partitions)
+            self._want_nothing()
 
     def _is_lost(self, error: BaseException) -> bool:
         """Whether the scheduler is gone: a call may fail a moment before the client knows."""

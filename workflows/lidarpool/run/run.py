@@ -338,17 +338,14 @@ class Run:
 
     def _tell_progress(self, show: Show, seconds: float) -> None:
         waits_for = LIDAR if self._driver.waiting else ""
-        now = self._progress(seconds, waits_for)
+        now = replace(self._progress(), seconds=seconds, waits_for=waits_for)
         self._cluster.call(show, now)
         self._cluster.call(lambda progress: self._page.on_progress(progress, self.under_way), now)
 
-    def _progress(self, seconds: float, waits_for: str) -> Progress:
-        if self._writer is not None:
-            jobs, done = self._store.jobs.count, self._store.db.ended_count
-            return Progress(seconds=seconds, waits_for=waits_for, jobs=jobs, jobs_done=done)
-        points = self._store.only
-        assert points is not None, "of a single job"
-        progress = replace(points.progress(), seconds=seconds, waits_for=waits_for)
+    def _progress(self) -> Progress:
+        if (points := self._store.only) is None:
+            return Progress(jobs=self._store.jobs.count, jobs_done=self._store.db.ended_count)
+        progress = points.progress()
         if self._trials is not None:
             progress = replace(progress, trials_done=len(self._trials.trials))
         if (state := self._driver.jobs.get(points.job.number, self.kept)) is None:
