@@ -243,11 +243,6 @@ def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
     return made
 
 
-def row_of(place: Storage, number: int) -> JobRow | None:
-    """Row of a job in the table of a data set; None if it is not there."""
-    return next((row for row in read_table(place) if row.number == number), None)
-
-
 def _own_files(out: Storage, *, begun: bool) -> list[str]:
     """Name the files of a data set, which has begun or is empty.
 

@@ -16,7 +16,7 @@ from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from ..base.errors import LidarpoolError
 from ..pipeline import GPU, LIDAR, OTHER
 from ..scenario.job import Job
-from .checks import check_workers, find_workers, gpu_note
+from .checks import check_workers, find_workers, gpu_note, slots_needed
 from .connection import connected, local_client, started_client
 from .options import RunOptions
 from .screen import Screen
@@ -49,23 +49,27 @@ def client_of(
 
 
 class Cluster:
-    """A cluster that was checked for some jobs, which need slots of partitions.
+    """The cluster that is there, or started, once it was checked for jobs such as `first`.
 
-    `store` says what earlier runs cast with, and `left` how many scans are to be cast.
-    LidarpoolError if it lacks something.
+    `store` says which are left, and what earlier runs cast with; `enter` has the cluster left or
+    stopped in the end. LidarpoolError if it lacks something.
     """
 
     def __init__(
         self,
-        client: Client,
+        first: Job,
         store: RunStore,
         options: RunOptions,
-        needed: Mapping[str, int],
-        left: int,
-        waiting: Waiting,
         screen: Screen,
+        enter: Callable[[AbstractContextManager[Client]], Client],
     ) -> None:
-        self.client, self.options, self._screen = client, options, screen
+        writing = store.only is None
+        needed = slots_needed(options, planning=first.planning is not None, writing=writing)
+        if options.cluster is not None:
+            options.cluster.require(needed)
+        waiting = Waiting(options.wait_s, screen.tell)
+        self.client = client = enter(client_of(options, needed, waiting, screen))
+        self.options, self._screen = options, screen
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
         if client.asynchronous:
@@ -74,6 +78,8 @@ class Cluster:
             )
         self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
+            left = first.survey.scan_count * (store.jobs.count - store.db.ended_count)
+            left -= store.only.resumed if store.only else 0
             for name, slots in needed.items():  # partitions may grow with their work
                 self.partitions[name].want(max(slots, left) if name == GPU else slots)
             pool, casting, backend, software = find_workers(
@@ -83,7 +89,7 @@ class Cluster:
                 store.advice,
                 store.casting if store.kept else {},
                 waiting,
-                writing=store.only is None,
+                writing=writing,
             )
             store.cast_with(backend, software)
         except LidarpoolError:

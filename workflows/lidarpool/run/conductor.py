@@ -15,8 +15,7 @@ from ..pipeline import Frame
 from ..pipeline.database import FILE
 from ..plan import best
 from ..simulator.world import check_backend_here
-from .checks import slots_needed
-from .cluster import Cluster, client_of
+from .cluster import Cluster
 from .jobs import JobMaker, Jobs, Made, OneJob
 from .options import RunOptions
 from .page import Page
@@ -24,7 +23,6 @@ from .result import RunResult
 from .run import Run
 from .screen import Screen
 from .store import RunStore, remove_run
-from .watch import Waiting
 
 R = TypeVar("R")
 
@@ -149,18 +147,10 @@ class Conductor(Generic[R]):
     def _reach_cluster(self) -> None:
         if self._first is None:
             return
-        job, options, store = self._first.job, self.options, self.store
-        if options.own:
-            check_backend_here(store.backend or options.backend, store.advice)
-        writing = self.output.dataset is not None
-        needed = slots_needed(options, planning=job.planning is not None, writing=writing)
-        if options.cluster is not None:
-            options.cluster.require(needed)
-        waiting = Waiting(options.wait_s, self.screen.tell)
-        client = self.cluster_stack.enter_context(client_of(options, needed, waiting, self.screen))
-        jobs_left = self.jobs.count - store.db.ended_count
-        left = job.survey.scan_count * jobs_left - (store.only.resumed if store.only else 0)
-        self.cluster = Cluster(client, store, options, needed, left, waiting, self.screen)
+        if self.options.own:
+            check_backend_here(self.store.backend or self.options.backend, self.store.advice)
+        job, enter = self._first.job, self.cluster_stack.enter_context
+        self.cluster = Cluster(job, self.store, self.options, self.screen, enter)
         self.page.follow(self.cluster.partitions)
 
     def _cast_what_is_left(self) -> None:
