@@ -504,7 +504,7 @@ def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, fold
     points = store.points_of(job)
     add(store, 0, 2, job)
     if change != "of unknown content":
-        store.identify(points)
+        store.save()
     store.db.close()
     again, job = campaign(folder, height=2.0 if change == "another height" else 1.0, resume=True)
     same = change == "none"

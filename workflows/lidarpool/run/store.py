@@ -304,12 +304,6 @@ class RunStore:
                 points.resumed = 0
         return points
 
-    def identify(self, points: JobPoints) -> None:
-        """Keep what a job is made of, of which parts are committed and others are not yet."""
-        if not isinstance(self.jobs, OneJob) and not points.identified:
-            points.identified = True
-            self.db.set_hash(points.job.number, _hash_of(points.job))
-
     def end(self, rows: Sequence[JobRow]) -> None:
         """Commit that jobs have ended."""
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
@@ -343,10 +337,15 @@ class RunStore:
     # -- the end -----------------------------------------------------------------------------
 
     def save(self, *, now: bool = False) -> None:
-        """Keep how many frames were handed out; where it is time or `now`, copy the database.
+        """Keep how many frames were handed out, and what jobs are made of that are partly cast.
 
-        LidarpoolError if that fails, or another run has taken over.
+        Where it is time or `now`, copy the database. LidarpoolError if that fails, or another run
+        has taken over.
         """
+        for number, points in () if isinstance(self.jobs, OneJob) else self._points.items():
+            if points.parts.scans_done and not points.complete and not points.identified:
+                points.identified = True
+                self.db.set_hash(number, _hash_of(points.job))
         self.db.save_frames()
         if self._remote:
             self._remote.save(self.db, now=now)
