@@ -23,8 +23,8 @@ from distributed import Client
 from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.run.conductor import Conductor, Kept
+from lidarpool.run.connection import local_cluster
 from lidarpool.run.jobs import OneJob
-from lidarpool.run.local import local_cluster
 from lidarpool.run.options import RunOptions
 from lidarpool.run.page import Page
 from lidarpool.run.screen import Screen

@@ -22,7 +22,7 @@ import numpy as np
 from distributed import Client
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
-from lidarpool.run.local import local_cluster
+from lidarpool.run.connection import local_cluster
 from lidarpool.scene.mesh import Mesh
 
 STAGES = ("generate", "intersect", "sort", "collect")

@@ -15,7 +15,7 @@ from distributed import Client, SpecCluster
 
 from lidarpool.base.fork_server import start_fork_server
 from lidarpool.base.tracing import trace_to
-from lidarpool.run.local import local_cluster
+from lidarpool.run.connection import local_cluster
 from poolpart.internals import forked_workers
 
 from .events import Board, ChaosPlugin

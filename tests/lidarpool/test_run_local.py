@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.run.checks import gpu_note
-from lidarpool.run.local import default_workers, local_cluster
+from lidarpool.run.connection import default_workers, local_cluster
 from poolpart import PoolError, WorkerInfo
 
 

@@ -23,7 +23,7 @@ import lidarpool.report.pictures
 from lidarpool import Cloud
 from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
-from lidarpool.run.local import local_cluster
+from lidarpool.run.connection import local_cluster
 from poolpart import fetch_available
 from poolpart.pipe import pipes_of
 

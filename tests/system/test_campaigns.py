@@ -22,7 +22,7 @@ import pytest
 from distributed import Client
 from tests.clusters import thread_cluster
 
-import lidarpool.run.conductor
+import lidarpool.run.cluster
 import lidarpool.run.writer
 from lidarpool import Campaign, Job, LidarpoolError, Scene, Sensor, Survey, simulate
 from lidarpool.base.errors import explained
@@ -497,7 +497,7 @@ def test_a_campaign_whose_only_job_was_harmed_goes_on(
         path.unlink()
     for _ in range(2):  # what is to be done again is forgotten first, and nothing else is there
         with monkeypatch.context() as patched, pytest.raises(LidarpoolError, match="no cluster"):
-            patched.setattr(lidarpool.run.conductor, "client_of", refuse)
+            patched.setattr(lidarpool.run.cluster, "client_of", refuse)
             unwritten.run(tmp_path / "ds", client=client, resume=True)
     assert unwritten.run(tmp_path / "ds", client=client, resume=True).done == 3
     (tmp_path / "ds" / "run").mkdir()  # a run that was killed as it removed itself
@@ -808,7 +808,7 @@ def test_jobs_are_written_here_when_no_worker_has_a_slot_left(files, whole, monk
     """Its last slots went with a worker that does not come back."""
     monkeypatch.setattr(lidarpool.run.writer, "BEGIN_S", 0.05)
     needed = {"GPU": 1, "LIDAR": 3}
-    monkeypatch.setattr(lidarpool.run.conductor, "slots_needed", lambda *_, **__: needed)
+    monkeypatch.setattr(lidarpool.run.cluster, "slots_needed", lambda *_, **__: needed)
     with (
         thread_cluster({"GPU": 1}, {"LIDAR": 4}) as cluster,
         Client(cluster, set_as_default=False) as client,

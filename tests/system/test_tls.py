@@ -12,8 +12,7 @@ from distributed import Client, Security
 from tests.clusters import thread_cluster
 
 from lidarpool import LidarpoolError
-from lidarpool.run.connection import TlsFiles, connected
-from lidarpool.run.local import local_cluster
+from lidarpool.run.connection import TlsFiles, connected, local_cluster
 from lidarpool.run.watch import Waiting
 from poolpart import Pool
 

@@ -142,6 +142,5 @@ def simulate(
     if client is None:  # before anything is made in the folder
         check_backend_here(backend)
     with page_of(jobs, live) as page:
-        screen, on_frame = Screen(on_progress), on_frame or (lambda frame: None)
-        result = Conductor(jobs, options, Kept(), screen, page, on_frame)()
+        result = Conductor(jobs, options, Kept(), Screen(on_progress), page, on_frame)()
     return Result(**{field.name: getattr(result, field.name) for field in fields(result)})

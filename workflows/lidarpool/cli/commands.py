@@ -197,6 +197,7 @@ def _run(
         if given.get("cluster") is not None:
             given["cluster"] = ClusterFile.load(given["cluster"])
         terminal = Terminal(quiet, verbose, as_json)
+        set_logs(verbose)
         given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER) if resumable else None}
         if len(paths) > 1 or (paths and is_campaign(paths[0])):
             several = len(paths) > 1

@@ -33,8 +33,8 @@ from ..pipeline.database import FILE
 from ..pipeline.policies import most_scans
 from ..report.output import ROOM_BYTES, SurveyOutput
 from ..run.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
+from ..run.connection import default_workers
 from ..run.jobs import identity_of
-from ..run.local import default_workers
 from ..run.options import RunOptions
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice

@@ -16,14 +16,13 @@ from ..base.storage import Storage
 from ..base.words import counted
 from ..export.dataset import DataSet
 from ..export.folder import local_result, output_place
-from ..export.jobs import Tally
+from ..export.jobs import Tally, read_table
 from ..live.pages import page_of
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
     DataSetOutput,
     check_same,
     failures,
-    row_of,
     verify,
 )
 from ..report.output import CLOUD, SurveyOutput
@@ -41,7 +40,6 @@ from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
-from .logs import set_logs
 from .options import show
 from .terminal import Terminal
 
@@ -59,7 +57,6 @@ def run_scenario(
 
     LidarpoolError if the run fails; notes of the error say what was kept.
     """
-    set_logs(terminal.verbose)
     options = options_of(scenario.pool, **given)
     if options.own:  # before reading the scene, which may take long
         check_backend_here(options.backend)
@@ -96,7 +93,6 @@ def _run_survey(
 
 def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **given: Any) -> None:
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
-    set_logs(terminal.verbose)
     if only:
         raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
     options = options_of(campaign.pool, **given)
@@ -120,7 +116,6 @@ def run_job(
     must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
     other software, or its files there are damaged.
     """
-    set_logs(terminal.verbose)
     place, name = Storage.at(given["out"]), campaign.name(number)
     dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
     of_dataset = CAMPAIGN_FILE in place.entries()
@@ -134,10 +129,11 @@ def run_job(
     built, job = build(scenario, plans=False), campaign.job(number, columns=dataset.columns)
 
     def compare(result: RunResult) -> str:
-        row = row_of(place, number) if of_dataset else None
-        if row is None or row.error:
+        rows = read_table(place) if of_dataset else ()
+        known = [row.sha256 for row in rows if row.number == number and row.done]
+        if not known:
             return ""
-        if Tally.of(result.points).sha256 != row.sha256:
+        if Tally.of(result.points).sha256 not in known:
             raise LidarpoolError(
                 f"job {name} has other points than those in {place}: files that it is "
                 "made of have changed, such as images of a mesh."

@@ -131,9 +131,8 @@ class DataSetOutput(Output[CampaignRun]):
         """Write what all jobs share, and remove the run unless jobs have failed."""
         store, cast = conductor.store, conductor.run
         seconds = time.monotonic() - conductor.started
-        run = CampaignRun.of(store.rows(), seconds, store.resumed)
-        stages = cast.stages if cast else ()
-        run = replace(run, stages=stages, notes=tuple(conductor.notes), sensors=store.sensors)
+        more = {"stages": cast.stages if cast else (), "notes": tuple(conductor.notes)}
+        run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         self._write_shared(store, run)
         if run.failed:
             store.save(now=True)
@@ -243,11 +242,6 @@ def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
                 "its own with --out."
             )
     return made
-
-
-def row_of(place: Storage, number: int) -> JobRow | None:
-    """Row of a job in the table of a data set; None if it is not there."""
-    return next((row for row in read_table(place) if row.number == number), None)
 
 
 def _own_files(out: Storage, *, begun: bool) -> list[str]:

@@ -107,9 +107,11 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """Write the result, and remove the run."""
         result = conductor.result()
         in_pieces = any(one.in_pieces for one in self.formats)
-        workers = conductor.lidar_workers() if in_pieces else None
+        workers = None
         if not in_pieces:
-            conductor.leave_cluster()
+            conductor.cluster_stack.close()
+        elif conductor.cluster is not None:
+            workers = LidarWorkers(conductor.cluster)
         conductor.page.finish(result.seconds, result)
         if note := self.judge(result):
             result = replace(result, notes=(*result.notes, note))

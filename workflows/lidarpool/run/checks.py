@@ -6,14 +6,12 @@ import platform
 import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from contextlib import suppress
 from functools import partial
 from typing import Any
 
 from distributed import Client
 
 from poolpart import (
-    Partition,
     Pool,
     PoolError,
     WorkerInfo,
@@ -52,7 +50,6 @@ def find_workers(
     advice: str = AUTO_TAKES,
     earlier: Mapping[str, str] | None = None,
     waiting: Waiting | None = None,
-    left: int | None = None,
     *,
     writing: bool = False,
 ) -> tuple[Pool, list[WorkerInfo], str, dict[str, str]]:
@@ -60,17 +57,11 @@ def find_workers(
 
     `wanted` is a backend, `advice` ends the message if it is not available, and `earlier` is the
     software that a resumed run was cast with. Workers that are missing or just died, or whose jobs
-    are in the queue, are waited for as long as `waiting` says. If scans are `left` to be cast,
-    slots are wanted of partitions that grow with their work. `writing` says that jobs are written,
-    too.
+    are in the queue, are waited for as long as `waiting` says. `writing` says that jobs are
+    written, too.
 
     LidarpoolError if workers, slots `needed` or the backend are missing, or versions differ.
     """
-    if client.asynchronous:
-        raise LidarpoolError("The client is asynchronous: give one made without asynchronous=True.")
-    waiting = waiting or Waiting()
-    for name, slots in needed.items() if left is not None else ():
-        Partition(name, client).want(max(slots, left or 0) if name == GPU else slots)
     while True:
         looked = time.monotonic()
         try:
@@ -81,25 +72,17 @@ def find_workers(
             return pool, casting, backend, casts
         except TooFewWorkersError as error:
             coming = 0  # jobs: a queue does not say which of them have died
-            if left is not None:
+            if waiting is not None:
                 coming = sum(look_for_tasks(client, name).coming for name in needed)
             # One that has just died takes half a minute not to answer, which is no waiting: what
             # counts is when the last look began.
-            if not waiting.left(looked):
+            if waiting is None or not waiting.left(looked):
                 if coming:
                     error.add_note(f"{queued(coming)}: if they wait, give --wait more time.")
                 raise
             why = str(error).partition(": start ")[0] + (f"; {queued(coming)}" if coming else "")
             waiting.tell("workers", why)  # who waits has started them
         time.sleep(LOOK_EVERY_S)
-
-
-def want_nothing(client: Client, names: Iterable[str]) -> None:
-    """Let partitions shrink that have grown for a run."""
-    if client.status == "running":
-        with suppress(PoolError, OSError):
-            for name in names:
-                Partition(name, client).want(0)
 
 
 def check_memory(job: Job, tasks: TaskOptions, backend: str, room: float, worker: str) -> None:

@@ -16,7 +16,7 @@ from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 from ..base.errors import LidarpoolError
 from ..pipeline import GPU, LIDAR, OTHER
 from ..scenario.job import Job
-from .checks import check_workers, find_workers, gpu_note, want_nothing
+from .checks import check_workers, find_workers, gpu_note, slots_needed
 from .connection import connected, local_client, started_client
 from .options import RunOptions
 from .screen import Screen
@@ -49,26 +49,39 @@ def client_of(
 
 
 class Cluster:
-    """A cluster that was checked for some jobs, which need slots of partitions.
+    """The cluster that is there, or started, once it was checked for jobs such as `first`.
 
-    `store` says what earlier runs cast with, and `left` how many scans are to be cast.
-    LidarpoolError if it lacks something.
+    `store` says which are left, and what earlier runs cast with; `enter` has the cluster left or
+    stopped in the end. LidarpoolError if it lacks something.
     """
 
     def __init__(
         self,
-        client: Client,
+        first: Job,
         store: RunStore,
         options: RunOptions,
-        needed: Mapping[str, int],
-        left: int,
-        waiting: Waiting,
         screen: Screen,
+        enter: Callable[[AbstractContextManager[Client]], Client],
     ) -> None:
-        self.client, self.options, self._screen = client, options, screen
+        writing = store.only is None
+        needed = slots_needed(options, planning=first.planning is not None, writing=writing)
+        if options.cluster is not None:
+            options.cluster.require(needed)
+        waiting = Waiting(options.wait_s, screen.tell)
+        self.client = client = enter(client_of(options, needed, waiting, screen))
+        self.options, self._screen = options, screen
         # For errors about a lost cluster; a client that was never connected is refused below.
         self.address: str = getattr(client.scheduler, "address", "")
+        if client.asynchronous:
+            raise LidarpoolError(
+                "The client is asynchronous: give one made without asynchronous=True."
+            )
+        self.partitions = {name: Partition(name, client) for name in (GPU, LIDAR, OTHER)}
         try:
+            left = first.survey.scan_count * (store.jobs.count - store.db.ended_count)
+            left -= store.only.resumed if store.only else 0
+            for name, slots in needed.items():  # partitions may grow with their work
+                self.partitions[name].want(max(slots, left) if name == GPU else slots)
             self._pool, self._casting, self.backend, self.software = find_workers(
                 client,
                 needed,
@@ -76,14 +89,13 @@ class Cluster:
                 store.advice,
                 store.casting if store.kept else {},
                 waiting,
-                left,
-                writing=store.only is None,
+                writing=writing,
             )
             store.cast_with(self.backend, self.software)
             if store.only is not None:  # others are checked one by one
                 self.check(store.only.job)
         except LidarpoolError:
-            want_nothing(client, (GPU, LIDAR, OTHER))
+            self._want_nothing()
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
@@ -96,6 +108,13 @@ class Cluster:
         note = gpu_note(self._pool, self._casting, self.backend)
         self.notes: list[str] = [note] if note else []
         self._callers_error: BaseException | None = None
+
+    def _want_nothing(self) -> None:
+        """Let partitions shrink that have grown for the run."""
+        if self.client.status == "running":
+            with suppress(PoolError, OSError):
+                for partition in self.partitions.values():
+                    partition.want(0)
 
     def _told_lost(self) -> LidarpoolError:
         return LidarpoolError(
@@ -162,7 +181,7 @@ class Cluster:
                 raise self._told_lost() from error
             raise
         finally:
-            want_nothing(self.client, self.partitions)
+            self._want_nothing()
 
     def _is_lost(self, error: BaseException) -> bool:
         """Whether the scheduler is gone: a call may fail a moment before the client knows."""

@@ -15,17 +15,14 @@ from ..pipeline import Frame
 from ..pipeline.database import FILE
 from ..plan import best
 from ..simulator.world import check_backend_here
-from .checks import slots_needed
-from .cluster import Cluster, client_of
+from .cluster import Cluster
 from .jobs import JobMaker, Jobs, Made, OneJob
 from .options import RunOptions
 from .page import Page
-from .ranges import LidarWorkers
 from .result import RunResult
 from .run import Run
 from .screen import Screen
 from .store import RunStore, remove_run
-from .watch import Waiting
 
 R = TypeVar("R")
 
@@ -76,12 +73,12 @@ class Conductor(Generic[R]):
         output: Output[R],
         screen: Screen,
         page: Page,
-        on_frame: Callable[[Frame], None] = lambda frame: None,
+        on_frame: Callable[[Frame], None] | None = None,
     ) -> None:
         self.jobs, self.options, self.output = jobs, options, output
         self.screen, self.page, self._on_frame = screen, page, on_frame
         self.started = time.monotonic()
-        self.stack, self._cluster_stack = ExitStack(), ExitStack()
+        self.stack, self.cluster_stack = ExitStack(), ExitStack()  # the latter of the cluster
         self.store: RunStore
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
         self.run: Run | None = None
@@ -132,7 +129,7 @@ class Conductor(Generic[R]):
         if self.store.only is not None:
             self.page.begun(self.store.only)
         self.output.look(self)
-        self.stack.enter_context(self._cluster_stack)
+        self.stack.enter_context(self.cluster_stack)
 
     def _make_first_job(self) -> None:
         """Wait for a job that can be made."""
@@ -150,18 +147,10 @@ class Conductor(Generic[R]):
     def _reach_cluster(self) -> None:
         if self._first is None:
             return
-        job, options, store = self._first.job, self.options, self.store
-        if options.own:
-            check_backend_here(store.backend or options.backend, store.advice)
-        writing = self.output.dataset is not None
-        needed = slots_needed(options, planning=job.planning is not None, writing=writing)
-        if options.cluster is not None:
-            options.cluster.require(needed)
-        waiting = Waiting(options.wait_s, self.screen.tell)
-        client = self._cluster_stack.enter_context(client_of(options, needed, waiting, self.screen))
-        jobs_left = self.jobs.count - store.db.ended_count
-        left = job.survey.scan_count * jobs_left - (store.only.resumed if store.only else 0)
-        self.cluster = Cluster(client, store, options, needed, left, waiting, self.screen)
+        if self.options.own:
+            check_backend_here(self.store.backend or self.options.backend, self.store.advice)
+        job, enter = self._first.job, self.cluster_stack.enter_context
+        self.cluster = Cluster(job, self.store, self.options, self.screen, enter)
         self.page.follow(self.cluster.partitions)
 
     def _cast_what_is_left(self) -> None:
@@ -177,7 +166,8 @@ class Conductor(Generic[R]):
 
     def _frame(self, frame: Frame) -> None:
         self.page.on_frame(frame)
-        self._on_frame(frame)
+        if self._on_frame is not None:
+            self._on_frame(frame)
 
     # -- for outputs -------------------------------------------------------------------------
 
@@ -215,10 +205,6 @@ class Conductor(Generic[R]):
             replayed=run.kept.offered_again if run and run.kept else 0,
         )
 
-    def lidar_workers(self) -> LidarWorkers | None:
-        """Return workers that write formats of many files; None if there is no cluster."""
-        return None if self.cluster is None else LidarWorkers(self.cluster)
-
     def result_is_in(self, place: object) -> None:
         """Have any later error or interrupt say that the result is complete."""
 
@@ -227,7 +213,3 @@ class Conductor(Generic[R]):
                 error.add_note(f"The result in {place} is complete.")
 
         self.stack.push(note)
-
-    def leave_cluster(self) -> None:
-        """Stop or leave the cluster, which is not needed any more."""
-        self._cluster_stack.close()

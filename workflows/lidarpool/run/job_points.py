@@ -125,7 +125,6 @@ class JobPoints:
             points=parts.point_count,
             trials=self.job.trials,
             trials_done=len(parts.trials),
-            seconds=0.0,
         )
 
     def points(self) -> StoredCloud:

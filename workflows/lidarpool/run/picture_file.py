@@ -32,7 +32,8 @@ PICTURE_FILE = "pictures.npz"
 MODELS_MOST = 4  # sensors named in a picture
 PLACES_MOST = 1000  # positions of a moving sensor or actor
 _FORMAT = 6
-_TRACK = ("times", "positions", "quaternions")  # of an actor
+# {name in the file: field of an actor's track}
+_TRACK = {"times": "times_s", "positions": "positions", "quaternions": "quaternions"}
 _PLAN_NUMBERS = ("length", "shortest_possible", "clearance", "trial", "trials")
 
 
@@ -169,8 +170,7 @@ class Pictured:
             track = actor.trajectory
             if not isinstance(track, Track):
                 raise TypeError(f"the trajectory of actor {actor.name!r} is not sampled")
-            values = zip(_TRACK, (track.times_s, track.positions, track.quaternions), strict=True)
-            arrays |= {f"actor{number}_{part}": value for part, value in values}
+            arrays |= {f"actor{number}_{n}": getattr(track, field) for n, field in _TRACK.items()}
             arrays[f"actor{number}_absent"] = track.beyond == "absent"
         meshes, arrays["actor_mesh"] = shapes_of(self.scene.actors)
         for number, mesh in enumerate(meshes):
@@ -229,16 +229,16 @@ class Pictured:
         counts = arrays["hit_counts"]
         if counts.shape != (scene.triangles,):
             raise ValueError(f"hit_counts of {counts.shape} for {scene.triangles} triangles")
-        rays, duration = arrays["sample_rays"], float(arrays["duration_ns"])
-        own = [Column(**column) for column in names["own"]]
-        rest = duration, own, arrays.get("reflectance"), names["coordinates"], names["triangles"]
-        if "path" not in arrays:
-            return cls(scene, sensors, counts, rays, None, None, (), *rest)
-        start, target = arrays["ends"]
-        planning = Planning(start, target, arrays["centres"], arrays["radii"])
-        numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
-        plan, trials = Plan(path=arrays["path"], **numbers), tuple(arrays["waypoints"])
-        return cls(scene, sensors, counts, rays, planning, plan, trials, *rest)
+        planning = plan = None
+        if "path" in arrays:
+            start, target = arrays["ends"]
+            planning = Planning(start, target, arrays["centres"], arrays["radii"])
+            numbers = {name: arrays[name].item() for name in _PLAN_NUMBERS}
+            plan = Plan(path=arrays["path"], **numbers)
+        rays, trials = arrays["sample_rays"], tuple(arrays.get("waypoints", ()))
+        duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
+        rest = arrays.get("reflectance"), names["coordinates"], names["triangles"]
+        return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
 
 
 def reflectances_of(scene: Scene, survey: Survey) -> Floats:

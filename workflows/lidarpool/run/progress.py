@@ -31,7 +31,7 @@ SURE_SHARE, SURE_S = 0.05, 20.0
 class Progress:
     """Counts of a run at one moment."""
 
-    seconds: float  # since the start
+    seconds: float = 0.0  # since the start
     scans: int = 0
     generated: int = 0  # scans that have passed stage 1, and so on to 4
     cast: int = 0

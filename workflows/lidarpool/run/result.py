@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cached_property
+from typing import Any
 
 from poolpart import TaskRecord
 
@@ -124,7 +125,9 @@ class CampaignRun:
     sensors: Mapping[str, str] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None) -> CampaignRun:
+    def of(
+        cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **more: Any
+    ) -> CampaignRun:
         """Sum up the rows of a campaign, all of which are of an earlier run by default."""
         failed, done, points, rays, casting = [], 0, 0, 0, 0.0
         for row in rows:
@@ -134,4 +137,4 @@ class CampaignRun:
                 done, points, rays = done + 1, points + row.points, rays + row.rays
                 casting += row.seconds
         known = done if resumed is None else resumed
-        return cls(tuple(failed), done, points, rays, casting, known, seconds)
+        return cls(tuple(failed), done, points, rays, casting, known, seconds, **more)

@@ -85,6 +85,7 @@ class Run:
         self._writer: JobWriter | None = None
         self._trials: TrialPump | None = None
         self._made: dict[int, tuple[JobPoints, Sweeps | None]] = {}  # {number: job under way}
+        self._rows: list[JobRow] = []  # of jobs that have ended, and are not yet committed
         self._scans_begun = self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
         self.kept: JobState | None = None  # the job whose parts are kept, once it is committed
@@ -109,13 +110,12 @@ class Run:
 
         LidarpoolError if something fails that all jobs need.
         """
-        rows: list[JobRow] = []
-        moved = self._admit(rows)
+        moved = self._admit()
         moved |= self._driver.step()
         for state, error in self._driver.take_ended():
             moved = True
             if error is not None:
-                self._fail(state.number, error, rows)
+                self._fail(state.number, error)
             elif self._writer is None:
                 self.kept = state
                 del self._made[state.number]
@@ -125,17 +125,17 @@ class Run:
         for files, made in self._written():
             moved = True
             if isinstance(made, JobError):
-                self._fail(files.row.number, made, rows)
+                self._fail(files.row.number, made)
             elif isinstance(made, LidarpoolError):
                 for_all = made
             else:
-                rows.append(made)
-        self._commit(rows)
+                self._rows.append(made)
+        self._commit()
         if for_all is not None:
             raise for_all
         return moved
 
-    def _admit(self, rows: list[JobRow]) -> bool:
+    def _admit(self) -> bool:
         """Take on jobs that are ready, if there is room for them."""
         moved, most = False, SPARE + 2 * self._driver.slot_count
         while self._maker and self._driver.has_room and len(self._made) < most:
@@ -143,12 +143,12 @@ class Run:
                 break
             moved = True
             if isinstance(found, JobRow):
-                rows.append(found)
+                self._rows.append(found)
             else:
-                self._begin(found, rows)
+                self._begin(found)
         return moved
 
-    def _begin(self, made: Made, rows: list[JobRow]) -> None:
+    def _begin(self, made: Made) -> None:
         points = self._store.points_of(made.job)
         self._made[made.job.number] = points, made.sweeps
         try:
@@ -156,7 +156,7 @@ class Run:
                 self._cluster.check(made.job)
             self._cast(made.job, points)
         except JobError as error:  # too large for the workers, or it cannot be pickled
-            self._fail(made.job.number, error, rows)
+            self._fail(made.job.number, error)
 
     def _cast(self, job: Job, points: JobPoints) -> None:
         cluster, on_frame = self._cluster, self.on_frame
@@ -216,14 +216,15 @@ class Run:
         slots = 0 if self._driver.lacks_slot else self._cluster.spare
         return self._writer.step(slots)
 
-    def _fail(self, number: int, error: LidarpoolError, rows: list[JobRow]) -> None:
+    def _fail(self, number: int, error: LidarpoolError) -> None:
         """Note that a job has failed; if there is only one, so has the run."""
         if isinstance(self._store.jobs, OneJob):
             raise error
-        rows.append(failed_row(self._store.jobs, number, error))
+        self._rows.append(failed_row(self._store.jobs, number, error))
 
-    def _commit(self, rows: Sequence[JobRow]) -> None:
+    def _commit(self) -> None:
         """Commit that jobs have ended, and remove what is left of them."""
+        rows, self._rows = self._rows, []
         if not rows:
             return
         left = [(row, *self._made.pop(row.number, (None, None))) for row in rows]
@@ -286,21 +287,18 @@ class Run:
         self._save()
         self._store.save(now=True)
         self._store.tidy()
-        books = [driver.book, stages]
-        if self._writer is not None:
-            books.insert(1, self._writer.book)
-            self.notes += filter(None, [self._writer.note])
-        if self._trials is not None:
-            books.insert(1, self._trials.tasks.book)
+        others = [one.tasks.book for one in (self._writer, self._trials) if one is not None]
+        books = [driver.book, *others, stages]
         self.stages = tuple(totals for book in books for totals in book.stages.values())
         self.notes += [*cluster.notes, *driver.notes]
+        if self._writer is not None and self._writer.hidden:
+            place = self._writer.dataset.place
+            self.notes.append(f"no worker of {LIDAR} sees {place}: the driver wrote the data set")
 
     def _loop(self, show: Show) -> None:
         """Step everything until all have finished."""
         driver, started, pause_s = self._driver, time.monotonic(), 0.0
-        rows: list[JobRow] = []
-        self._begin(self._first, rows)  # and its trials
-        self._commit(rows)
+        self._begin(self._first)  # and its trials
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         told = saved = float("-inf")
         while not (driver.ended and (self._trials is None or "planning" in self.times)):
@@ -332,24 +330,18 @@ class Run:
         if self._trials is not None:
             done = len(self._store.db.job(0, 0).trials)
             self._store.db.add_trials(0, self._trials.trials[done:])
-        for points, _ in self._made.values():
-            if points.parts.scans_done and not points.complete:
-                self._store.identify(points)
         self._store.save()
 
     def _tell_progress(self, show: Show, seconds: float) -> None:
         waits_for = LIDAR if self._driver.waiting else ""
-        now = self._progress(seconds, waits_for)
+        now = replace(self._progress(), seconds=seconds, waits_for=waits_for)
         self._cluster.call(show, now)
         self._cluster.call(lambda progress: self._page.on_progress(progress, self.under_way), now)
 
-    def _progress(self, seconds: float, waits_for: str) -> Progress:
-        if self._writer is not None:
-            jobs, done = self._store.jobs.count, self._store.db.ended_count
-            return Progress(seconds=seconds, waits_for=waits_for, jobs=jobs, jobs_done=done)
-        points = self._store.only
-        assert points is not None, "of a single job"
-        progress = replace(points.progress(), seconds=seconds, waits_for=waits_for)
+    def _progress(self) -> Progress:
+        if (points := self._store.only) is None:
+            return Progress(jobs=self._store.jobs.count, jobs_done=self._store.db.ended_count)
+        progress = points.progress()
         if self._trials is not None:
             progress = replace(progress, trials_done=len(self._trials.trials))
         if (state := self._driver.jobs.get(points.job.number, self.kept)) is None:

@@ -8,7 +8,7 @@ import shutil
 import tempfile
 import weakref
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ class RunStore:
         self.lasting = place is not None
         self.notes: list[str] = []  # remarks for the user
         self._gone = False
-        self.identity = here = software() | dict(jobs.identity)
+        self.identity = software() | dict(jobs.identity)
         self._remote = None
         kept = Storage.at(tempfile.mkdtemp(prefix="lidarpool-") if place is None else place)
         self.place = self._folder = kept  # that of the run, and that of its database
@@ -102,21 +102,15 @@ class RunStore:
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
         self._points: dict[int, JobPoints] = {}  # {number: of a job that is under way}
-        try:
-            self.db = self._open(here, parts, resume)
-            try:
-                self._claim(here, resume)
-            except BaseException:
-                self.close()
-                raise
-        except BaseException:
-            self._folder.remove([], folder=True)
-            raise
+        with ExitStack() as undo:
+            undo.callback(self._folder.remove, [], folder=True)
+            self.db = self._open(parts, resume)
+            undo.callback(self.close)
+            self._claim(resume)
+            undo.pop_all()
         self.resumed = self.db.ended_count  # jobs of an earlier run
 
-    def _open(
-        self, here: Mapping[str, str], parts: str | Path | Storage | None, resume: bool
-    ) -> RunDatabase:
+    def _open(self, parts: str | Path | Storage | None, resume: bool) -> RunDatabase:
         """Open the database, or a new one if nothing is committed in it."""
         path = _database(self._folder)
         durable = self.lasting and self._remote is None
@@ -138,7 +132,7 @@ class RunStore:
         new = self._marked(parts) if resume and not mark else None
         if new is not None:
             read_place(path)  # an error if it is another program's
-            self._check_same(here, new["identity"])
+            self._check_same(new["identity"])
             self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
         elif damage is not None:
             told = str(damage).replace(self._folder.url, self.place.url)
@@ -150,7 +144,7 @@ class RunStore:
         if new is None:
             mark = secrets.token_hex(8)
             shared = Storage.at(parts).path(parts_folder(mark)) if parts is not None else ""
-            new = {"mark": mark, "identity": json.dumps(here), "parts": shared}
+            new = {"mark": mark, "identity": json.dumps(self.identity), "parts": shared}
         try:
             return RunDatabase(path, durable=durable, **new)
         except LidarpoolError:
@@ -174,7 +168,7 @@ class RunStore:
                         return {key: str(value) for key, value in told.items()}
         return None
 
-    def _claim(self, here: Mapping[str, str], resume: bool) -> None:
+    def _claim(self, resume: bool) -> None:
         """Find the parts, and mark their folder as this run's."""
         self.storage = replace(_parts_of(self.place, self.db.meta["parts"]), durable=self.lasting)
         with explained(f"{self.storage.url} cannot be looked at"):
@@ -186,7 +180,7 @@ class RunStore:
         if isinstance(self.jobs, OneJob):
             self.points_of(self.jobs.only)
         if self.db.used:
-            self._go_on(here, resume)
+            self._go_on(resume)
         if self._remote:
             self._remote.claim(self.db)
         if mark_name(self.db.meta["mark"]) not in self._sizes:
@@ -202,9 +196,9 @@ class RunStore:
         told["place"] = self.place.url
         self.storage.write(mark_name(told["mark"]), json.dumps(told).encode())
 
-    def _go_on(self, here: Mapping[str, str], resume: bool) -> None:
+    def _go_on(self, resume: bool) -> None:
         """Check that this run may continue the existing one."""
-        self._check_same(here, self.db.meta["identity"])
+        self._check_same(self.db.meta["identity"])
         if not resume:
             raise LidarpoolError(
                 f"{self.place} holds an unfinished run, {self.kept}: continue it with "
@@ -216,9 +210,9 @@ class RunStore:
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
 
-    def _check_same(self, here: Mapping[str, str], identity: str) -> None:
+    def _check_same(self, identity: str) -> None:
         """Check that the run that is there is the same."""
-        if other := _difference(here, json.loads(identity)):
+        if other := _difference(self.identity, json.loads(identity)):
             raise LidarpoolError(
                 f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
                 "give another folder."
@@ -309,12 +303,6 @@ class RunStore:
                 points.resumed = 0
         return points
 
-    def identify(self, points: JobPoints) -> None:
-        """Keep what a job is made of, of which parts are committed and others are not yet."""
-        if not isinstance(self.jobs, OneJob) and not points.identified:
-            points.identified = True
-            self.db.set_hash(points.job.number, _hash_of(points.job))
-
     def end(self, rows: Sequence[JobRow]) -> None:
         """Commit that jobs have ended."""
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
@@ -348,10 +336,15 @@ class RunStore:
     # -- the end -----------------------------------------------------------------------------
 
     def save(self, *, now: bool = False) -> None:
-        """Keep how many frames were handed out; where it is time or `now`, copy the database.
+        """Keep how many frames were handed out, and what jobs are made of that are partly cast.
 
-        LidarpoolError if that fails, or another run has taken over.
+        Where it is time or `now`, copy the database. LidarpoolError if that fails, or another run
+        has taken over.
         """
+        for number, points in () if isinstance(self.jobs, OneJob) else self._points.items():
+            if points.parts.scans_done and not points.complete and not points.identified:
+                points.identified = True
+                self.db.set_hash(number, _hash_of(points.job))
         self.db.save_frames()
         if self._remote:
             self._remote.save(self.db, now=now)

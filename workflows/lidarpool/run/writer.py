@@ -20,7 +20,6 @@ from ..export.jobs import JobRow
 from ..export.sweeps import Sweeps
 from ..pipeline import EXPORT, LIDAR, JobError
 from ..pipeline.failures import raise_if_failed, was_killed
-from ..pipeline.task_book import TaskBook
 from .store import RunStore
 from .tasks import Tasks
 
@@ -86,8 +85,8 @@ class JobWriter:
         store: RunStore,
         of_parts: tuple[str, bytes],
     ) -> None:
-        self._tasks, place, mark = tasks, dataset.place, store.db.meta["mark"]
-        self._dataset = replace(dataset, made_with=store.made_with)
+        self.tasks, place, mark = tasks, dataset.place, store.db.meta["mark"]
+        self.dataset = replace(dataset, made_with=store.made_with)
         # What a killed run leaves of it is removed as that of any killed writer.
         probe = (f"{TEMPORARY}dataset-{mark[:8]}", mark.encode())
         self._probes = (place, *probe), (store.storage, *of_parts)
@@ -98,24 +97,12 @@ class JobWriter:
         self._here: dict[Future[Written], JobFiles] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
-        self._hidden = False  # whether a worker did not see the data set
-
-    @property
-    def book(self) -> TaskBook:
-        """Tasks that have written jobs."""
-        return self._tasks.book
-
-    @property
-    def note(self) -> str:
-        """Say that the driver wrote the data set; empty if it did not."""
-        if not self._hidden:
-            return ""
-        return f"no worker of {LIDAR} sees {self._dataset.place}: the driver wrote the data set"
+        self.hidden = False  # whether a worker did not see the data set
 
     @property
     def jobs(self) -> Iterator[JobRow]:
         """Jobs that wait or are being written."""
-        yield from (job.row for jobs in self._tasks.running.values() for job in jobs)
+        yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._here.values(), *self.waiting))
 
     def step(self, slots: int) -> list[tuple[JobFiles, Written]]:
@@ -123,18 +110,18 @@ class JobWriter:
 
         Errors of single jobs are JobErrors; others are of the place, or of a worker's software.
         """
-        while self.waiting and len(self._tasks.running) < WRITING * slots:
+        while self.waiting and len(self.tasks.running) < WRITING * slots:
             jobs = self._next()
-            arguments = self._dataset, self._probes, jobs
-            self._tasks.submit(jobs, write_jobs, *arguments, priority=5)
+            arguments = self.dataset, self._probes, jobs
+            self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
         ended: list[tuple[JobFiles, Written]] = []
-        for jobs, rows in self._tasks.take_done():
+        for jobs, rows in self.tasks.take_done():
             if rows is None:
-                self._hidden = True
+                self.hidden = True
                 self._write_here(jobs)
             else:
                 ended += zip(jobs, rows, strict=True)
-        for jobs, future in self._tasks.take_failed():
+        for jobs, future in self.tasks.take_failed():
             if was_killed(future):
                 self._write_here(jobs)
                 continue
@@ -161,24 +148,24 @@ class JobWriter:
     def _relieve(self, moved: bool) -> None:
         """Write jobs here if none has begun for long: all slots are held, or have gone."""
         now = time.monotonic()
-        if moved or self._here or not self._tasks.running:
+        if moved or self._here or not self.tasks.running:
             self._moved_at = now
         elif now - self._moved_at > BEGIN_S:
             self._moved_at = now
-            seen = self._tasks.look()
+            seen = self.tasks.look()
             if any(at.started and not seen.out_of_reach(key) for key, at in seen.tasks.items()):
                 return
-            future, jobs = self._tasks.running.popitem()
+            future, jobs = self.tasks.running.popitem()
             future.cancel()
             self._write_here(jobs)
 
     def _write_here(self, jobs: Sequence[JobFiles]) -> None:
-        self._here |= {self._thread.submit(_written, self._dataset, job): job for job in jobs}
+        self._here |= {self._thread.submit(_written, self.dataset, job): job for job in jobs}
 
     def close(self) -> None:
         """Write nothing more."""
         with suppress(Exception):  # report the first error
-            self._tasks.cancel()
+            self.tasks.cancel()
         self._thread.shutdown(cancel_futures=True)
         place, name, _ = self._probes[0]
         with suppress(OSError):
