@@ -7,7 +7,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.pipeline.batches import Batch, Batches, Place
+from lidarpool.pipeline.jobs import Batch, Place
 from lidarpool.pipeline.names import INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
@@ -267,34 +267,3 @@ def test_a_batch_is_judged_by_the_deaths_of_those_that_had_it():
     for kills in range(1, KILLS_MOST):
         assert verdict(SUSPECT_DEATHS + kills, 1) is Verdict.RETRY
     assert verdict(SUSPECT_DEATHS + KILLS_MOST, 1) is Verdict.POISON
-
-
-def test_pieces_hold_the_scans_of_the_whole_and_keep_its_place_in_the_order():
-    batches = Batches()
-    batches.add(JOB, 0, 5)
-    whole = batches.add(JOB, 5, 42)
-    batches.add(JOB, 42, 50)
-    batches.add(OTHER, 5, 42)
-    batches.split(whole, Counter(collect=2))
-    pieces = batches.within(JOB.number, 5, 42)
-    assert [scan for piece in pieces for scan in piece.scans] == list(range(5, 42))
-    assert {piece.deaths["collect"] for piece in pieces} == {2}
-    assert batches.waiting[1:-2] == pieces and whole not in [*batches]
-    assert batches.span(JOB) == 4 and batches.span(OTHER) == 1
-    for done in batches.within(JOB.number, 0, 5):
-        batches.remove(done)
-    assert batches.span(JOB) == 3
-    batches.postpone(pieces[0])
-    assert batches.waiting[-1] is pieces[0]
-
-
-def test_a_task_is_forgotten_with_its_last_batch():
-    batches = Batches()
-    one, two = (batches.add(job, 0, 5) for job in (JOB, OTHER))
-    for each in (one, two):
-        batches.offered(each, "key", A, 1.0)
-    assert batches.casting == {"key": A} and batches.of_task("key") == [one, two]
-    assert batches.forget_task(one) == "" and batches.of_task("key") == [two]
-    batches.move(one, Place.WAITING, 2.0)
-    assert batches.forget_task(two) == "key" and batches.of_task("key") == []
-    assert batches.at(Place.CASTING) == [two] and batches.waiting == [one]

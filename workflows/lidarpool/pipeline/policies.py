@@ -13,7 +13,7 @@ from enum import Enum
 
 from poolpart import Whereabouts
 
-from .batches import Batch, Place
+from .jobs import Batch, Place
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead

@@ -27,31 +27,24 @@ from ..simulator.rig import Rig
 UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
 
 
-@dataclass(frozen=True, eq=False)
-class RigPlan:
-    """Description of a rig; its backend is the same on all workers."""
+def packed_plan(name: str, scene: Scene, survey: bytes, backend: str) -> bytes:
+    """Return all that a rig is made of but the scene's still part, which has a name, as bytes.
 
-    scene: Scene
-    survey: bytes  # pickled: stage 1 gets the same
-    backend: str
+    Workers check their version before they unpickle them. `survey` is pickled: stage 1 gets the
+    same. The backend is the same on all workers.
+    """
+    return cloudpickle.dumps((name, scene.actors, survey, backend), protocol=5)
 
-    def packed(self, scene: str) -> bytes:
-        """All but the scene's still part, which has the name `scene`, as bytes to send to workers.
 
-        Workers check their version before they unpickle them.
-        """
-        packed = (scene, self.scene.actors, self.survey, self.backend)
-        return cloudpickle.dumps(packed, protocol=5)
+def packed_still(scene: Scene) -> bytes:
+    """Return a scene's still part as bytes."""
+    return cloudpickle.dumps(scene.with_actors(()), protocol=5)
 
-    def packed_scene(self) -> bytes:
-        """Return the scene's still part as bytes."""
-        return cloudpickle.dumps(self.scene.with_actors(()), protocol=5)
 
-    @property
-    def still(self) -> tuple[int, ...]:
-        """Identity of the scene's still part while it exists: surveys of it share their trees."""
-        still = [field.name for field in fields(self.scene) if field.name != "actors"]
-        return tuple(id(getattr(self.scene, name)) for name in still)
+def still_part(scene: Scene) -> tuple[int, ...]:
+    """Identity of a scene's still part while it exists: surveys of it share their trees."""
+    still = [field.name for field in fields(scene) if field.name != "actors"]
+    return tuple(id(getattr(scene, name)) for name in still)
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened

@@ -17,11 +17,12 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
+from ..scene.scene import Scene
 from .cast import CastWork, intersect
 from .failures import JobError, error_of, raise_if_failed, sending, was_killed, words_on_memory
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigFailed, RigMissing, RigPlan, drop_all
+from .rigs import RigFailed, RigMissing, drop_all, packed_plan, packed_still, still_part
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
@@ -72,7 +73,7 @@ class CastingWorkers:
         software: Mapping[str, str],
     ) -> None:
         self._client, self._partition, self.run = client, partition, run
-        self.backend, self._software = backend, dict(software)
+        self._backend, self._software = backend, dict(software)
         # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
         self._jobs: dict[int, tuple[_Packed, _Packed]] = {}
         # Of jobs, and those used last; what packs them keeps what they are known by.
@@ -122,17 +123,19 @@ class CastingWorkers:
 
     # -- jobs ------------------------------------------------------------------------------
 
-    def add(self, job: int, plan: RigPlan) -> str:
-        """Let a job be cast; returns the name of its scene, which it may share with others.
+    def add(self, job: int, scene: Scene, survey: bytes) -> str:
+        """Let a job be cast, its survey pickled; returns a name of what jobs of one scene share.
 
         JobError if it cannot be sent to workers.
         """
         with sending():
-            scene = self._scenes.pop(plan.still, None) or self._packed("scene", plan.packed_scene)
-            self._scenes[plan.still] = scene  # the last used
-            rig = self._packed(str(job), partial(plan.packed, scene.name))
-        self._jobs[job] = rig, scene
-        return scene.name
+            key, pack = still_part(scene), partial(packed_still, scene)
+            still = self._scenes.pop(key, None) or self._packed("scene", pack)
+            self._scenes[key] = still  # the last used
+            pack = partial(packed_plan, still.name, scene, survey, self._backend)
+            rig = self._packed(str(job), pack)
+        self._jobs[job] = rig, still
+        return still.name
 
     def remove(self, job: int) -> None:
         """Cast nothing more of a job.
@@ -296,7 +299,7 @@ class CastingWorkers:
     def _prepare(self, address: str) -> None:
         self._count += 1
         self._setups[address] = self._partition.submit(
-            _preparation(self.backend),
+            _preparation(self._backend),
             key=f"check-{self.run}-{self._count}",
             priority=10,
             workers=address,

@@ -152,7 +152,8 @@ class Run:
 
     @property
     def _has_room(self) -> bool:
-        return self._driver.has_room and len(self._made) < SPARE + 2 * self._driver.slot_count
+        most = SPARE + 2 * self._driver.workers.slot_count
+        return self._driver.has_room and len(self._made) < most
 
     def _begin(self, made: Made) -> None:
         job, (points, _) = made.job, self._made[made.job.number]
@@ -212,7 +213,7 @@ class Run:
         if self._writer is None:
             return ()
         # A stage whose worker has died comes first.
-        slots = 0 if self._driver.lacks_slot else self._cluster.spare
+        slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
         return self._writer.step(slots)
 
     def _fail(self, number: int, error: LidarpoolError, rows: list[JobRow]) -> None:
@@ -305,9 +306,9 @@ class Run:
             tell=tell,
         )
         told = saved = float("-inf")
-        while not (driver.ended and (self._trials is None or "planning" in self.times)):
+        while not (driver.stages.ended and (self._trials is None or "planning" in self.times)):
             moved = False
-            if not driver.closed:
+            if not driver.stages.closed:
                 moved = self.step()
                 if self.finished:
                     driver.close()
@@ -327,7 +328,7 @@ class Run:
                 told = now
                 self._tell_progress(show, now - started)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            (time.sleep if driver.ended else driver.wait)(pause_s)
+            (time.sleep if driver.stages.ended else driver.wait)(pause_s)
         self.notes += watch.notes
 
     def _admit_first(self) -> None:
@@ -345,7 +346,7 @@ class Run:
         self._store.save()
 
     def _tell_progress(self, show: Show, seconds: float) -> None:
-        waits_for = LIDAR if self._driver.waiting else ""
+        waits_for = LIDAR if self._driver.stages.waiting else ""
         now = self._progress(seconds, waits_for)
         self._cluster.call(show, now)
         self._cluster.call(lambda progress: self._page.on_progress(progress, self.under_way), now)
