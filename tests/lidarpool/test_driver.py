@@ -26,7 +26,7 @@ from lidarpool.pipeline import (
 )
 from lidarpool.pipeline.dispatch import PIECES
 from lidarpool.pipeline.driver import ANNOUNCED, STALL_S
-from lidarpool.pipeline.jobs import Place
+from lidarpool.pipeline.jobs import Outcome, Place
 from lidarpool.pipeline.messages import (
     ColumnsLost,
     Failed,
@@ -37,7 +37,6 @@ from lidarpool.pipeline.messages import (
     summary_type,
 )
 from lidarpool.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
-from lidarpool.pipeline.workers import Outcome
 from poolpart import TaskRecord, Whereabouts
 
 SCANS = 60
@@ -602,7 +601,7 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
 
     def cast():
         if run.workers.open:
-            outcomes = (Outcome.DONE, Outcome.DONE, Outcome.DONE, Outcome.NO_RIG, Outcome.KILLED)
+            outcomes = (Outcome.DONE, Outcome.DONE, Outcome.DONE, Outcome.NO_RIG, Outcome.DIED)
             run.workers.end(chance.choice(run.workers.open), chance.choice(outcomes))
 
     def lose_stage():

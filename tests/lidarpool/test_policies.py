@@ -7,20 +7,17 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.pipeline.jobs import Batch, Place
+from lidarpool.pipeline.jobs import Batch, Outcome, Place
 from lidarpool.pipeline.names import INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
-    KILLS_MOST,
     LATE_FACTOR,
     LATE_S,
     SPAN,
     SUSPECT_DEATHS,
     TASK_BATCHES,
     TASK_SECONDS,
-    Loss,
-    Verdict,
     batches_per_task,
     handovers,
     late_after_s,
@@ -29,7 +26,6 @@ from lidarpool.pipeline.policies import (
     room,
     scans_per_batch,
     slots_wanted,
-    verdict,
     weight,
 )
 from poolpart import Whereabouts
@@ -214,8 +210,8 @@ def test_batches_are_late_by_what_others_took():
     ("place", "reason"),
     [
         (Place.WAITING, None),
-        (Place.CASTING, Loss.DIED),
-        (Place.CAST, Loss.GONE),
+        (Place.CASTING, Outcome.DIED),
+        (Place.CAST, Outcome.GONE),
         (Place.COLLECTING, None),  # its collector may have the columns, and says if it has not
     ],
 )
@@ -226,15 +222,15 @@ def test_the_batches_of_a_worker_that_is_gone(place, reason):
 def test_a_silent_worker_is_left_if_there_is_another():
     seen = Whereabouts(frozenset({A, B}), frozenset({A}), {B: 1})
     for place in (Place.CASTING, Place.CAST):
-        assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Loss.GONE
+        assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Outcome.GONE
         assert loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
 
 
 @pytest.mark.parametrize(
     ("task", "reason"),
     [
-        (TaskPlace("no-worker", (), 0), Loss.REFUSED),
-        (TaskPlace("processing", (A,), 0), Loss.REFUSED),
+        (TaskPlace("no-worker", (), 0), Outcome.REFUSED),
+        (TaskPlace("processing", (A,), 0), Outcome.REFUSED),
         (TaskPlace("processing", (A,), 0, started=True), None),
         (TaskPlace("memory", (A,), 0), None),
         (None, None),
@@ -249,21 +245,12 @@ def test_a_worker_that_takes_no_tasks_ends_what_it_has_begun(task, reason):
     ("place", "prepared", "reason"),
     [
         (Place.WAITING, 2, None),
-        (Place.CASTING, 2, Loss.LATE),
+        (Place.CASTING, 2, Outcome.LATE),
         (Place.CASTING, 1, None),  # nobody else could do it
         (Place.CAST, 2, None),  # it waits for a collector
-        (Place.COLLECTING, 1, Loss.LATE),
+        (Place.COLLECTING, 1, Outcome.LATE),
     ],
 )
 def test_a_late_batch(place, prepared, reason):
     assert loss(batch(0, place, A), HERE, prepared, LATE_S + 1, LATE_S) is reason
     assert loss(batch(0, place, A), HERE, prepared, LATE_S - 1, LATE_S) is None
-
-
-def test_a_batch_is_judged_by_the_deaths_of_those_that_had_it():
-    for deaths in range(SUSPECT_DEATHS + 1):
-        assert verdict(deaths, 10) is verdict(deaths, 1) is Verdict.RETRY
-    assert verdict(SUSPECT_DEATHS + 1, 2) is Verdict.SPLIT
-    for kills in range(1, KILLS_MOST):
-        assert verdict(SUSPECT_DEATHS + kills, 1) is Verdict.RETRY
-    assert verdict(SUSPECT_DEATHS + KILLS_MOST, 1) is Verdict.POISON

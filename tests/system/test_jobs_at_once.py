@@ -177,7 +177,7 @@ def test_jobs_of_a_scene_share_its_trees_and_give_the_points_of_each_alone(
 def _kept() -> int:
     from lidarpool.pipeline import rigs
 
-    return len(rigs._rigs) + len(rigs._scenes)
+    return len(rigs._kept)
 
 
 @pytest.mark.slow

@@ -403,22 +403,20 @@ class RunDatabase:
         """Translate an error of SQLite."""
         try:
             yield
-        except sqlite3.OperationalError as error:
-            if "locked" in str(error):
+        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+            words = str(error)
+            # Without a table or column it is not what it was.
+            if not isinstance(error, sqlite3.OperationalError) or "no such" in words:
+                raise DamagedError(
+                    f"{self.path} is damaged ({words}): drop the run with --fresh, or give another "
+                    "folder."
+                ) from error
+            if "locked" in words:
                 raise LidarpoolError(f"Another run is using {self.path.parent}.") from error
-            if "no such" in str(error):  # table or column
-                raise self._damaged(error) from error
             raise LidarpoolError(
-                f"{self.path} cannot be written ({error}): make room on its disk, or give another "
+                f"{self.path} cannot be written ({words}): make room on its disk, or give another "
                 "folder."
             ) from error
-        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
-            raise self._damaged(error) from error
-
-    def _damaged(self, error: Exception) -> DamagedError:
-        return DamagedError(
-            f"{self.path} is damaged ({error}): drop the run with --fresh, or give another folder."
-        )
 
 
 def _trial_of(data: dict[str, Any]) -> Trial:

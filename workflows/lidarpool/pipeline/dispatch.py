@@ -12,12 +12,11 @@ from ..base.storage import Storage
 from ..columns.parts import part_name
 from . import policies
 from .failures import JobError, storing
-from .jobs import Batch, JobState, Place
+from .jobs import Batch, JobState, Outcome, Place
 from .long_stages import LongStages
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
-from .policies import Loss, Verdict
-from .workers import CastingWorkers, Outcome
+from .workers import CastingWorkers
 
 ADVISED_AGAIN = 0.2  # change of the scans in an item of stage 1 that is worth a request
 PIECES = 16  # a failing batch is divided into so many
@@ -155,31 +154,22 @@ class Dispatcher:
             except JobError as error:
                 self.failed.setdefault(left[0].job, error)
                 continue
-            moved |= outcome is not Outcome.PENDING
-            for batch in [*left]:
+            for batch in [*left] if outcome is not Outcome.PENDING else ():
+                moved = True
                 if outcome is Outcome.DONE:
                     batch.move(Place.CAST)
                     batch.job.cast += len(batch)
-                elif outcome is Outcome.NO_RIG:
-                    self._again(batch, "its worker has no scene any more")
-                elif outcome is Outcome.KILLED:
-                    self._lose(batch, Loss.DIED)
-                elif outcome is Outcome.DIVIDE:
-                    self._again(batch, "its task failed, perhaps because of another job")
-                    batch.divided = True
+                else:
+                    self._again(batch, outcome.value)
+                    batch.divided |= outcome is Outcome.DIVIDE
         return moved
 
     def leave_workers(self, seen: Whereabouts) -> None:
         """Offer batches again whose workers died, are silent, late, or take no tasks."""
         prepared, late_s = len(self._workers.slots), policies.late_after_s(self._seconds)
         for batch in [*self.batches.values()]:
-            if reason := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
-                self._lose(batch, reason)
-
-    def _lose(self, batch: Batch, reason: Loss) -> None:
-        self._again(batch, reason.value)
-        if reason is Loss.DIED:
-            self._blame(batch, INTERSECT, batch.worker)
+            if why := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
+                self._again(batch, why.value)
 
     def _again(self, batch: Batch, reason: str, place: Place = Place.WAITING) -> None:
         """Return a batch to be cast again, or only to be collected again."""
@@ -188,6 +178,8 @@ class Dispatcher:
         batch.move(place)
         batch.job.offered_again += 1
         batch.job.trace("replay", INTERSECT, batch.scans, reason=reason)
+        if reason == Outcome.DIED.value:
+            self._blame(batch, INTERSECT, batch.worker)
 
     def _remove(self, batch: Batch) -> None:
         self._forget(batch)
@@ -212,19 +204,19 @@ class Dispatcher:
     # -- poison batches ----------------------------------------------------------------------
 
     def _blame(self, batch: Batch, stage: str, worker: str) -> None:
-        """Count the death of a worker against its batches, see `policies.verdict`."""
+        """Count the death of a worker against its batches, see `policies.kills`."""
         batch.deaths[stage] += 1
-        if stage == INTERSECT and not batch.job.cast and policies.was_alone(batch, stage):
+        kills = policies.kills(batch, stage)
+        if stage == INTERSECT and not batch.job.cast and kills > 0:
             self._blame_scene(batch, worker)
-        judged = policies.verdict(batch.deaths[stage], len(batch))
-        if judged is Verdict.SPLIT:
+        if kills > 0 and len(batch) > 1:
             self._remove(batch)
             for first in range(batch.first, batch.stop, -(-len(batch) // PIECES)):
                 stop = min(first - (-len(batch) // PIECES), batch.stop)
                 piece = Batch(batch.job, first, stop, batch.number, batch.order)
                 piece.deaths[stage] = policies.SUSPECT_DEATHS
                 self.batches[batch.job.number, first] = piece
-        elif judged is Verdict.POISON:
+        elif kills >= policies.KILLS_MOST:
             partition = GPU if stage == INTERSECT else LIDAR
             batch.job.condemned.append(
                 f"{scans_in_words(batch.first, batch.stop)} kills the worker that runs stage "

@@ -90,7 +90,7 @@ class RunDriver:
         """
         with sending():
             packed = cloudpickle.dumps(survey, protocol=5)
-        scene_name = self.workers.add(number, scene, packed)
+            scene_name = self.workers.add(number, scene, packed)
         parts = self._db.job(number, survey.scan_count)
         parts.has_frames = on_frame is not None
         job = self.jobs[number] = JobState(

@@ -91,6 +91,19 @@ class Place(Enum):
     COLLECTING = "collecting"  # assigned to a collector
 
 
+class Outcome(Enum):
+    """What has become of a casting task; or why its batches are offered again."""
+
+    PENDING = "pending"
+    DONE = "done"
+    DIED = "its worker died"
+    GONE = "its worker is gone or silent"
+    REFUSED = "its worker takes no tasks"
+    LATE = "it is late"
+    NO_RIG = "its worker has no scene any more"
+    DIVIDE = "its task failed, perhaps because of another job"
+
+
 @dataclass(eq=False)
 class Batch:
     """Consecutive uncommitted scans of a job on their way to a part."""

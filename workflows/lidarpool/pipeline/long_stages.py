@@ -91,8 +91,8 @@ class LongStages:
         self._submitted = 0
         # A file in the storage, by which collectors find out whether they see it.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
-        self._scans = self._pipe("scans", queue_capacity)
-        self._news = self._pipe("news", 64)  # from stages 3 and 4
+        self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, client)
+        self._news = Pipe(f"lidarpool-{run}-news", 64, client)  # from stages 3 and 4
         self._inbox: list[Message] = []
         self._outbox: dict[str, list[Order]] = {}  # by pipe
         self._looked_at = 0.0
@@ -157,9 +157,6 @@ class LongStages:
             for name, task in self._tasks.items()
             if name.startswith(COLLECT) and task.dead_since is None
         }
-
-    def _pipe(self, name: str, capacity: int) -> Pipe:
-        return Pipe(f"lidarpool-{self.run}-{name}", capacity, self.client)
 
     @property
     def lacks_slot(self) -> bool:
@@ -270,10 +267,7 @@ class LongStages:
         return died, started
 
     def _miss(self, name: str) -> None:
-        """LidarpoolError for a stage that has had no slot for long.
-
-        One of several collectors is not needed: the others do its work.
-        """
+        """LidarpoolError for a stage that has had no slot for long, unless others do its work."""
         if not (name.startswith(COLLECT) and self.collectors):
             what = f"no free slot in partition {self.partition.name!r} for"
             raise self._too_few(f"Stage {name} has had {what}", " since its worker died")
@@ -301,7 +295,7 @@ class LongStages:
         earlier = self._tasks.get(name)
         if earlier is not None:
             forget_pipes(self.client, [earlier.inlet.name])
-        inlet = self._pipe(f"{name}-{number}", 1_000_000).create()
+        inlet = Pipe(f"lidarpool-{self.run}-{name}-{number}", 1_000_000, self.client).create()
         me = StageStart(self.run, name.partition("-")[0], number)
         work: dict[str, tuple[Any, ...]] = {
             GENERATE: (generate, me, inlet, self._scans),

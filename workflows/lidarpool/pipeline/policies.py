@@ -9,11 +9,10 @@ import math
 import statistics
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-from enum import Enum
 
 from poolpart import Whereabouts
 
-from .jobs import Batch, Place
+from .jobs import Batch, Outcome, Place
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
@@ -88,14 +87,19 @@ def slots_wanted(left: int, scan_s: float | None) -> int:
 # -- where batches go ------------------------------------------------------------------------
 
 
+def kills(batch: Batch, stage: str) -> int:
+    """How many workers of a stage died with a batch while it was tried alone; below 0: it is not.
+
+    After some deaths a batch is suspect, and tried alone. An innocent one succeeds then; one whose
+    worker dies again is divided, down to single scans. A scan is the cause if `KILLS_MOST` workers
+    in a row die with it alone.
+    """
+    return batch.deaths[stage] - SUSPECT_DEATHS
+
+
 def suspect(batch: Batch, stage: str) -> bool:
     """Whether a batch may be what kills the workers of a stage: then it is tried alone."""
-    return batch.deaths[stage] >= SUSPECT_DEATHS
-
-
-def was_alone(batch: Batch, stage: str) -> bool:
-    """Whether a batch was tried alone when a worker of a stage died with it last."""
-    return batch.deaths[stage] > SUSPECT_DEATHS
+    return kills(batch, stage) >= 0
 
 
 def offers(
@@ -212,15 +216,6 @@ def _host(address: str) -> str:
 # -- when a batch is tried again -------------------------------------------------------------
 
 
-class Loss(Enum):
-    """Why a batch is offered again although its task has not failed."""
-
-    DIED = "its worker died"
-    GONE = "its worker is gone or silent"
-    REFUSED = "its worker takes no tasks"
-    LATE = "it is late"
-
-
 def late_after_s(seconds: Sequence[float]) -> float:
     """Seconds after which a batch is late, from the casting times of others; inf without any."""
     if not seconds:
@@ -228,43 +223,24 @@ def late_after_s(seconds: Sequence[float]) -> float:
     return max(LATE_S, LATE_FACTOR * statistics.median(seconds))
 
 
-def loss(batch: Batch, seen: Whereabouts, prepared: int, now: float, late_s: float) -> Loss | None:
-    """Whether a batch should be offered again, and why.
+def loss(
+    batch: Batch, seen: Whereabouts, prepared: int, now: float, late_s: float
+) -> Outcome | None:
+    """Whether a batch should be offered again although its task has not failed, and why.
 
     It depends on what was `seen` of workers and tasks, and on the number of workers that are
     `prepared`: while there is no other, a batch is waited for.
     """
     if batch.place in (Place.CASTING, Place.CAST):
         if batch.worker not in seen.members:
-            return Loss.DIED if batch.place is Place.CASTING else Loss.GONE
+            return Outcome.DIED if batch.place is Place.CASTING else Outcome.GONE
         if batch.worker in seen.silent:
             if prepared:
-                return Loss.GONE
+                return Outcome.GONE
         elif batch.worker not in seen.free and batch.place is Place.CASTING:
             task = seen.tasks.get(batch.key)
             # "no-worker": not even sent there, as the worker was paused before.
             if task and task.state in ("no-worker", "processing") and not task.started:
-                return Loss.REFUSED
+                return Outcome.REFUSED
     late = batch.place in (Place.CASTING, Place.COLLECTING) and now - batch.since > late_s
-    return Loss.LATE if late and (prepared > 1 or batch.place is Place.COLLECTING) else None
-
-
-class Verdict(Enum):
-    """What becomes of a batch that was under way when a worker died."""
-
-    RETRY = "retry"
-    SPLIT = "split"
-    POISON = "poison"
-
-
-def verdict(deaths: int, scans: int) -> Verdict:
-    """Judge a batch of so many scans, with which so many workers of one stage have died.
-
-    After some deaths it is tried alone, see `suspect`. An innocent one succeeds then; one whose
-    worker dies again is divided, down to single scans. A scan is the cause if several workers in a
-    row die with it alone.
-    """
-    kills = deaths - SUSPECT_DEATHS  # those with no other batch in that stage
-    if kills > 0 and scans > 1:
-        return Verdict.SPLIT
-    return Verdict.POISON if kills >= KILLS_MOST else Verdict.RETRY
+    return Outcome.LATE if late and (prepared > 1 or batch.place is Place.COLLECTING) else None

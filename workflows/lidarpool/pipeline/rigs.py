@@ -64,8 +64,7 @@ class _Kept:
     used_at: float
 
 
-_rigs: dict[str, _Kept] = {}  # {handle: the rig of this process}
-_scenes: dict[str, _Kept] = {}  # {handle: a rig of the scene}
+_kept: dict[str, _Kept] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
 _lock = threading.Lock()
 
 
@@ -75,16 +74,14 @@ def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -
     RigMissing if it is not there, or its scene is not, and nothing to make it of; RigFailed if it
     cannot be made.
     """
-    kept = _rigs.get(handle)
+    kept = _kept.get(handle)
     if kept is None:
         with _lock:
-            kept = _rigs.get(handle)
+            kept = _kept.get(handle)
             if kept is None:
-                kept = _rigs[handle] = _made(handle, plan, scene)
-    now = time.monotonic()
-    kept.used_at = now
-    if (its_scene := _scenes.get(kept.scene)) is not None:
-        its_scene.used_at = now
+                kept = _kept[handle] = _made(handle, plan, scene)
+    its_scene = _kept.get(kept.scene, kept)
+    kept.used_at = its_scene.used_at = time.monotonic()
     return kept.rig
 
 
@@ -95,7 +92,7 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
         name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
         survey: Survey = pickle.loads(packed)  # noqa: S301
         _drop_unused(name)
-        if (found := _scenes.get(name)) is not None:
+        if (found := _kept.get(name)) is not None:
             rig = found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
         elif scene is not None:
             still: Scene = pickle.loads(scene)  # noqa: S301
@@ -107,7 +104,7 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
         raise
     except Exception as error:
         raise RigFailed(str(error) or type(error).__name__) from error
-    _scenes[name] = _Kept(rig, name, time.monotonic())
+    _kept[name] = _Kept(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
     return _Kept(rig, name, time.monotonic())
 
@@ -115,20 +112,16 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
 def _drop_unused(scene: str) -> None:
     """Drop rigs and scenes that nobody has used for long, but for a scene."""
     now = time.monotonic()
-    for kept in (_rigs, _scenes):
-        for handle, one in list(kept.items()):
-            if now - one.used_at > UNUSED_S and handle != scene:
-                kept.pop(handle, None)
+    drop([h for h, one in [*_kept.items()] if now - one.used_at > UNUSED_S and h != scene])
 
 
 def drop(handles: Collection[str]) -> None:
     """Drop rigs and scenes; those that are not there are skipped."""
     for handle in handles:
-        _rigs.pop(handle, None)
-        _scenes.pop(handle, None)
+        _kept.pop(handle, None)
 
 
 def drop_all(run: str) -> None:
     """Drop the rigs and scenes of a run."""
     # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
-    drop([h for h in (*_rigs, *_scenes) if h.partition(".")[0] == run])
+    drop([handle for handle in [*_kept] if handle.partition(".")[0] == run])

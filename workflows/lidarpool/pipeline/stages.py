@@ -96,7 +96,6 @@ def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     scans equally on every worker. A survey that cannot be described is reported as `Failed`.
     """
     secede()
-
     return _work(
         me, inlet, lambda wanted: _tell(me, outlet, _described(me, wanted, outlet), outlet.capacity)
     )
@@ -195,27 +194,22 @@ def _collected(
     if order.key not in found:
         yield ColumnsLost(order.key)
         return
-    batches: dict[tuple[int, int], CastBatch] = {
-        (batch.job, batch.part.first): batch for batch in found[order.key]
-    }
+    batches = {(batch.job, batch.part.first): batch for batch in found[order.key]}
     for job, (first, stop), name in order.parts:
-        me.trace("get", range(first, stop))
+        batch: CastBatch = batches[job, first]
+        scans = range(first, stop)
+        me.trace("get", scans)
         try:
-            yield _stored(me, storage, batches[job, first], name)
+            with naming_scans(first, stop):
+                data = pack(batch.part)
+                receipt = Receipt.of_part(batch.part, job, name, len(data), batch.record)
+            me.trace("part", scans)
+            if storage is None:
+                yield replace(receipt, held_at=hold_for_driver(name, data))
+                continue
+            with storing(storage):
+                storage.write(name, data)
+            me.trace("stored", scans)
+            yield receipt
         except ScanError as error:
             yield Failed(job, COLLECT, str(error))
-
-
-def _stored(me: StageStart, storage: Storage | None, batch: CastBatch, name: str) -> Receipt:
-    """Make a part of a batch."""
-    part = batch.part
-    with naming_scans(part.first, part.stop):
-        data = pack(part)
-        receipt = Receipt.of_part(part, batch.job, name, len(data), batch.record)
-    me.trace("part", receipt.scans)
-    if storage is None:
-        return replace(receipt, held_at=hold_for_driver(name, data))
-    with storing(storage):
-        storage.write(name, data)
-    me.trace("stored", receipt.scans)
-    return receipt

@@ -7,7 +7,6 @@ import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field
-from enum import Enum
 from functools import partial
 from typing import Any
 
@@ -19,7 +18,8 @@ from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from ..scene.scene import Scene
 from .cast import CastWork, intersect
-from .failures import JobError, error_of, raise_if_failed, sending, was_killed, words_on_memory
+from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
+from .jobs import Outcome
 from .messages import Span
 from .names import INTERSECT
 from .rigs import RigFailed, RigMissing, drop_all, packed_plan, packed_still, still_part
@@ -31,16 +31,6 @@ RELEASE_S = 3.0  # for workers to drop their rigs
 SPARE_SCENES = 2  # of which no survey is under way, kept for the next one
 INLINE_BYTES = 1 << 17  # larger things are sent to a worker once, and fetched from there by others
 CHECKING, PREPARING = "checking the GPU workers", "preparing the scene on the GPU workers"
-
-
-class Outcome(Enum):
-    """State of a casting task that has not failed by itself."""
-
-    PENDING = "pending"
-    DONE = "done"
-    KILLED = "killed"  # its worker died or left
-    NO_RIG = "no rig"  # its worker has dropped the scene
-    DIVIDE = "divide"  # it failed by itself, and it is not known which of its jobs is the cause
 
 
 @dataclass(eq=False)
@@ -84,7 +74,7 @@ class CastingWorkers:
         # workers: one with a result cannot be returned to the queue.
         self._checked: dict[str, int] = {}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
-        self._count = self._offered = 0
+        self._count = 0  # of the names and keys that were given
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: casting task, its jobs}
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
@@ -107,12 +97,10 @@ class CastingWorkers:
     def futures(self) -> list[Future]:
         """All tasks."""
         brought = [one.data for one in self._packed_things if isinstance(one.data, Future)]
-        casts = [future for future, _ in self._casts.values()]
-        return [*casts, *self._setups.values(), *brought]
+        return [*(cast for cast, _ in self._casts.values()), *self._setups.values(), *brought]
 
     @property
     def _packed_things(self) -> list[_Packed]:
-        """What tasks bring."""
         return [*(rig for rig, _ in self._jobs.values()), *self._scenes.values()]
 
     @property
@@ -124,16 +112,12 @@ class CastingWorkers:
     # -- jobs ------------------------------------------------------------------------------
 
     def add(self, job: int, scene: Scene, survey: bytes) -> str:
-        """Let a job be cast, its survey pickled; returns a name of what jobs of one scene share.
-
-        JobError if it cannot be sent to workers.
-        """
-        with sending():
-            key, pack = still_part(scene), partial(packed_still, scene)
-            still = self._scenes.pop(key, None) or self._packed("scene", pack)
-            self._scenes[key] = still  # the last used
-            pack = partial(packed_plan, still.name, scene, survey, self._backend)
-            rig = self._packed(str(job), pack)
+        """Let a job be cast, its survey pickled; returns a name that jobs of one scene share."""
+        key, pack = still_part(scene), partial(packed_still, scene)
+        still = self._scenes.pop(key, None) or self._packed("scene", pack)
+        self._scenes[key] = still  # the last used
+        plan = partial(packed_plan, still.name, scene, survey, self._backend)
+        rig = self._packed(str(job), plan)
         self._jobs[job] = rig, still
         return still.name
 
@@ -189,8 +173,8 @@ class CastingWorkers:
         brought = [self._brought(packed, worker) for packed in things]
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
-        self._offered += 1
-        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._offered}"
+        self._count += 1
+        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._count}"
         unneeded = self._unneeded.pop(worker, [])
         future = self._partition.submit(
             intersect, works, unneeded, *brought, key=key, workers=worker
@@ -215,7 +199,7 @@ class CastingWorkers:
                 one.there.discard(worker)
             return Outcome.NO_RIG
         if was_killed(future):
-            return Outcome.KILLED
+            return Outcome.DIED
         if status == "error" and len(jobs) > 1:
             return Outcome.DIVIDE
         what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
@@ -253,19 +237,28 @@ class CastingWorkers:
         known = self._setups.keys() | self._checked.keys()
         for address in known - self.seen.members:
             self._remove(address)
-        for address in sorted(self.seen.free.keys() - known):
-            if address not in self._refused:
-                self._prepare(address)
+        for address in sorted(self.seen.free.keys() - known - self._refused.keys()):
+            self._count += 1
+            self._setups[address] = self._partition.submit(
+                _preparation(self._backend),
+                key=f"check-{self.run}-{self._count}",
+                priority=10,
+                workers=address,
+            )
         self._check()
         return self.seen
 
     def _check(self) -> None:
-        """Record the workers that may cast."""
+        """Record workers that may cast; one that answered and has stopped since is asked again."""
         for address, future in list(self._setups.items()):
-            if future.status == "finished" and address in self.seen.free:
-                self._take(address, future)
-            elif future.status == "error" and not was_killed(future):
+            if future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
+            if future.status != "finished" or address not in self.seen.free:
+                continue
+            found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
+            if future.key in found:
+                del self._setups[address]
+                self._take(address, found[future.key])
 
     def want(self, slots: int) -> None:
         """Want so many slots of a partition that grows with its work; 0 when there is no more.
@@ -296,22 +289,8 @@ class CastingWorkers:
                     callback_timeout=RELEASE_S,
                 )
 
-    def _prepare(self, address: str) -> None:
-        self._count += 1
-        self._setups[address] = self._partition.submit(
-            _preparation(self._backend),
-            key=f"check-{self.run}-{self._count}",
-            priority=10,
-            workers=address,
-        )
-
-    def _take(self, address: str, future: Future) -> None:
-        """Record a worker that has answered; one that has stopped since is asked again."""
-        found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
-        if future.key not in found:
-            return
-        answer: dict[str, Any] = found[future.key]
-        del self._setups[address]
+    def _take(self, address: str, answer: dict[str, Any]) -> None:
+        """Record what a worker has answered."""
         if differs := difference(answer["software"], self._software):
             self._refused[address] = differs
             self.notes.append(
