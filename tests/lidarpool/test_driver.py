@@ -165,10 +165,6 @@ class Stages:
     def wait(self, seconds, keys, *, scans):
         self.wanted = scans
 
-    def receive(self):
-        messages, self.inbox = self.inbox, []
-        return messages
-
     def send(self, name, messages):
         known = {"generate": self.described, "sort": self.unsorted}
         (known[name] if name in known else self.orders[name]).extend(messages)

@@ -14,7 +14,6 @@ from lidarpool.pipeline.policies import (
     COLLECTING,
     LATE_FACTOR,
     LATE_S,
-    SPAN,
     SUSPECT_DEATHS,
     TASK_BATCHES,
     TASK_SECONDS,
@@ -23,7 +22,6 @@ from lidarpool.pipeline.policies import (
     late_after_s,
     loss,
     offers,
-    room,
     scans_per_batch,
     slots_wanted,
     weight,
@@ -81,11 +79,6 @@ def test_scans_of_a_batch(seconds, scans, fit, count, slots, wanted):
     assert scans_per_batch(seconds, scans, fit, count, slots) == wanted
 
 
-def test_no_batches_are_taken_far_ahead_of_the_oldest():
-    assert room(3, 5, 10) == 7
-    assert room(3, SPAN * 10, 10) == 0
-
-
 def test_slots_are_wanted_for_what_is_left():
     assert slots_wanted(100, None) == 100  # nothing is known of them
     assert slots_wanted(100, 0.1) == 1  # of 10 s
@@ -127,8 +120,8 @@ def test_a_task_has_as_many_batches_as_are_worth_it():
 
 
 def test_the_batches_of_a_task_fit_into_memory_together():
-    assert weight(batch(0, scans=25), 4) == weight(batch(0), 4) == 1
-    assert weight(batch(0, scans=50), 4) == 2 and weight(batch(0, scans=100), 1) == 1
+    assert weight([batch(0, scans=25)], 4) == weight([batch(0)], 4) == 1
+    assert weight([batch(0, scans=50)], 4) == 2 and weight([batch(0, scans=100)], 1) == 1
     assert sizes(waiting(10, scans=50)) == [2, 2, 2, 2]
     assert sizes([*waiting(2, scans=75), *waiting(4, first=20)]) == [1, 2]
     there = waiting(20, scans=50)

@@ -15,6 +15,7 @@ import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -45,6 +46,7 @@ CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEX
 """
 _DONE, _FAILED = 1, 2  # what became of a job
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
+_FIRST = attrgetter("first")  # the order of parts
 
 
 class JobParts:
@@ -111,14 +113,14 @@ class JobParts:
 
     def _at(self, scan: int) -> int:
         """Index of the last part that begins with a scan or before; 0 if there is none."""
-        return max(0, bisect.bisect_right(self.ordered, scan, key=_first) - 1)
+        return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
 
     # -- writing -------------------------------------------------------------------------
 
     def enter(self, part: Receipt) -> None:
         """Add a part."""
         bare = replace(part, summaries=b"", record=None, held_at="")
-        bisect.insort(self.ordered, bare, key=_first)
+        bisect.insort(self.ordered, bare, key=_FIRST)
         self._count(part, 1)
 
     def leave(self, part: Receipt) -> None:
@@ -130,10 +132,6 @@ class JobParts:
         self.scans_done += sign * len(part.scans)
         self.point_count += sign * part.rows
         self.hits += sign * part.hits
-
-
-def _first(part: Receipt) -> int:
-    return part.first
 
 
 class DamagedError(LidarpoolError):
@@ -200,14 +198,11 @@ class RunDatabase:
         """Return what is committed of a job that has not ended; kept until it has."""
         if (found := self.under_way.get(number)) is not None:
             return found
-        job = self.under_way[number] = JobParts(number, scan_count, self._summaries)
-        try:
-            if number in self.begun:
-                with self._explained():
-                    self._read(job)
-        except BaseException:
-            del self.under_way[number]
-            raise
+        job = JobParts(number, scan_count, self._summaries)
+        if number in self.begun:
+            with self._explained():
+                self._read(job)
+        self.under_way[number] = job
         return job
 
     def _read(self, job: JobParts) -> None:

@@ -81,11 +81,12 @@ class Dispatcher:
         return policies.most_under_way(slots, collectors, self._per_task)
 
     def room(self, job: JobState) -> float:
-        """Batches that may be taken of a job, by weight."""
-        under_way = sum(policies.weight(batch, self._per_task) for batch in self.batches.values())
+        """Batches that may be taken of a job, by weight; none far ahead of its oldest."""
         # How many batches the newest of all is ahead of the oldest of the job.
         span = max((self._count - batch.number for batch in self._of(job)), default=0)
-        return policies.room(under_way, span, self.most)
+        if span >= policies.SPAN * self.most:
+            return 0
+        return self.most - policies.weight(self.batches.values(), self._per_task)
 
     def slots_wanted(self, left: int) -> int:
         """Slots that so many scans are worth; at least 1."""

@@ -10,6 +10,7 @@ and workers.
 
 from __future__ import annotations
 
+import pickle
 import time
 from collections.abc import Callable, Iterable, Sequence
 from itertools import chain
@@ -24,7 +25,7 @@ from ..scene.scene import Scene
 from ..sensor import Survey
 from .database import RunDatabase
 from .dispatch import Dispatcher
-from .failures import JobError, sending
+from .failures import JobError
 from .jobs import JobState
 from .long_stages import LongStages
 from .messages import (
@@ -45,6 +46,7 @@ STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
 WAIT_S = 0.02  # for news, where there is nothing else to do
 CLOSING_S = 0.001  # longest wait while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
+_UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
 
 
 class RunDriver:
@@ -88,9 +90,11 @@ class RunDriver:
         is committed. Frames read their points with `read`. `on_parts` is called with parts that
         were committed.
         """
-        with sending():
+        try:
             packed = cloudpickle.dumps(survey, protocol=5)
             scene_name = self.workers.add(number, scene, packed)
+        except _UNSENT as error:  # of pickling what a user has defined
+            raise JobError(f"The survey cannot be sent to the workers: {error}") from error
         parts = self._db.job(number, survey.scan_count)
         parts.has_frames = on_frame is not None
         job = self.jobs[number] = JobState(
@@ -161,7 +165,7 @@ class RunDriver:
 
         LidarpoolError if something fails that all jobs need.
         """
-        messages = self.stages.receive()
+        messages, self.stages.inbox = self.stages.inbox, []
         moved = bool(messages)
         self._commit([message for message in messages if isinstance(message, Receipt)])
         for message in messages:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
@@ -23,15 +22,6 @@ class JobError(LidarpoolError):
 
 class ScanError(RuntimeError):
     """Scans cannot be described, cast or packed; the message names them."""
-
-
-@contextmanager
-def sending() -> Iterator[None]:
-    """Turn errors of pickling what a user has defined into a JobError."""
-    try:
-        yield
-    except (pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise JobError(f"The survey cannot be sent to the workers: {error}") from error
 
 
 @contextmanager

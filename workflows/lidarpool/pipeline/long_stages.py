@@ -93,7 +93,7 @@ class LongStages:
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
         self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, client)
         self._news = Pipe(f"lidarpool-{run}-news", 64, client)  # from stages 3 and 4
-        self._inbox: list[Message] = []
+        self.inbox: list[Message] = []  # what has come, for the driver to take
         self._outbox: dict[str, list[Order]] = {}  # by pipe
         self._looked_at = 0.0
         self._progress = -1  # when something was last committed
@@ -125,12 +125,7 @@ class LongStages:
         self._outbox = {}
         found = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=LINGER_S)
         for items in found.values():
-            self._inbox += items
-
-    def receive(self) -> list[Message]:
-        """Messages since the last call."""
-        messages, self._inbox = self._inbox, []
-        return messages
+            self.inbox += items
 
     def send(self, name: str, messages: Sequence[Order]) -> None:
         """Send messages to a stage with the next `wait`.
@@ -333,15 +328,13 @@ class LongStages:
         return [self._scans, self._news, *(task.inlet for task in self._tasks.values())]
 
     @property
-    def _done(self) -> bool:
-        return all(task.future.done() for task in self._tasks.values())
-
-    @property
     def ended(self) -> bool:
         """True once all stages have exited after `close`, or the shutdown timeout has elapsed."""
-        if self._closed_at is None:
-            return False
-        return self._done or time.monotonic() - self._closed_at > LAST_WORDS_S
+        return self._closed_at is not None and self._have_ended(self._closed_at)
+
+    def _have_ended(self, since: float) -> bool:
+        late = time.monotonic() - since > LAST_WORDS_S
+        return late or all(task.future.done() for task in self._tasks.values())
 
     def stop(self, reason: str) -> None:
         """End all stages at once, because the run has failed."""
@@ -356,8 +349,8 @@ class LongStages:
         """
         futures = [task.future for task in self._tasks.values()]
         try:
-            deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
-            while not self._done and time.monotonic() < deadline:
+            since = self._closed_at or time.monotonic()
+            while not self._have_ended(since):
                 time.sleep(0.01)
             ended = [future.key for future in futures if future.status == "finished"]
             found = fetch_available(self.client, ended)

@@ -57,23 +57,18 @@ def batches_per_task(seconds: Sequence[float]) -> int:
     return max(1, min(int(TASK_SECONDS / typical), TASK_BATCHES))
 
 
-def weight(batch: Batch, per_task: int) -> float:
-    """How many small batches a batch counts as, where a task has so many.
+def weight(batches: Iterable[Batch], per_task: int) -> float:
+    """How many small batches some batches count as, where a task has so many.
 
     All of a task's batches are in a worker's memory at a time: one that takes half of what is there
     counts as half a task.
     """
-    return max(1.0, batch.share * per_task)
+    return sum(max(1.0, batch.share * per_task) for batch in batches)
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
     """Batches that may be under way by their `weight`, so many in a task."""
     return (AHEAD * slots + COLLECTING * collectors + 2) * per_task
-
-
-def room(under_way: float, span: int, most: int) -> float:
-    """Batches that may be taken; none while the newest is far ahead of the oldest."""
-    return 0 if span >= SPAN * most else most - under_way
 
 
 def slots_wanted(left: int, scan_s: float | None) -> int:
@@ -118,12 +113,11 @@ def offers(
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
     waiting = [b for b in batches if b.place is Place.WAITING]
-    left = most - sum(weight(b, per_task) for b in casting if b.worker in slots)
     behind = [b for b in batches if b.place in (Place.CAST, Place.COLLECTING)]
-    left -= sum(weight(b, per_task) for b in behind)
+    left = most - weight([*behind, *(b for b in casting if b.worker in slots)], per_task)
     backlog = any(b.place is Place.CAST for b in behind)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
-    spread = -(-_weight(waiting, per_task) // max(1, idle))  # all idle slots get some
+    spread = -(-weight(waiting, per_task) // max(1, idle))  # all idle slots get some
     size = per_task if backlog else min(per_task, spread)
     groups: dict[object, deque[Batch]] = {}  # those that may share a task
     for batch in waiting:
@@ -144,11 +138,11 @@ def offers(
             break
         group = groups[_group(first)]
         busy = backlog or load[address] >= slots[address]
-        if busy and not first.deaths and min(left, _weight(group, per_task)) < per_task:
+        if busy and not first.deaths and min(left, weight(group, per_task)) < per_task:
             passed.update(group)  # a task that has to wait may become larger
             continue
         task = _task(group, min(size, left), per_task)
-        left -= _weight(task, per_task)
+        left -= weight(task, per_task)
         passed.update(task)
         chosen.append((task, address))
         load[address] += 1
@@ -164,15 +158,11 @@ def _group(batch: Batch) -> object:
     return batch.job.number if batch.divided else batch.job.scene
 
 
-def _weight(batches: Iterable[Batch], per_task: int) -> float:
-    return sum(weight(batch, per_task) for batch in batches)
-
-
 def _task(group: deque[Batch], most: float, per_task: int) -> list[Batch]:
     """Take the batches of a task from a group, one at least."""
     task = [group.popleft()]
-    taken = weight(task[0], per_task)
-    while group and (taken := taken + weight(group[0], per_task)) <= most:
+    taken = weight(task, per_task)
+    while group and (taken := taken + weight([group[0]], per_task)) <= most:
         task.append(group.popleft())
     return task
 
