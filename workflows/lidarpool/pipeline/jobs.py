@@ -120,10 +120,6 @@ class Batch:
     collector: str = ""  # name of the task of stage 4
     deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
     divided: bool = False  # not to be cast with batches of other jobs
-    share: float = field(init=False)  # of the memory that a worker has for a casting task
-
-    def __post_init__(self) -> None:
-        self.share = len(self) / self.job.fit
 
     def __len__(self) -> int:
         return self.stop - self.first

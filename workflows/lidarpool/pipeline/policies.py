@@ -63,7 +63,7 @@ def weight(batches: Iterable[Batch], per_task: int) -> float:
     All of a task's batches are in a worker's memory at a time: one that takes half of what is there
     counts as half a task.
     """
-    return sum(max(1.0, batch.share * per_task) for batch in batches)
+    return sum(max(1.0, per_task * len(batch) / batch.job.fit) for batch in batches)
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:

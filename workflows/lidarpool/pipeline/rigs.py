@@ -12,9 +12,8 @@ import pickle
 import threading
 import time
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import cloudpickle
 from distributed import get_worker
 
 from poolpart import own_device
@@ -25,26 +24,6 @@ from ..sensor import Survey
 from ..simulator.rig import Rig
 
 UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
-
-
-def packed_plan(name: str, scene: Scene, survey: bytes, backend: str) -> bytes:
-    """Return all that a rig is made of but the scene's still part, which has a name, as bytes.
-
-    Workers check their version before they unpickle them. `survey` is pickled: stage 1 gets the
-    same. The backend is the same on all workers.
-    """
-    return cloudpickle.dumps((name, scene.actors, survey, backend), protocol=5)
-
-
-def packed_still(scene: Scene) -> bytes:
-    """Return a scene's still part as bytes."""
-    return cloudpickle.dumps(scene.with_actors(()), protocol=5)
-
-
-def still_part(scene: Scene) -> tuple[int, ...]:
-    """Identity of a scene's still part while it exists: surveys of it share their trees."""
-    still = [field.name for field in fields(scene) if field.name != "actors"]
-    return tuple(id(getattr(scene, name)) for name in still)
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened

@@ -6,10 +6,10 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from functools import partial
+from dataclasses import dataclass, field, fields
 from typing import Any
 
+import cloudpickle
 from distributed import Client, Future
 
 from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
@@ -22,7 +22,7 @@ from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_
 from .jobs import Outcome
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigFailed, RigMissing, drop_all, packed_plan, packed_still, still_part
+from .rigs import RigFailed, RigMissing, drop_all
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
@@ -113,11 +113,14 @@ class CastingWorkers:
 
     def add(self, job: int, scene: Scene, survey: bytes) -> str:
         """Let a job be cast, its survey pickled; returns a name that jobs of one scene share."""
-        key, pack = still_part(scene), partial(packed_still, scene)
-        still = self._scenes.pop(key, None) or self._packed("scene", pack)
+        # What identifies its still part while it exists: jobs of it share their trees.
+        key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
+        still = self._scenes.pop(key, None)
+        if still is None:
+            still = self._packed("scene", lambda: _pickled(scene.with_actors(())))
         self._scenes[key] = still  # the last used
-        plan = partial(packed_plan, still.name, scene, survey, self._backend)
-        rig = self._packed(str(job), plan)
+        plan = still.name, scene.actors, survey, self._backend
+        rig = self._packed(str(job), lambda: _pickled(plan))
         self._jobs[job] = rig, still
         return still.name
 
@@ -323,6 +326,11 @@ class CastingWorkers:
                 f"{words_on_memory(self._client, self._died)}: "
                 "look into their logs."
             )
+
+
+def _pickled(thing: object) -> bytes:
+    data: bytes = cloudpickle.dumps(thing, protocol=5)
+    return data
 
 
 def share(partition: Partition, thing: Any, **options: Any) -> Future:
