@@ -257,15 +257,13 @@ class LongStages:
                 free[task.worker] = free.get(task.worker, 0) + behind
                 self._submit(name, free)
                 started.append(name)
-            elif task.dead_since is not None and now - task.dead_since > self._patience_s:
-                self._miss(name)
+                continue
+            # One of several collectors is not needed: the others do its work.
+            spare = name.startswith(COLLECT) and self.collectors
+            if task.dead_since and now - task.dead_since > self._patience_s and not spare:
+                what = f"no free slot in partition {self.partition.name!r} for"
+                raise self._too_few(f"Stage {name} has had {what}", " since its worker died")
         return died, started
-
-    def _miss(self, name: str) -> None:
-        """LidarpoolError for a stage that has had no slot for long, unless others do its work."""
-        if not (name.startswith(COLLECT) and self.collectors):
-            what = f"no free slot in partition {self.partition.name!r} for"
-            raise self._too_few(f"Stage {name} has had {what}", " since its worker died")
 
     def _count_death(self, name: str, worker: str) -> None:
         """LidarpoolError when a stage keeps dying."""

@@ -252,16 +252,12 @@ class CastingWorkers:
         return self.seen
 
     def _check(self) -> None:
-        """Record workers that may cast; one that answered and has stopped since is asked again."""
+        """Record the workers that may cast."""
         for address, future in list(self._setups.items()):
-            if future.status == "error" and not was_killed(future):
+            if future.status == "finished" and address in self.seen.free:
+                self._take(address, future)
+            elif future.status == "error" and not was_killed(future):
                 raise_if_failed(future, CHECKING)
-            if future.status != "finished" or address not in self.seen.free:
-                continue
-            found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
-            if future.key in found:
-                del self._setups[address]
-                self._take(address, found[future.key])
 
     def want(self, slots: int) -> None:
         """Want so many slots of a partition that grows with its work; 0 when there is no more.
@@ -292,8 +288,13 @@ class CastingWorkers:
                     callback_timeout=RELEASE_S,
                 )
 
-    def _take(self, address: str, answer: dict[str, Any]) -> None:
-        """Record what a worker has answered."""
+    def _take(self, address: str, future: Future) -> None:
+        """Record a worker that has answered; one that has stopped since is asked again."""
+        found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
+        if future.key not in found:
+            return
+        answer: dict[str, Any] = found[future.key]
+        del self._setups[address]
         if differs := difference(answer["software"], self._software):
             self._refused[address] = differs
             self.notes.append(
