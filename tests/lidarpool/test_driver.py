@@ -19,15 +19,14 @@ from lidarpool.pipeline import (
     JobError,
     RunDatabase,
     RunDriver,
-    casting,
-    collecting,
+    dispatch,
     driver,
     jobs,
     policies,
 )
-from lidarpool.pipeline.batches import PIECES, Place
+from lidarpool.pipeline.dispatch import PIECES
 from lidarpool.pipeline.driver import ANNOUNCED, STALL_S
-from lidarpool.pipeline.long_stages import StageChanges
+from lidarpool.pipeline.jobs import Outcome, Place
 from lidarpool.pipeline.messages import (
     ColumnsLost,
     Failed,
@@ -38,7 +37,6 @@ from lidarpool.pipeline.messages import (
     summary_type,
 )
 from lidarpool.pipeline.policies import LATE_S, SPAN, TASK_SECONDS, most_under_way
-from lidarpool.pipeline.workers import Outcome
 from poolpart import TaskRecord, Whereabouts
 
 SCANS = 60
@@ -52,7 +50,6 @@ class Workers:
     """Workers that cast a batch when they are told to."""
 
     notes = futures = pending = ()
-    backend = "numpy"
 
     def __init__(self):
         self.jobs = {}  # {job: plan}
@@ -78,9 +75,9 @@ class Workers:
     def look(self):
         return self.seen
 
-    def add(self, job, plan):
-        self.jobs[job] = plan
-        return str(id(plan.scene))
+    def add(self, job, scene, survey):
+        self.jobs[job] = scene
+        return str(id(scene))
 
     def remove(self, job):
         del self.jobs[job]
@@ -90,7 +87,7 @@ class Workers:
 
     def cast(self, batches, worker):
         assert worker in self.slots
-        assert len({id(self.jobs[job].scene) for job, _ in batches}) == 1
+        assert len({id(self.jobs[job]) for job, _ in batches}) == 1
         self.tried.update((job, *span) for job, span in batches)
         self.most = max(self.most, len(batches))
         self.tasks += 1
@@ -148,7 +145,7 @@ class Stages:
         self.ended = False
         self.failure = ""
         self.wanted = True  # whether scans are taken
-        self.changes = StageChanges(started=["generate", "sort", *self.collectors])
+        self.changes = ({}, ["generate", "sort", *self.collectors])
         self._storage, self._workers = storage, workers
         self._following = Counter()  # {job: the scan that the sorter waits for}
 
@@ -158,19 +155,15 @@ class Stages:
         self._storage.prepare()
 
     def look(self, progress):
-        changes, self.changes = self.changes, StageChanges()
-        if "generate" in changes.started:
+        changes, self.changes = self.changes, ({}, [])
+        if "generate" in changes[1]:
             self.described.clear()
-        if "sort" in changes.started:
+        if "sort" in changes[1]:
             self.unsorted, self._following = [], Counter()
         return changes
 
     def wait(self, seconds, keys, *, scans):
         self.wanted = scans
-
-    def receive(self):
-        messages, self.inbox = self.inbox, []
-        return messages
 
     def send(self, name, messages):
         known = {"generate": self.described, "sort": self.unsorted}
@@ -237,8 +230,8 @@ class Stages:
         left = list(self.orders.get(name, ()))
         if name in self.orders:
             self.orders[name].clear()
-        died = {**self.changes.died, name: GONE}
-        self.changes = StageChanges(died, [*self.changes.started, name])
+        died, started = self.changes
+        self.changes = {**died, name: GONE}, [*started, name]
         return left
 
 
@@ -301,7 +294,7 @@ class Run:
         """Let everybody work to the end, and check that each scan has come once, in order."""
         self.until(lambda: not self.driver.jobs)
         self.driver.close()
-        assert self.driver.ended
+        assert self.stages.ended
         self.driver.finish()
         done = [number for number, error in self.ended.items() if error is None]
         for number in done:
@@ -315,11 +308,13 @@ class Run:
             for part in self.committed[number]:
                 data = self.storage.read(part.name).decode()
                 assert data == f"job {number}, scans {part.first} to {part.stop}"
-        assert not [*self.driver.batches] and not self.workers.casts and self.workers.released
+        assert (
+            not self.driver.dispatcher.batches and not self.workers.casts and self.workers.released
+        )
         assert not self.workers.jobs and not self.driver._announced
 
     def at(self, place, number=None):
-        there = self.driver.batches.at(place)
+        there = self.driver.dispatcher.at(place)
         return there if number is None else [b for b in there if b.job.number == number]
 
 
@@ -342,7 +337,7 @@ def run(empty):
 def clock(monkeypatch):
     """A clock for the driver that only goes when it is told to."""
     clock = SimpleNamespace(now=time.monotonic())
-    for module in (driver, casting, collecting, jobs):
+    for module in (driver, dispatch, jobs):
         monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now))
     return clock
 
@@ -415,7 +410,7 @@ def test_a_late_batch_is_offered_again_and_whatever_arrives_second_does_no_harm(
         orders.clear()
     clock.now += LATE_S + 1
     run.step()
-    run.until(lambda: span[0] in run.job.parts.parts)
+    run.until(lambda: not run.job.parts.missing(*span))
     assert run.workers.tried[0, *span] == 2
     before = len(run.committed[0])
     written = run.storage.read(name)
@@ -436,7 +431,7 @@ def test_what_is_lost_on_its_way_is_cast_again(run, how):
     run.stages.held.clear()  # the worker has died
     run.stages.inbox += answers if how == "held" else [ColumnsLost(order.key)]
     run.step()
-    assert span[0] not in run.job.parts.parts
+    assert run.job.parts.missing(*span) == [span]
     run.end()
     assert run.workers.tried[0, *span] == 2
 
@@ -551,7 +546,7 @@ def test_a_suspect_that_is_innocent_is_not_divided(run):
     alone = [b for b in run.at(Place.CASTING) if b.worker == batch.worker]
     assert batch.deaths["intersect"] == 2 and alone == [batch]
     run.end()
-    assert batch.span in {(part.first, part.stop) for part in run.committed[0]}
+    assert (batch.first, batch.stop) in {(part.first, part.stop) for part in run.committed[0]}
 
 
 def test_batches_under_way_are_bounded_whoever_is_slow(run):
@@ -560,8 +555,8 @@ def test_batches_under_way_are_bounded_whoever_is_slow(run):
     for _ in range(5 * most):
         run.step()
         run.stages.generate()
-    assert len(run.driver.batches) == most and not run.stages.wanted
-    oldest = min(run.driver.batches, key=lambda batch: batch.first)
+    assert len(run.driver.dispatcher.batches) == most and not run.stages.wanted
+    oldest = min(run.driver.dispatcher.batches.values(), key=lambda batch: batch.first)
     for _ in range(5 * SPAN * most):  # all the others go on
         run.step()
         run.stages.generate()
@@ -572,7 +567,7 @@ def test_batches_under_way_are_bounded_whoever_is_slow(run):
             run.stages.inbox += run.stages.collect(order)
         for orders in run.stages.orders.values():
             orders.clear()
-    assert run.driver.batches.span(run.job) <= max(SPAN * most, SCANS) and run.frames[0] == []
+    assert run.job.generated - oldest.first <= max(SPAN * most, SCANS) and run.frames[0] == []
 
 
 def test_a_run_that_is_stopped_leaves_nothing(run):
@@ -602,7 +597,7 @@ def test_whatever_dies_each_scan_arrives_once_in_order(tmp_path_factory, chance)
 
     def cast():
         if run.workers.open:
-            outcomes = (Outcome.DONE, Outcome.DONE, Outcome.DONE, Outcome.NO_RIG, Outcome.KILLED)
+            outcomes = (Outcome.DONE, Outcome.DONE, Outcome.DONE, Outcome.NO_RIG, Outcome.DIED)
             run.workers.end(chance.choice(run.workers.open), chance.choice(outcomes))
 
     def lose_stage():
@@ -670,7 +665,7 @@ def test_a_job_takes_no_more_than_there_is_room_for_while_another_wants_scans(tw
     for _ in range(5 * most):
         two.step()
         two.stages.generate()
-    assert len(two.driver.batches) == most and not two.stages.wanted
+    assert len(two.driver.dispatcher.batches) == most and not two.stages.wanted
     assert two.other.generated == 0
     two.end()
 
@@ -765,7 +760,7 @@ def begin_tiny(run, count, scenes=(SCENE,), fit=1000):
 def test_tiny_jobs_of_a_scene_share_casting_tasks(empty):
     begin_tiny(empty, 64)
     tasks = empty.workers.tasks
-    empty.until(lambda: len(empty.driver.batches) == 64, idle="cast")
+    empty.until(lambda: len(empty.driver.dispatcher.batches) == 64, idle="cast")
     empty.end()
     assert empty.workers.most == 16 and empty.workers.tasks - tasks <= 8
     assert set(empty.workers.tried.values()) == {1} and len(empty.ended) == 65
@@ -787,7 +782,7 @@ def test_jobs_of_different_scenes_share_no_tasks(empty):
 
 def test_of_jobs_in_a_task_that_fails_only_the_cause_does(empty):
     begin_tiny(empty, 30)
-    empty.until(lambda: len(empty.driver.batches) == 30, idle="cast")
+    empty.until(lambda: len(empty.driver.dispatcher.batches) == 30, idle="cast")
 
     def fail():
         for key in empty.workers.open:
@@ -805,7 +800,7 @@ def test_of_jobs_in_a_task_that_fails_only_the_cause_does(empty):
 @pytest.mark.parametrize("stage", ["intersect", "collect"])
 def test_a_scan_that_kills_its_workers_is_found_among_tiny_jobs(empty, stage):
     begin_tiny(empty, 30)
-    empty.until(lambda: len(empty.driver.batches) == 30, idle="cast")
+    empty.until(lambda: len(empty.driver.dispatcher.batches) == 30, idle="cast")
     empty.until(striking(empty, stage, 3, job=17))
     assert empty.fails(17).startswith(f"scan 3 kills the worker that runs stage {stage}")
     empty.end()

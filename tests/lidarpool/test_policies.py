@@ -7,29 +7,23 @@ from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.pipeline.batches import Batch, Batches, Place
+from lidarpool.pipeline.jobs import Batch, Outcome, Place
 from lidarpool.pipeline.names import INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
-    KILLS_MOST,
     LATE_FACTOR,
     LATE_S,
-    SPAN,
     SUSPECT_DEATHS,
     TASK_BATCHES,
     TASK_SECONDS,
-    Loss,
-    Verdict,
     batches_per_task,
     handovers,
     late_after_s,
     loss,
     offers,
-    room,
     scans_per_batch,
     slots_wanted,
-    verdict,
     weight,
 )
 from poolpart import Whereabouts
@@ -85,11 +79,6 @@ def test_scans_of_a_batch(seconds, scans, fit, count, slots, wanted):
     assert scans_per_batch(seconds, scans, fit, count, slots) == wanted
 
 
-def test_no_batches_are_taken_far_ahead_of_the_oldest():
-    assert room(3, 5, 10) == 7
-    assert room(3, SPAN * 10, 10) == 0
-
-
 def test_slots_are_wanted_for_what_is_left():
     assert slots_wanted(100, None) == 100  # nothing is known of them
     assert slots_wanted(100, 0.1) == 1  # of 10 s
@@ -131,8 +120,8 @@ def test_a_task_has_as_many_batches_as_are_worth_it():
 
 
 def test_the_batches_of_a_task_fit_into_memory_together():
-    assert weight(batch(0, scans=25), 4) == weight(batch(0), 4) == 1
-    assert weight(batch(0, scans=50), 4) == 2 and weight(batch(0, scans=100), 1) == 1
+    assert weight([batch(0, scans=25)], 4) == weight([batch(0)], 4) == 1
+    assert weight([batch(0, scans=50)], 4) == 2 and weight([batch(0, scans=100)], 1) == 1
     assert sizes(waiting(10, scans=50)) == [2, 2, 2, 2]
     assert sizes([*waiting(2, scans=75), *waiting(4, first=20)]) == [1, 2]
     there = waiting(20, scans=50)
@@ -214,8 +203,8 @@ def test_batches_are_late_by_what_others_took():
     ("place", "reason"),
     [
         (Place.WAITING, None),
-        (Place.CASTING, Loss.DIED),
-        (Place.CAST, Loss.GONE),
+        (Place.CASTING, Outcome.DIED),
+        (Place.CAST, Outcome.GONE),
         (Place.COLLECTING, None),  # its collector may have the columns, and says if it has not
     ],
 )
@@ -226,15 +215,15 @@ def test_the_batches_of_a_worker_that_is_gone(place, reason):
 def test_a_silent_worker_is_left_if_there_is_another():
     seen = Whereabouts(frozenset({A, B}), frozenset({A}), {B: 1})
     for place in (Place.CASTING, Place.CAST):
-        assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Loss.GONE
+        assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Outcome.GONE
         assert loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
 
 
 @pytest.mark.parametrize(
     ("task", "reason"),
     [
-        (TaskPlace("no-worker", (), 0), Loss.REFUSED),
-        (TaskPlace("processing", (A,), 0), Loss.REFUSED),
+        (TaskPlace("no-worker", (), 0), Outcome.REFUSED),
+        (TaskPlace("processing", (A,), 0), Outcome.REFUSED),
         (TaskPlace("processing", (A,), 0, started=True), None),
         (TaskPlace("memory", (A,), 0), None),
         (None, None),
@@ -249,52 +238,12 @@ def test_a_worker_that_takes_no_tasks_ends_what_it_has_begun(task, reason):
     ("place", "prepared", "reason"),
     [
         (Place.WAITING, 2, None),
-        (Place.CASTING, 2, Loss.LATE),
+        (Place.CASTING, 2, Outcome.LATE),
         (Place.CASTING, 1, None),  # nobody else could do it
         (Place.CAST, 2, None),  # it waits for a collector
-        (Place.COLLECTING, 1, Loss.LATE),
+        (Place.COLLECTING, 1, Outcome.LATE),
     ],
 )
 def test_a_late_batch(place, prepared, reason):
     assert loss(batch(0, place, A), HERE, prepared, LATE_S + 1, LATE_S) is reason
     assert loss(batch(0, place, A), HERE, prepared, LATE_S - 1, LATE_S) is None
-
-
-def test_a_batch_is_judged_by_the_deaths_of_those_that_had_it():
-    for deaths in range(SUSPECT_DEATHS + 1):
-        assert verdict(deaths, 10) is verdict(deaths, 1) is Verdict.RETRY
-    assert verdict(SUSPECT_DEATHS + 1, 2) is Verdict.SPLIT
-    for kills in range(1, KILLS_MOST):
-        assert verdict(SUSPECT_DEATHS + kills, 1) is Verdict.RETRY
-    assert verdict(SUSPECT_DEATHS + KILLS_MOST, 1) is Verdict.POISON
-
-
-def test_pieces_hold_the_scans_of_the_whole_and_keep_its_place_in_the_order():
-    batches = Batches()
-    batches.add(JOB, 0, 5)
-    whole = batches.add(JOB, 5, 42)
-    batches.add(JOB, 42, 50)
-    batches.add(OTHER, 5, 42)
-    batches.split(whole, Counter(collect=2))
-    pieces = batches.within(JOB.number, 5, 42)
-    assert [scan for piece in pieces for scan in piece.scans] == list(range(5, 42))
-    assert {piece.deaths["collect"] for piece in pieces} == {2}
-    assert batches.waiting[1:-2] == pieces and whole not in [*batches]
-    assert batches.span(JOB) == 4 and batches.span(OTHER) == 1
-    for done in batches.within(JOB.number, 0, 5):
-        batches.remove(done)
-    assert batches.span(JOB) == 3
-    batches.postpone(pieces[0])
-    assert batches.waiting[-1] is pieces[0]
-
-
-def test_a_task_is_forgotten_with_its_last_batch():
-    batches = Batches()
-    one, two = (batches.add(job, 0, 5) for job in (JOB, OTHER))
-    for each in (one, two):
-        batches.offered(each, "key", A, 1.0)
-    assert batches.casting == {"key": A} and batches.of_task("key") == [one, two]
-    assert batches.forget_task(one) == "" and batches.of_task("key") == [two]
-    batches.move(one, Place.WAITING, 2.0)
-    assert batches.forget_task(two) == "key" and batches.of_task("key") == []
-    assert batches.at(Place.CASTING) == [two] and batches.waiting == [one]

@@ -35,7 +35,7 @@ def test_it_goes_on_from_the_last_copy(unfinished):
     assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
     assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)], "parts say what is not in the copy"
     assert add(store, 2, 3) and add(store, 5, 6)
-    store.only.parts.count_frame(5)
+    store.only.parts.frames = 6
     store.save(now=True)
     store.tidy()
     mark = mark_name(store.db.meta["mark"])

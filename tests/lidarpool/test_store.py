@@ -77,7 +77,7 @@ def test_a_run_from_its_beginning_to_its_end(folder):
     add(store, 2, 6)
     assert store.kept == "4 of 6 scans" and store.only.progress().points == 12
     add(store, 0, 2)
-    store.only.parts.count_frame(5)
+    store.only.parts.frames = 6
     assert store.only.complete
     cloud = store.only.points().load()
     assert cloud.scan.tolist() == np.repeat(np.arange(6), 3).tolist()
@@ -309,7 +309,7 @@ def test_places_that_cannot_be(tmp_path):
 def test_an_error_tells_how_to_go_on(anywhere):
     store = opened(anywhere)
     add(store, 0, 2)
-    store.only.parts.count_frame(0)
+    store.only.parts.frames = 1
     with pytest.raises(KeyboardInterrupt) as caught, store.kept_on_error():
         raise KeyboardInterrupt
     (note,) = caught.value.__notes__

@@ -90,12 +90,12 @@ class Together:
                     self.numbers[name], scene, survey, fit=1000, in_all=10**6,
                     on_frame=take if on_frame else None, read=str,
                 )  # fmt: skip
-            while not driver.ended:
-                moved = driver.closed or driver.step()
+            while not driver.stages.ended:
+                moved = driver.stages.closed or driver.step()
                 for job, error in driver.take_ended():
                     if error is not None:
                         self.failed[names[job.number]] = str(error)
-                if not driver.jobs and not driver.closed:
+                if not driver.jobs and not driver.stages.closed:
                     driver.close()
                 driver.wait(0.0 if moved else 0.02)
         except BaseException as error:
@@ -125,8 +125,8 @@ class Together:
         for name in self.storage.sizes():
             receipt = self.rebuilt(name)
             job = self.db.under_way[receipt.job]
-            if receipt.first in job.parts and not receipt.job >= len(alone):
-                assert job.parts[receipt.first] == replace(receipt, summaries=b"")
+            if not job.missing(receipt.first, receipt.stop) and not receipt.job >= len(alone):
+                assert job.part_of(receipt.first) == replace(receipt, summaries=b"")
                 assert job.summaries_of([receipt.first]) == [(receipt.first, receipt.summaries)]
 
     def rebuilt(self, name: str) -> Receipt:
@@ -177,7 +177,7 @@ def test_jobs_of_a_scene_share_its_trees_and_give_the_points_of_each_alone(
 def _kept() -> int:
     from lidarpool.pipeline import rigs
 
-    return len(rigs._rigs) + len(rigs._scenes)
+    return len(rigs._kept)
 
 
 @pytest.mark.slow

@@ -1,6 +1,6 @@
 """The survey pipeline: four stages on the partitions of a cluster, and their driver."""
 
-from .database import JobParts, RunDatabase
+from .database import RunDatabase
 from .driver import RunDriver
 from .failures import JobError
 from .jobs import JobState
@@ -21,7 +21,6 @@ __all__ = [
     "CastingWorkers",
     "Frame",
     "JobError",
-    "JobParts",
     "JobState",
     "LongStages",
     "Receipt",

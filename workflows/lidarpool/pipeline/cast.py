@@ -73,7 +73,7 @@ def _cast(rig: Rig, work: CastWork, first: int, stop: int) -> CastBatch:
     about = {"run": work.handle.partition(".")[0], "stage": INTERSECT, "job": work.job}
     scans = list(range(first, stop))
     trace("intersect.start", **about, scans=scans)
-    with naming_scans(first, stop - 1):
+    with naming_scans(first, stop):
         found = list(rig.cast(first, stop))
         trace("intersect.cast", **about, scans=scans)
         part = replace(

@@ -15,6 +15,7 @@ import sqlite3
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -45,29 +46,25 @@ CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEX
 """
 _DONE, _FAILED = 1, 2  # what became of a job
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
+_FIRST = attrgetter("first")  # the order of parts
 
 
 class JobParts:
     """What is committed of a job under way; only its `RunDatabase` adds and removes parts.
 
-    `read` reads the summaries of parts, by their first scans.
+    `read` reads the summaries of a part.
     """
 
-    def __init__(
-        self, number: int, scan_count: int, read: Callable[[int, Iterable[int]], list[bytes]]
-    ) -> None:
+    def __init__(self, number: int, scan_count: int, read: Callable[[Receipt], bytes]) -> None:
         self.number, self.scan_count, self._read = number, scan_count, read
         self.has_frames = False  # whether scans are handed out as frames, too
         self.clear()
 
     def clear(self) -> None:
         """Forget all of it."""
-        # {first scan: its part}, without summaries
-        self.parts: dict[int, Receipt] = {}
+        self.ordered: list[Receipt] = []  # the parts in scan order, without summaries
         self.trials: list[Trial] = []
-        self.committed = np.zeros(self.scan_count, bool)
         self.scans_done = self.point_count = self.hits = 0
-        self._firsts: list[int] = []  # of the parts, in order
         self.frames = self.frames_written = 0  # scans handed out as frames, from the first on
 
     # -- reading -------------------------------------------------------------------------
@@ -79,14 +76,9 @@ class JobParts:
         return framed and self.scans_done == self.scan_count
 
     @property
-    def ordered(self) -> list[Receipt]:
-        """The parts in scan order."""
-        return [self.parts[first] for first in self._firsts]
-
-    @property
     def cells(self) -> Ints | None:
         """Lowest and highest cell of all points, (2, 3); None without points."""
-        found = [part.cells for part in self.parts.values() if part.cells]
+        found = [part.cells for part in self.ordered if part.cells]
         if not found:
             return None
         table = np.array(found, np.int64).reshape(-1, 2, 3)
@@ -94,56 +86,52 @@ class JobParts:
 
     def unframed(self) -> list[Receipt]:
         """Parts with scans that were not handed out as frames, with summaries, in order."""
-        at = max(0, bisect.bisect_right(self._firsts, self.frames) - 1)
-        parts = [self.parts[first] for first in self._firsts[at:]]
-        return self._with_summaries([part for part in parts if part.stop > self.frames])
+        parts = [part for part in self.ordered[self._at(self.frames) :] if part.stop > self.frames]
+        return [replace(part, summaries=self._read(part)) for part in parts]
 
     def summaries_of(self, scans: Iterable[int]) -> list[tuple[int, bytes]]:
         """Summaries of the parts that hold some scans: (first scan, summaries), in order."""
-        firsts = sorted({self.part_of(scan).first for scan in scans})
-        return [*zip(firsts, self._read(self.number, firsts), strict=True)]
-
-    def _with_summaries(self, parts: Sequence[Receipt]) -> list[Receipt]:
-        read = self._read(self.number, [part.first for part in parts])
-        return [replace(part, summaries=data) for part, data in zip(parts, read, strict=True)]
+        parts = {part.first: part for part in map(self.part_of, sorted(scans))}
+        return [(first, self._read(part)) for first, part in parts.items()]
 
     def part_of(self, scan: int) -> Receipt:
         """Part of a committed scan; KeyError if it is not committed."""
-        at = bisect.bisect_right(self._firsts, scan) - 1
-        part = self.parts[self._firsts[at]] if at >= 0 else None
-        if part is None or scan >= part.stop:
-            raise KeyError(scan)
-        return part
+        for part in self.ordered[self._at(scan) :][:1]:
+            if scan in part.scans:
+                return part
+        raise KeyError(scan)
 
     def missing(self, first: int, stop: int) -> list[tuple[int, int]]:
         """Return the scans from `first` to `stop` that are not committed, as half-open ranges."""
-        absent = np.flatnonzero(~self.committed[first:stop]) + first
-        cuts = np.flatnonzero(np.diff(absent) > 1) + 1
-        return [(int(run[0]), int(run[-1]) + 1) for run in np.split(absent, cuts) if len(run)]
+        absent, at = [], self._at(first)
+        while first < stop and at < len(self.ordered):
+            part = self.ordered[at]
+            if first < part.first:
+                absent.append((first, min(part.first, stop)))
+            first, at = max(first, part.stop), at + 1
+        return [*absent, (first, stop)] if first < stop else absent
+
+    def _at(self, scan: int) -> int:
+        """Index of the last part that begins with a scan or before; 0 if there is none."""
+        return max(0, bisect.bisect_right(self.ordered, scan, key=_FIRST) - 1)
 
     # -- writing -------------------------------------------------------------------------
 
-    def count_frame(self, scan: int) -> None:
-        """Note that the next scan was handed out as a frame."""
-        self.frames = scan + 1
-
     def enter(self, part: Receipt) -> None:
         """Add a part."""
-        self.parts[part.first] = replace(part, summaries=b"", record=None, held_at="")
-        bisect.insort(self._firsts, part.first)
-        self.committed[part.first : part.stop] = True
-        self.scans_done += part.stop - part.first
-        self.point_count += part.rows
-        self.hits += part.hits
+        bare = replace(part, summaries=b"", record=None, held_at="")
+        bisect.insort(self.ordered, bare, key=_FIRST)
+        self._count(part, 1)
 
     def leave(self, part: Receipt) -> None:
         """Remove a part."""
-        del self.parts[part.first]
-        self._firsts.remove(part.first)
-        self.committed[part.first : part.stop] = False
-        self.scans_done -= part.stop - part.first
-        self.point_count -= part.rows
-        self.hits -= part.hits
+        del self.ordered[self._at(part.first)]
+        self._count(part, -1)
+
+    def _count(self, part: Receipt, sign: int) -> None:
+        self.scans_done += sign * len(part.scans)
+        self.point_count += sign * part.rows
+        self.hits += sign * part.hits
 
 
 class DamagedError(LidarpoolError):
@@ -165,7 +153,8 @@ class RunDatabase:
         self.path, self._durable = path, durable
         self.meta: dict[str, str] = {}
         self.under_way: dict[int, JobParts] = {}  # {number of a job: what is committed of it}
-        self._begun: set[int] = set()  # numbers of jobs with rows in `_OF_JOBS`
+        # Numbers of the jobs that have not ended and of which something is committed.
+        self.begun: set[int] = set()
         self.ended_count = 0
         self._ended = bytearray()  # of each job: 0, _DONE or _FAILED
         with self._explained():
@@ -186,8 +175,7 @@ class RunDatabase:
         if not self._sql.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             for statement in _TABLES.split(";"):
                 self._sql.execute(statement)
-            for name, value in new.items():
-                self._set(name, value)
+            self._sql.executemany("INSERT INTO meta VALUES (?, ?)", new.items())
         self._sql.execute("COMMIT")
         self.meta = dict(self._sql.execute("SELECT name, value FROM meta"))
         if (made := self.meta.get("format")) != str(FORMAT):
@@ -198,10 +186,11 @@ class RunDatabase:
             for number, failed in rows:
                 self._mark_ended(number, _FAILED if failed else _DONE)
         for table in _OF_JOBS:
-            self._begun.update(job for (job,) in self._rows(f"SELECT DISTINCT job FROM {table}"))
+            self.begun.update(job for (job,) in self._rows(f"SELECT DISTINCT job FROM {table}"))
 
     def _rows(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
-        return self._sql.execute(query, values).fetchall()
+        with self._explained():
+            return self._sql.execute(query, values).fetchall()
 
     # -- reading -------------------------------------------------------------------------
 
@@ -209,39 +198,31 @@ class RunDatabase:
         """Return what is committed of a job that has not ended; kept until it has."""
         if (found := self.under_way.get(number)) is not None:
             return found
-        job = self.under_way[number] = JobParts(number, scan_count, self._summaries)
-        if number in self._begun:
-            try:
+        job = JobParts(number, scan_count, self._summaries)
+        if number in self.begun:
+            with self._explained():
                 self._read(job)
-            except BaseException:
-                del self.under_way[number]
-                raise
+        self.under_way[number] = job
         return job
 
     def _read(self, job: JobParts) -> None:
         number, scan_count = job.number, job.scan_count
         query = "SELECT first, stop, rows, size, hits, cells FROM parts WHERE job = ?"
-        with self._explained():
-            for first, stop, *counts, cells in self._rows(query, number):
-                if not 0 <= first < stop <= scan_count:
-                    raise ValueError(f"a part has scans {first} to {stop} of {scan_count}")
-                name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
-                rows, size, hits = counts
-                job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
-            query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
-            job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, number)]
-            for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
-                job.frames = job.frames_written = int(count)
-
-    @property
-    def begun(self) -> list[int]:
-        """Numbers of the jobs that have not ended and of which something is committed."""
-        return sorted(self._begun)
+        for first, stop, *counts, cells in self._rows(query, number):
+            if not 0 <= first < stop <= scan_count:
+                raise ValueError(f"a part has scans {first} to {stop} of {scan_count}")
+            name, box = part_name(self.meta["mark"], number, first, stop), json.loads(cells)
+            rows, size, hits = counts
+            job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
+        query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
+        job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, number)]
+        for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
+            job.frames = job.frames_written = int(count)
 
     @property
     def used(self) -> bool:
         """Whether anything is committed, or was."""
-        return "forgot" in self.meta or bool(self.ended_count or self._begun)
+        return "forgot" in self.meta or bool(self.ended_count or self.begun)
 
     def ended(self, number: int) -> bool:
         """Whether a job has ended."""
@@ -253,10 +234,8 @@ class RunDatabase:
 
     def hash_of(self, number: int) -> str:
         """Hash of what a job under way is made of; empty if none was kept."""
-        with self._explained():
-            return "".join(
-                h for (h,) in self._rows("SELECT hash FROM made_of WHERE job = ?", number)
-            )
+        found = self._rows("SELECT hash FROM made_of WHERE job = ?", number)
+        return "".join(text for (text,) in found)
 
     def job_rows(self) -> Iterator[dict[str, Any]]:
         """Yield what was stored of the jobs that have ended, by number; one at a time."""
@@ -267,18 +246,17 @@ class RunDatabase:
             for (data,) in rows:
                 yield json.loads(data)
 
-    def _summaries(self, number: int, firsts: Iterable[int]) -> list[bytes]:
+    def _summaries(self, part: Receipt) -> bytes:
         query = "SELECT summaries FROM parts WHERE job = ? AND first = ?"
-        with self._explained():
-            return [self._rows(query, number, first)[0][0] for first in firsts]
+        ((data,),) = self._rows(query, part.job, part.first)
+        return bytes(data)
 
     # -- writing -------------------------------------------------------------------------
 
     def set(self, **values: str) -> None:
         """Store some values."""
         with self._transaction():
-            for name, value in values.items():
-                self._set(name, value)
+            self._sql.executemany("INSERT OR REPLACE INTO meta VALUES (?, ?)", values.items())
         self.meta |= values
 
     def commit(self, receipts: Sequence[Receipt]) -> list[Receipt]:
@@ -287,26 +265,26 @@ class RunDatabase:
         A part with a scan that is committed already is left out.
         """
         new: list[Receipt] = []
-        taken: dict[int, set[int]] = {}  # {job: scans}
         for receipt in receipts:
-            scans, of_job = range(receipt.first, receipt.stop), taken.setdefault(receipt.job, set())
-            job = self.under_way.get(receipt.job)
-            if job is None or job.committed[receipt.first : receipt.stop].any():
-                continue
-            if of_job.isdisjoint(scans):
+            span, job = (receipt.first, receipt.stop), self.under_way.get(receipt.job)
+            if job is not None and job.missing(*span) == [span]:
+                job.enter(receipt)
                 new.append(receipt)
-                of_job.update(scans)
-        if new:
-            rows = [
-                (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
-                for p in new
-            ]
+        if not new:
+            return new
+        rows = [
+            (p.job, p.first, p.stop, p.rows, p.size, p.hits, json.dumps(p.cells), p.summaries)
+            for p in new
+        ]
+        try:
             with self._transaction():
                 self._sql.executemany("INSERT INTO parts VALUES (?, ?, ?, ?, ?, ?, ?, ?)", rows)
                 self._write_frames()
+        except BaseException:
             for receipt in new:
-                self._begun.add(receipt.job)
-                self.under_way[receipt.job].enter(receipt)
+                self.under_way[receipt.job].leave(receipt)
+            raise
+        self.begun.update(receipt.job for receipt in new)
         return new
 
     def set_hash(self, number: int, text: str) -> None:
@@ -332,7 +310,7 @@ class RunDatabase:
                 # To the bit: a float is written with the digits that identify it.
                 [(number, t.trial, json.dumps(vars(t), default=np.ndarray.tolist)) for t in trials],
             )
-        self._begun.add(number)
+        self.begun.add(number)
         self.under_way[number].trials += trials
 
     def end_jobs(self, jobs: Iterable[tuple[int, bool, Mapping[str, Any]]]) -> None:
@@ -345,7 +323,7 @@ class RunDatabase:
         with self._transaction():
             self._sql.executemany("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", rows)
             self._delete(ended)
-        self._begun -= ended.keys()
+        self.begun -= ended.keys()
         for number, (failed, _) in ended.items():
             self._mark_ended(number, _FAILED if failed else _DONE)
             self.under_way.pop(number, None)
@@ -353,18 +331,17 @@ class RunDatabase:
     def forget_jobs(self, numbers: Iterable[int]) -> None:
         """Let some jobs be done again: there are files of them, also if there is nothing else."""
         self.set(forgot="jobs")
-        forgotten = [*numbers]
+        forgotten = [(number,) for number in numbers]
         with self._transaction():
-            for number in forgotten:
-                self._sql.execute("DELETE FROM jobs WHERE number = ?", (number,))
-        for number in forgotten:
+            self._sql.executemany("DELETE FROM jobs WHERE number = ?", forgotten)
+        for (number,) in forgotten:
             self._mark_ended(number, 0)
 
     def restart(self, number: int) -> None:
         """Drop all that is committed of a job that has not ended."""
         with self._transaction():
             self._delete([number])
-        self._begun.discard(number)
+        self.begun.discard(number)
         if (job := self.under_way.get(number)) is not None:
             job.clear()
 
@@ -383,12 +360,9 @@ class RunDatabase:
         """Close the file."""
         self._sql.close()
 
-    def _set(self, name: str, value: str) -> None:
-        self._sql.execute("INSERT OR REPLACE INTO meta VALUES (?, ?)", (name, value))
-
     def _delete(self, numbers: Iterable[int]) -> None:
         """Delete what is committed of some jobs."""
-        there = [(number,) for number in numbers if number in self._begun]
+        there = [(number,) for number in numbers if number in self.begun]
         for table in _OF_JOBS:
             self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", there)
 
@@ -424,22 +398,20 @@ class RunDatabase:
         """Translate an error of SQLite."""
         try:
             yield
-        except sqlite3.OperationalError as error:
-            if "locked" in str(error):
+        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+            words = str(error)
+            # Without a table or column it is not what it was.
+            if not isinstance(error, sqlite3.OperationalError) or "no such" in words:
+                raise DamagedError(
+                    f"{self.path} is damaged ({words}): drop the run with --fresh, or give another "
+                    "folder."
+                ) from error
+            if "locked" in words:
                 raise LidarpoolError(f"Another run is using {self.path.parent}.") from error
-            if "no such" in str(error):  # table or column
-                raise self._damaged(error) from error
             raise LidarpoolError(
-                f"{self.path} cannot be written ({error}): make room on its disk, or give another "
+                f"{self.path} cannot be written ({words}): make room on its disk, or give another "
                 "folder."
             ) from error
-        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
-            raise self._damaged(error) from error
-
-    def _damaged(self, error: Exception) -> DamagedError:
-        return DamagedError(
-            f"{self.path} is damaged ({error}): drop the run with --fresh, or give another folder."
-        )
 
 
 def _trial_of(data: dict[str, Any]) -> Trial:

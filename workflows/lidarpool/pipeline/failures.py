@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import pickle
 from collections.abc import Collection, Iterator
 from contextlib import AbstractContextManager, contextmanager
 
@@ -12,6 +11,7 @@ from poolpart import WorkerLeft
 
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
+from .messages import scans_in_words
 
 ASK_S = 10.0  # for an error's text, which the scheduler has
 
@@ -25,16 +25,7 @@ class ScanError(RuntimeError):
 
 
 @contextmanager
-def sending() -> Iterator[None]:
-    """Turn errors of pickling what a user has defined into a JobError."""
-    try:
-        yield
-    except (pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError) as error:
-        raise JobError(f"The survey cannot be sent to the workers: {error}") from error
-
-
-@contextmanager
-def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
+def naming_scans(first: int, stop: int) -> Iterator[None]:
     """Prefix the message of any error with the current scans.
 
     It becomes a ScanError, because that can always be sent through Dask; but a WorkerLeft passes,
@@ -45,8 +36,8 @@ def naming_scans(first: int, last: int | None = None) -> Iterator[None]:
     except WorkerLeft:
         raise
     except Exception as error:
-        span = f"scan {first}" if last in (None, first) else f"scans {first} to {last}"
-        raise ScanError(f"{span}: {type(error).__name__}: {error}") from error
+        words = scans_in_words(first, stop)
+        raise ScanError(f"{words}: {type(error).__name__}: {error}") from error
 
 
 def storing(storage: Storage) -> AbstractContextManager[None]:

@@ -1,29 +1,21 @@
-"""One job under way: how far it is, and its frames."""
+"""A job under way: how far it is, its frames and its batches."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
+from enum import Enum
 
 import numpy as np
-
-from poolpart import TaskRecord
 
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..sensor import Survey
 from .database import JobParts
-from .messages import (
-    Description,
-    Frame,
-    Receipt,
-    Span,
-    Summaries,
-    samples_of_scan,
-    summary_type,
-)
-from .names import GENERATE, SORT
+from .messages import Frame, Receipt, Summaries, samples_of_scan, summary_type
+from .names import SORT
 
 
 @dataclass(eq=False)
@@ -53,106 +45,90 @@ class JobState:
     condemned: list[str] = field(default_factory=list)  # why scans cannot be done
     sorted_at: float = field(default_factory=time.monotonic)  # when the last frames came
 
-    def __post_init__(self) -> None:
-        if not self.left:  # stage 1 need not describe what is committed
-            self.generated = self.survey.scan_count
-
     @property
-    def complete(self) -> bool:
-        """Whether all is committed, and was handed out if there are frames."""
-        return self.parts.complete
+    def left(self) -> int:
+        """Scans that are not committed."""
+        return self.survey.scan_count - self.parts.scans_done
 
     def trace(self, event: str, stage: str, scans: Iterable[int], **more: str) -> None:
         """Report that the driver has reached a point with some scans."""
         more |= {"run": self.run, "stage": stage}
         trace(f"driver.{event}", job=self.number, scans=list(scans), **more)
 
-    # -- stage 1 ---------------------------------------------------------------------------
-
-    @property
-    def left(self) -> int:
-        """Scans that are not committed."""
-        return self.survey.scan_count - self.parts.scans_done
-
-    @property
-    def is_described(self) -> bool:
-        """Whether stage 1 has nothing to do for it any more."""
-        return self.generated >= self.survey.scan_count
-
-    def batches_to_come(self, scans: int) -> int:
-        """How many batches of so many scans, if they fit, stage 1 has to describe yet."""
-        return -(-(self.survey.scan_count - self.generated) // min(scans, self.fit))
-
-    @property
-    def description(self) -> Description:
-        """What stage 1 has to describe yet."""
-        return Description(self.number, self.packed, self.generated, self.survey.scan_count)
-
-    def take(self, first: int, stop: int) -> list[Span]:
-        """Take scans from stage 1; returns batches of those that are not committed."""
-        first = max(first, self.generated)  # a restarted generator repeats some
-        if first < stop:
-            self.trace("take", GENERATE, range(first, stop))
-        self.generated = max(stop, self.generated)
-        return [
-            (begin, min(begin + self.fit, end))  # the size was advised for another job perhaps
-            for at, end in self.parts.missing(first, stop)
-            for begin in range(at, end, self.fit)
-        ]
-
-    # -- stage 2 ---------------------------------------------------------------------------
-
-    def count_cast(self, scans: int) -> None:
-        """Count scans that stage 2 has finished."""
-        self.cast += scans
-
-    def count_again(self) -> None:
-        """Count a batch that is offered again."""
-        self.offered_again += 1
-
-    def learn(self, record: TaskRecord) -> None:
-        """Count the casting time of a committed batch."""
-        self.seconds += record.seconds
-
-    def condemn(self, reason: str) -> None:
-        """Give scans up; the job fails when its other batches have ended."""
-        self.condemned.append(reason)
-
-    # -- stage 3 ---------------------------------------------------------------------------
-
-    def summaries(self, parts: Sequence[Receipt]) -> list[Summaries]:
-        """Return the messages for the sorter about some parts."""
-        framed, count = self.parts.frames, self.survey.scan_count
-        return [Summaries(self.number, p.first, p.stop, p.summaries, framed, count) for p in parts]
-
-    def wait_for_sorter(self) -> None:
-        """Note that the sorter has news to tell of."""
-        self.sorted_at = time.monotonic()
-
     def hand_out(self, ordered: Summaries) -> int:
         """Hand out frames; returns how many, since some may have been handed out before."""
-        self.sorted_at, framed = time.monotonic(), self.parts.frames
-        kind = summary_type(samples_of_scan(self.survey.scan_count))
+        self.sorted_at, framed, survey = time.monotonic(), self.parts.frames, self.survey
+        kind = summary_type(samples_of_scan(survey.scan_count))
         for scan, summary in zip(ordered.scans, np.frombuffer(ordered.data, kind), strict=True):
-            if scan == self.parts.frames:
-                self._hand_out(scan, summary)
+            if scan != self.parts.frames:
+                continue
+            assert self.on_frame is not None and self.read is not None, "it has frames"
+            samples, spec = summary["samples"], survey.scan(scan)
+            frame = Frame(
+                scan,
+                survey.carried[spec.sensor].name,
+                survey.pose(scan),
+                spec.ray_count,
+                int(summary["hits"]),
+                int(summary["points"]),
+                samples[~np.isnan(samples[:, 0])],
+                self.read,
+            )
+            self.trace("frame", SORT, [scan])
+            self.on_frame(frame)
+            # Only now: after an error of the caller the frame is handed out again.
+            self.parts.frames = scan + 1
+            self.trace("release", SORT, [scan])
         return self.parts.frames - framed
 
-    def _hand_out(self, scan: int, summary: np.void) -> None:
-        assert self.on_frame is not None and self.read is not None, "it has frames"
-        samples, spec = summary["samples"], self.survey.scan(scan)
-        frame = Frame(
-            scan,
-            self.survey.carried[spec.sensor].name,
-            self.survey.pose(scan),
-            spec.ray_count,
-            int(summary["hits"]),
-            int(summary["points"]),
-            samples[~np.isnan(samples[:, 0])],
-            self.read,
-        )
-        self.trace("frame", SORT, [scan])
-        self.on_frame(frame)
-        # Only now: after an error of the caller the frame is handed out again.
-        self.parts.count_frame(scan)
-        self.trace("release", SORT, [scan])
+
+class Place(Enum):
+    """State of a batch."""
+
+    WAITING = "waiting"  # to be offered to a GPU worker
+    CASTING = "casting"  # offered to one
+    CAST = "cast"  # its columns are on that worker
+    COLLECTING = "collecting"  # assigned to a collector
+
+
+class Outcome(Enum):
+    """What has become of a casting task; or why its batches are offered again."""
+
+    PENDING = "pending"
+    DONE = "done"
+    DIED = "its worker died"
+    GONE = "its worker is gone or silent"
+    REFUSED = "its worker takes no tasks"
+    LATE = "it is late"
+    NO_RIG = "its worker has no scene any more"
+    DIVIDE = "its task failed, perhaps because of another job"
+
+
+@dataclass(eq=False)
+class Batch:
+    """Consecutive uncommitted scans of a job on their way to a part."""
+
+    job: JobState
+    first: int
+    stop: int
+    number: int  # of earlier batches: limits how far the last of a job is ahead of its first
+    order: int = 0  # of waiting batches
+    place: Place = Place.WAITING
+    since: float = 0.0  # since when it is in its state
+    key: str = ""  # of the casting task; "" while waiting
+    worker: str = ""  # address of the GPU worker
+    collector: str = ""  # name of the task of stage 4
+    deaths: Counter[str] = field(default_factory=Counter)  # {stage: workers that died with it}
+    divided: bool = False  # not to be cast with batches of other jobs
+
+    def __len__(self) -> int:
+        return self.stop - self.first
+
+    @property
+    def scans(self) -> range:
+        """Numbers of its scans."""
+        return range(self.first, self.stop)
+
+    def move(self, place: Place) -> None:
+        """Record its new state."""
+        self.place, self.since = place, time.monotonic()

@@ -6,7 +6,7 @@ import secrets
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any
 
 from distributed import Client, Future, Lock
@@ -54,14 +54,6 @@ class _Task:
     dead_since: float | None = None  # it has died, and has not been restarted yet
 
 
-@dataclass(frozen=True)
-class StageChanges:
-    """Stages whose workers have died, and stages that were started, again or for the first time."""
-
-    died: Mapping[str, str] = field(default_factory=dict)  # {name of a stage: address}
-    started: Sequence[str] = ()
-
-
 class LongStages:
     """Runs each long stage on a chosen worker, and restarts it when the worker dies.
 
@@ -99,9 +91,9 @@ class LongStages:
         self._submitted = 0
         # A file in the storage, by which collectors find out whether they see it.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
-        self._scans = self._pipe("scans", queue_capacity)
-        self._news = self._pipe("news", 64)  # from stages 3 and 4
-        self._inbox: list[Message] = []
+        self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, client)
+        self._news = Pipe(f"lidarpool-{run}-news", 64, client)  # from stages 3 and 4
+        self.inbox: list[Message] = []  # what has come, for the driver to take
         self._outbox: dict[str, list[Order]] = {}  # by pipe
         self._looked_at = 0.0
         self._progress = -1  # when something was last committed
@@ -133,12 +125,7 @@ class LongStages:
         self._outbox = {}
         found = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=LINGER_S)
         for items in found.values():
-            self._inbox += items
-
-    def receive(self) -> list[Message]:
-        """Messages since the last call."""
-        messages, self._inbox = self._inbox, []
-        return messages
+            self.inbox += items
 
     def send(self, name: str, messages: Sequence[Order]) -> None:
         """Send messages to a stage with the next `wait`.
@@ -166,9 +153,6 @@ class LongStages:
             if name.startswith(COLLECT) and task.dead_since is None
         }
 
-    def _pipe(self, name: str, capacity: int) -> Pipe:
-        return Pipe(f"lidarpool-{self.run}-{name}", capacity, self.client)
-
     @property
     def lacks_slot(self) -> bool:
         """Whether a stage whose worker has died waits for a free slot."""
@@ -191,36 +175,33 @@ class LongStages:
             lock.release()
 
     def _start_all(self) -> None:
-        seen = self._look()
+        seen, now, needed = self._look(), time.monotonic(), len(self._names)
         free = {address: count for address, count in seen.free.items() if count > 0}
-        now, needed = time.monotonic(), len(self._names)
-        if sum(free.values()) >= needed:
-            self.waiting = False
-            if self._waited_from is not None:
-                self.notes.append(
-                    f"the survey waited {now - self._waited_from:.1f} s for partition "
-                    f"{self.partition.name}, until other runs had left it {needed} slots"
-                )
-            for name in self._names:
-                self._submit(name, free)
-            # Another run may look once the lock is free: the scheduler must know the tasks by then.
-            deadline = now + SETTLE_S
-            keys = {task.future.key for task in self._tasks.values()}
-            while self._look().tasks.keys() < keys and time.monotonic() < deadline:
-                time.sleep(0.005)
+        if sum(free.values()) < needed:
+            self.waiting = seen.slots >= needed
+            if self.waiting:
+                self._waited_from = self._waited_from or now
+                self._enough_at = now
+            elif now - self._enough_at > self._patience_s:
+                what = f"has had {seen.slots} of the {needed} slots needed for"
+                raise self._too_few(f"Partition {self.partition.name!r} {what}")
             return
-        self.waiting = seen.slots >= needed
-        if self.waiting:
-            self._waited_from = self._waited_from or now
-            self._enough_at = now
-        elif now - self._enough_at > self._patience_s:
-            what = f"has had {seen.slots} of the {needed} slots needed for {self._patience_s:.0f} s"
-            raise self._too_few(f"Partition {self.partition.name!r} {what}")
+        self.waiting = False
+        if self._waited_from is not None:
+            self.notes.append(
+                f"the survey waited {now - self._waited_from:.1f} s for partition "
+                f"{self.partition.name}, until other runs had left it {needed} slots"
+            )
+        for name in self._names:
+            self._submit(name, free)
+        # Another run may look once the lock is free: the scheduler must know the tasks by then.
+        while len(self._look().tasks) < needed and time.monotonic() < now + SETTLE_S:
+            time.sleep(0.005)
 
-    def _too_few(self, what: str) -> LidarpoolError:
+    def _too_few(self, what: str, since: str = "") -> LidarpoolError:
         return LidarpoolError(
-            f'{what}: start another worker with --resources "{self.partition.name}=1" and run it '
-            "again."
+            f"{what} {self._patience_s:.0f} s{since}: start another worker with --resources "
+            f'"{self.partition.name}=1" and run it again.'
         )
 
     def _look(self) -> Whereabouts:
@@ -229,24 +210,28 @@ class LongStages:
 
     # -- looking after them ------------------------------------------------------------------
 
-    def look(self, progress: int) -> StageChanges:
+    def look(self, progress: int) -> tuple[Mapping[str, str], Sequence[str]]:
         """From time to time, start all stages, or those again that died or wait behind another.
 
-        `progress` is any number that grows when something is committed.
+        `progress` is any number that grows when something is committed. Returns the stages whose
+        workers have died, {name: address}, and those that were started, for the first time or
+        again.
 
         LidarpoolError if a stage has failed, or keeps dying with nothing committed in between, or
         the partition has too few slots for too long.
         """
         now = time.monotonic()
         if now - self._looked_at < LOOK_EVERY_S:
-            return StageChanges()
+            return {}, ()
         self._looked_at = now
         if progress > self._progress:
             self._progress, self._deaths = progress, {}
         if not self._tasks:
             self._start()
-            return StageChanges(started=[*self._tasks])
-        self._check()
+            return {}, [*self._tasks]
+        for name, task in self._tasks.items():
+            if not was_killed(task.future):
+                raise_if_failed(task.future, f"stage {name}")
         died: dict[str, str] = {}
         started: list[str] = []
         seen = self._look()
@@ -261,39 +246,24 @@ class LongStages:
                 task.dead_since = now
                 died[name] = task.worker
                 self._count_death(name, task.worker)
-            behind = task.dead_since is None and self._is_behind_another(task, seen, now)
+            # Whether it waits behind another, on a worker with more tasks than slots.
+            behind = (
+                task.dead_since is None
+                and now - task.since > SETTLE_S
+                and not seen.runs_for_long(task.future.key)
+                and seen.free.get(task.worker, 0) < 0
+            )
             if room and (behind or task.dead_since is not None):
                 free[task.worker] = free.get(task.worker, 0) + behind
                 self._submit(name, free)
                 started.append(name)
-            elif task.dead_since is not None:
-                self._wait_for_slot(name, now - task.dead_since)
-        return StageChanges(died, started)
-
-    def _check(self) -> None:
-        for name, task in self._tasks.items():
-            if not was_killed(task.future):
-                raise_if_failed(task.future, f"stage {name}")
-
-    def _is_behind_another(self, task: _Task, seen: Whereabouts, now: float) -> bool:
-        """Whether a task waits behind another on a worker with more tasks than slots."""
-        settled = now - task.since > SETTLE_S
-        behind = not seen.runs_for_long(task.future.key) and seen.free.get(task.worker, 0) < 0
-        return settled and behind
-
-    def _wait_for_slot(self, name: str, seconds: float) -> None:
-        """LidarpoolError when a stage has had no slot for long.
-
-        One of several collectors is not needed: the others do its work.
-        """
-        kind = name.partition("-")[0]
-        spare = any(
-            other != name and other.startswith(kind) and task.dead_since is None
-            for other, task in self._tasks.items()
-        )
-        if seconds > self._patience_s and not spare:
-            what = f"no free slot in partition {self.partition.name!r} for {self._patience_s:.0f} s"
-            raise self._too_few(f"Stage {name} has had {what} since its worker died")
+                continue
+            # One of several collectors is not needed: the others do its work.
+            spare = name.startswith(COLLECT) and self.collectors
+            if task.dead_since and now - task.dead_since > self._patience_s and not spare:
+                what = f"no free slot in partition {self.partition.name!r} for"
+                raise self._too_few(f"Stage {name} has had {what}", " since its worker died")
+        return died, started
 
     def _count_death(self, name: str, worker: str) -> None:
         """LidarpoolError when a stage keeps dying."""
@@ -318,11 +288,17 @@ class LongStages:
         earlier = self._tasks.get(name)
         if earlier is not None:
             forget_pipes(self.client, [earlier.inlet.name])
-        inlet = self._pipe(f"{name}-{number}", 1_000_000).create()
+        inlet = Pipe(f"lidarpool-{self.run}-{name}-{number}", 1_000_000, self.client).create()
+        me = StageStart(self.run, name.partition("-")[0], number)
+        work: dict[str, tuple[Any, ...]] = {
+            GENERATE: (generate, me, inlet, self._scans),
+            SORT: (sort_frames, me, inlet, self._news),
+            COLLECT: (collect, me, self._storage, self.probe, inlet, self._news),
+        }
         future = self.partition.submit(
             call_alike,
             self._sources,
-            *self._work(StageStart(self.run, name.partition("-")[0], number), inlet),
+            *work[me.stage],
             key=f"{name}-{self.run}-{number}",
             workers=worker,
         )
@@ -330,21 +306,14 @@ class LongStages:
         if earlier is not None:
             earlier.future.cancel()  # if it still runs, its result is dropped
 
-    def _work(self, me: StageStart, inlet: Pipe) -> tuple[Any, ...]:
-        """Return the function of a stage and its arguments."""
-        if me.stage == GENERATE:
-            return generate, me, inlet, self._scans
-        if me.stage == SORT:
-            return sort_frames, me, inlet, self._news
-        return collect, me, self._storage, self.probe, inlet, self._news
-
     # -- the end -----------------------------------------------------------------------------
 
     def close(self) -> None:
         """Let all stages end: everything is committed."""
         # Stage 1 may still describe a survey that has failed.
-        for pipe in (*self._inlets, self._scans):
-            pipe.close()
+        for pipe in self._pipes:
+            if pipe is not self._news:
+                pipe.close()
         self._closed_at = time.monotonic()
 
     @property
@@ -353,23 +322,21 @@ class LongStages:
         return self._closed_at is not None
 
     @property
-    def _inlets(self) -> list[Pipe]:
-        return [task.inlet for task in self._tasks.values()]
-
-    @property
-    def _done(self) -> bool:
-        return all(task.future.done() for task in self._tasks.values())
+    def _pipes(self) -> list[Pipe]:
+        return [self._scans, self._news, *(task.inlet for task in self._tasks.values())]
 
     @property
     def ended(self) -> bool:
         """True once all stages have exited after `close`, or the shutdown timeout has elapsed."""
-        if self._closed_at is None:
-            return False
-        return self._done or time.monotonic() - self._closed_at > LAST_WORDS_S
+        return self._closed_at is not None and self._have_ended(self._closed_at)
+
+    def _have_ended(self, since: float) -> bool:
+        late = time.monotonic() - since > LAST_WORDS_S
+        return late or all(task.future.done() for task in self._tasks.values())
 
     def stop(self, reason: str) -> None:
         """End all stages at once, because the run has failed."""
-        for pipe in (self._scans, self._news, *self._inlets):
+        for pipe in self._pipes:
             with suppress(PipeFailed):  # not made yet, or gone already
                 pipe.fail(reason)
 
@@ -380,15 +347,14 @@ class LongStages:
         """
         futures = [task.future for task in self._tasks.values()]
         try:
-            deadline = (self._closed_at or time.monotonic()) + LAST_WORDS_S
-            while not self._done and time.monotonic() < deadline:
+            since = self._closed_at or time.monotonic()
+            while not self._have_ended(since):
                 time.sleep(0.01)
             ended = [future.key for future in futures if future.status == "finished"]
             found = fetch_available(self.client, ended)
             return [found[key] for key in ended if key in found]
         finally:
-            pipes = (self._scans, self._news, *self._inlets)
-            forget_pipes(self.client, [pipe.name for pipe in pipes])
+            forget_pipes(self.client, [pipe.name for pipe in self._pipes])
             # Dask would keep the lock; another run may hold it.
             self.client.run_on_scheduler(_forget_lock, name=self._lock_name)
             # In one message: the answer to a second one could miss a client that leaves.

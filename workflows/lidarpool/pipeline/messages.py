@@ -38,6 +38,12 @@ def summary_type(samples: int) -> np.dtype[np.void]:
     return np.dtype([("hits", "<u4"), ("points", "<u4"), ("samples", "<f4", (samples, 3))])
 
 
+def scans_in_words(first: int, stop: int) -> str:
+    """Name the scans from `first` to `stop`, half-open, for messages."""
+    last = stop - 1
+    return f"scan {last}" if first == last else f"scans {first} to {last}"
+
+
 @dataclass(frozen=True, slots=True)
 class StageStart:
     """One start of a stage, for its traces."""
@@ -62,29 +68,32 @@ class Description:
 
 
 @dataclass(frozen=True, slots=True)
-class ScanRange:
-    """From stage 1: scans `first` to `stop` can be described, and may be cast."""
+class Scans:
+    """Consecutive scans of a job."""
 
     job: int
     first: int
     stop: int
-
-
-@dataclass(frozen=True, slots=True)
-class Summaries:
-    """To stage 3, and from it in scan order: the summaries of a committed part."""
-
-    job: int
-    first: int
-    stop: int
-    data: bytes  # of an array of `summary_type`
-    framed: int  # scans that had been handed out when it was sent, from the first on
-    scan_count: int  # of the survey
 
     @property
     def scans(self) -> range:
         """Numbers of the scans."""
         return range(self.first, self.stop)
+
+
+class ScanRange(Scans):
+    """From stage 1: scans that can be described, and may be cast."""
+
+    __slots__ = ()
+
+
+@dataclass(frozen=True, slots=True)
+class Summaries(Scans):
+    """To stage 3, and from it in scan order: the summaries of a committed part."""
+
+    data: bytes  # of an array of `summary_type`
+    framed: int  # scans that had been handed out when it was sent, from the first on
+    scan_count: int  # of the survey
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,12 +113,9 @@ class ColumnsLost:
 
 
 @dataclass(frozen=True, slots=True)
-class Receipt:
+class Receipt(Scans):
     """From stage 4: a part is whole in storage."""
 
-    job: int
-    first: int  # of its scans
-    stop: int
     name: str  # of the part
     rows: int  # points
     size: int  # bytes
@@ -127,7 +133,6 @@ class Receipt:
         name: str,
         size: int,
         record: TaskRecord | None = None,
-        held_at: str = "",
     ) -> Receipt:
         """Make the receipt of a part, from what the part itself says."""
         summaries = np.zeros(len(part.counts), summary_type(part.samples.shape[1]))
@@ -135,9 +140,7 @@ class Receipt:
         summaries["samples"] = part.samples
         box = () if (cells := part.cells) is None else tuple(cells.ravel().tolist())
         hits, data = int(part.scan_hits.sum()), summaries.tobytes()
-        return cls(
-            job, part.first, part.stop, name, len(part), size, hits, box, data, record, held_at
-        )
+        return cls(job, part.first, part.stop, name, len(part), size, hits, box, data, record)
 
 
 @dataclass(frozen=True, slots=True)

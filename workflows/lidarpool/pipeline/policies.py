@@ -9,11 +9,10 @@ import math
 import statistics
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
-from enum import Enum
 
 from poolpart import Whereabouts
 
-from .batches import Batch, Place
+from .jobs import Batch, Outcome, Place
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
@@ -58,23 +57,18 @@ def batches_per_task(seconds: Sequence[float]) -> int:
     return max(1, min(int(TASK_SECONDS / typical), TASK_BATCHES))
 
 
-def weight(batch: Batch, per_task: int) -> float:
-    """How many small batches a batch counts as, where a task has so many.
+def weight(batches: Iterable[Batch], per_task: int) -> float:
+    """How many small batches some batches count as, where a task has so many.
 
     All of a task's batches are in a worker's memory at a time: one that takes half of what is there
     counts as half a task.
     """
-    return max(1.0, batch.share * per_task)
+    return sum(max(1.0, per_task * len(batch) / batch.job.fit) for batch in batches)
 
 
 def most_under_way(slots: int, collectors: int, per_task: int = 1) -> int:
     """Batches that may be under way by their `weight`, so many in a task."""
     return (AHEAD * slots + COLLECTING * collectors + 2) * per_task
-
-
-def room(under_way: float, span: int, most: int) -> float:
-    """Batches that may be taken; none while the newest is far ahead of the oldest."""
-    return 0 if span >= SPAN * most else most - under_way
 
 
 def slots_wanted(left: int, scan_s: float | None) -> int:
@@ -88,14 +82,19 @@ def slots_wanted(left: int, scan_s: float | None) -> int:
 # -- where batches go ------------------------------------------------------------------------
 
 
+def kills(batch: Batch, stage: str) -> int:
+    """How many workers of a stage died with a batch while it was tried alone; below 0: it is not.
+
+    After some deaths a batch is suspect, and tried alone. An innocent one succeeds then; one whose
+    worker dies again is divided, down to single scans. A scan is the cause if `KILLS_MOST` workers
+    in a row die with it alone.
+    """
+    return batch.deaths[stage] - SUSPECT_DEATHS
+
+
 def suspect(batch: Batch, stage: str) -> bool:
     """Whether a batch may be what kills the workers of a stage: then it is tried alone."""
-    return batch.deaths[stage] >= SUSPECT_DEATHS
-
-
-def was_alone(batch: Batch, stage: str) -> bool:
-    """Whether a batch was tried alone when a worker of a stage died with it last."""
-    return batch.deaths[stage] > SUSPECT_DEATHS
+    return kills(batch, stage) >= 0
 
 
 def offers(
@@ -114,12 +113,11 @@ def offers(
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
     waiting = [b for b in batches if b.place is Place.WAITING]
-    left = most - sum(weight(b, per_task) for b in casting if b.worker in slots)
     behind = [b for b in batches if b.place in (Place.CAST, Place.COLLECTING)]
-    left -= sum(weight(b, per_task) for b in behind)
+    left = most - weight([*behind, *(b for b in casting if b.worker in slots)], per_task)
     backlog = any(b.place is Place.CAST for b in behind)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
-    spread = -(-_weight(waiting, per_task) // max(1, idle))  # all idle slots get some
+    spread = -(-weight(waiting, per_task) // max(1, idle))  # all idle slots get some
     size = per_task if backlog else min(per_task, spread)
     groups: dict[object, deque[Batch]] = {}  # those that may share a task
     for batch in waiting:
@@ -140,11 +138,11 @@ def offers(
             break
         group = groups[_group(first)]
         busy = backlog or load[address] >= slots[address]
-        if busy and not first.deaths and min(left, _weight(group, per_task)) < per_task:
+        if busy and not first.deaths and min(left, weight(group, per_task)) < per_task:
             passed.update(group)  # a task that has to wait may become larger
             continue
         task = _task(group, min(size, left), per_task)
-        left -= _weight(task, per_task)
+        left -= weight(task, per_task)
         passed.update(task)
         chosen.append((task, address))
         load[address] += 1
@@ -160,15 +158,11 @@ def _group(batch: Batch) -> object:
     return batch.job.number if batch.divided else batch.job.scene
 
 
-def _weight(batches: Iterable[Batch], per_task: int) -> float:
-    return sum(weight(batch, per_task) for batch in batches)
-
-
 def _task(group: deque[Batch], most: float, per_task: int) -> list[Batch]:
     """Take the batches of a task from a group, one at least."""
     task = [group.popleft()]
-    taken = weight(task[0], per_task)
-    while group and (taken := taken + weight(group[0], per_task)) <= most:
+    taken = weight(task, per_task)
+    while group and (taken := taken + weight([group[0]], per_task)) <= most:
         task.append(group.popleft())
     return task
 
@@ -212,15 +206,6 @@ def _host(address: str) -> str:
 # -- when a batch is tried again -------------------------------------------------------------
 
 
-class Loss(Enum):
-    """Why a batch is offered again although its task has not failed."""
-
-    DIED = "its worker died"
-    GONE = "its worker is gone or silent"
-    REFUSED = "its worker takes no tasks"
-    LATE = "it is late"
-
-
 def late_after_s(seconds: Sequence[float]) -> float:
     """Seconds after which a batch is late, from the casting times of others; inf without any."""
     if not seconds:
@@ -228,43 +213,24 @@ def late_after_s(seconds: Sequence[float]) -> float:
     return max(LATE_S, LATE_FACTOR * statistics.median(seconds))
 
 
-def loss(batch: Batch, seen: Whereabouts, prepared: int, now: float, late_s: float) -> Loss | None:
-    """Whether a batch should be offered again, and why.
+def loss(
+    batch: Batch, seen: Whereabouts, prepared: int, now: float, late_s: float
+) -> Outcome | None:
+    """Whether a batch should be offered again although its task has not failed, and why.
 
     It depends on what was `seen` of workers and tasks, and on the number of workers that are
     `prepared`: while there is no other, a batch is waited for.
     """
     if batch.place in (Place.CASTING, Place.CAST):
         if batch.worker not in seen.members:
-            return Loss.DIED if batch.place is Place.CASTING else Loss.GONE
+            return Outcome.DIED if batch.place is Place.CASTING else Outcome.GONE
         if batch.worker in seen.silent:
             if prepared:
-                return Loss.GONE
+                return Outcome.GONE
         elif batch.worker not in seen.free and batch.place is Place.CASTING:
             task = seen.tasks.get(batch.key)
             # "no-worker": not even sent there, as the worker was paused before.
             if task and task.state in ("no-worker", "processing") and not task.started:
-                return Loss.REFUSED
+                return Outcome.REFUSED
     late = batch.place in (Place.CASTING, Place.COLLECTING) and now - batch.since > late_s
-    return Loss.LATE if late and (prepared > 1 or batch.place is Place.COLLECTING) else None
-
-
-class Verdict(Enum):
-    """What becomes of a batch that was under way when a worker died."""
-
-    RETRY = "retry"
-    SPLIT = "split"
-    POISON = "poison"
-
-
-def verdict(deaths: int, scans: int) -> Verdict:
-    """Judge a batch of so many scans, with which so many workers of one stage have died.
-
-    After some deaths it is tried alone, see `suspect`. An innocent one succeeds then; one whose
-    worker dies again is divided, down to single scans. A scan is the cause if several workers in a
-    row die with it alone.
-    """
-    kills = deaths - SUSPECT_DEATHS  # those with no other batch in that stage
-    if kills > 0 and scans > 1:
-        return Verdict.SPLIT
-    return Verdict.POISON if kills >= KILLS_MOST else Verdict.RETRY
+    return Outcome.LATE if late and (prepared > 1 or batch.place is Place.COLLECTING) else None

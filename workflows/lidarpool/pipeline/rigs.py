@@ -12,9 +12,8 @@ import pickle
 import threading
 import time
 from collections.abc import Collection
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
-import cloudpickle
 from distributed import get_worker
 
 from poolpart import own_device
@@ -25,33 +24,6 @@ from ..sensor import Survey
 from ..simulator.rig import Rig
 
 UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
-
-
-@dataclass(frozen=True, eq=False)
-class RigPlan:
-    """Description of a rig; its backend is the same on all workers."""
-
-    scene: Scene
-    survey: bytes  # pickled: stage 1 gets the same
-    backend: str
-
-    def packed(self, scene: str) -> bytes:
-        """All but the scene's still part, which has the name `scene`, as bytes to send to workers.
-
-        Workers check their version before they unpickle them.
-        """
-        packed = (scene, self.scene.actors, self.survey, self.backend)
-        return cloudpickle.dumps(packed, protocol=5)
-
-    def packed_scene(self) -> bytes:
-        """Return the scene's still part as bytes."""
-        return cloudpickle.dumps(self.scene.with_actors(()), protocol=5)
-
-    @property
-    def still(self) -> tuple[int, ...]:
-        """Identity of the scene's still part while it exists: surveys of it share their trees."""
-        still = [field.name for field in fields(self.scene) if field.name != "actors"]
-        return tuple(id(getattr(self.scene, name)) for name in still)
 
 
 class RigMissing(RuntimeError):  # noqa: N818 - reads as what happened
@@ -71,8 +43,7 @@ class _Kept:
     used_at: float
 
 
-_rigs: dict[str, _Kept] = {}  # {handle: the rig of this process}
-_scenes: dict[str, _Kept] = {}  # {handle: a rig of the scene}
+_kept: dict[str, _Kept] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
 _lock = threading.Lock()
 
 
@@ -82,16 +53,14 @@ def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -
     RigMissing if it is not there, or its scene is not, and nothing to make it of; RigFailed if it
     cannot be made.
     """
-    kept = _rigs.get(handle)
+    kept = _kept.get(handle)
     if kept is None:
         with _lock:
-            kept = _rigs.get(handle)
+            kept = _kept.get(handle)
             if kept is None:
-                kept = _rigs[handle] = _made(handle, plan, scene)
-    now = time.monotonic()
-    kept.used_at = now
-    if (its_scene := _scenes.get(kept.scene)) is not None:
-        its_scene.used_at = now
+                kept = _kept[handle] = _made(handle, plan, scene)
+    its_scene = _kept.get(kept.scene, kept)
+    kept.used_at = its_scene.used_at = time.monotonic()
     return kept.rig
 
 
@@ -102,7 +71,7 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
         name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
         survey: Survey = pickle.loads(packed)  # noqa: S301
         _drop_unused(name)
-        if (found := _scenes.get(name)) is not None:
+        if (found := _kept.get(name)) is not None:
             rig = found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
         elif scene is not None:
             still: Scene = pickle.loads(scene)  # noqa: S301
@@ -114,7 +83,7 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
         raise
     except Exception as error:
         raise RigFailed(str(error) or type(error).__name__) from error
-    _scenes[name] = _Kept(rig, name, time.monotonic())
+    _kept[name] = _Kept(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
     return _Kept(rig, name, time.monotonic())
 
@@ -122,20 +91,16 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
 def _drop_unused(scene: str) -> None:
     """Drop rigs and scenes that nobody has used for long, but for a scene."""
     now = time.monotonic()
-    for kept in (_rigs, _scenes):
-        for handle, one in list(kept.items()):
-            if now - one.used_at > UNUSED_S and handle != scene:
-                kept.pop(handle, None)
+    drop([h for h, one in [*_kept.items()] if now - one.used_at > UNUSED_S and h != scene])
 
 
 def drop(handles: Collection[str]) -> None:
     """Drop rigs and scenes; those that are not there are skipped."""
     for handle in handles:
-        _rigs.pop(handle, None)
-        _scenes.pop(handle, None)
+        _kept.pop(handle, None)
 
 
 def drop_all(run: str) -> None:
     """Drop the rigs and scenes of a run."""
     # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
-    drop([h for h in (*_rigs, *_scenes) if h.partition(".")[0] == run])
+    drop([handle for handle in [*_kept] if handle.partition(".")[0] == run])

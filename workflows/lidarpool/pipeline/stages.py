@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import pickle
 import time
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from itertools import chain
+from typing import Any
 
 from distributed import secede
 
@@ -39,13 +40,52 @@ from .messages import (
     Failed,
     Receipt,
     ScanRange,
+    Scans,
     StageStart,
     Summaries,
 )
-from .names import COLLECT, GENERATE, LIDAR, SORT
+from .names import COLLECT, GENERATE, LIDAR
 
 TELL_EVERY_S = 0.02  # messages that follow each other so fast travel together
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker
+
+
+def _work(me: StageStart, inlet: Pipe, do: Callable[[Iterator[Any]], Iterable[int]]) -> TaskRecord:
+    """Do what the driver sends until a pipe is closed; `do` yields how many scans are done."""
+    recorder = Recorder(me.stage, LIDAR)
+    scans = 0
+    me.trace("start")
+    with suppress(PipeClosed, PipeFailed):
+        while True:
+            for count in do(chain.from_iterable(inlet.get_all())):
+                scans += count
+    return recorder.done(scans)
+
+
+def _tell(
+    me: StageStart, outlet: Pipe, news: Iterable[Scans | ColumnsLost | Failed], most: int = 0
+) -> Iterator[int]:
+    """Send news to the driver, those that follow each other quickly together, at most so many.
+
+    Without a limit, the driver limits its orders. Yields of how many scans it has told.
+    """
+    waiting: list[Scans | ColumnsLost | Failed] = []
+
+    def send() -> int:
+        outlet.put_many(waiting, unbounded=not most)
+        done = [item.scans for item in waiting if isinstance(item, Scans)]
+        for scans in done:
+            me.trace("sent", scans)
+        waiting.clear()
+        return sum(map(len, done))
+
+    told = time.monotonic()
+    for item in news:
+        waiting.append(item)
+        if len(waiting) == most or time.monotonic() - told > TELL_EVERY_S:
+            yield send()
+            told = time.monotonic()
+    yield send()
 
 
 @telling_departure()
@@ -56,29 +96,9 @@ def generate(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     scans equally on every worker. A survey that cannot be described is reported as `Failed`.
     """
     secede()
-    recorder = Recorder(GENERATE, LIDAR)
-    scans = 0
-    me.trace("start")
-    with suppress(PipeClosed, PipeFailed):
-        while True:
-            items: list[ScanRange | Failed] = []
-            told = time.monotonic()
-            for item in _described(me, chain.from_iterable(inlet.get_all()), outlet):
-                items.append(item)
-                if len(items) == outlet.capacity or time.monotonic() - told > TELL_EVERY_S:
-                    scans += _put(me, outlet, items)
-                    items, told = [], time.monotonic()
-            scans += _put(me, outlet, items)
-    return recorder.done(scans)
-
-
-def _put(me: StageStart, outlet: Pipe, items: Sequence[ScanRange | Failed]) -> int:
-    """Send descriptions to the driver; returns of how many scans."""
-    outlet.put_many(items)
-    sent = [range(item.first, item.stop) for item in items if isinstance(item, ScanRange)]
-    for scans in sent:
-        me.trace("sent", scans)
-    return sum(map(len, sent))
+    return _work(
+        me, inlet, lambda wanted: _tell(me, outlet, _described(me, wanted, outlet), outlet.capacity)
+    )
 
 
 def _described(
@@ -87,13 +107,13 @@ def _described(
     for one in wanted:
         sent = one.first
         try:
-            with naming_scans(sent):
+            with naming_scans(sent, sent + 1):
                 survey: Survey = pickle.loads(one.survey)  # noqa: S301 - of the run's own driver
             while sent < survey.scan_count:
                 item = ScanRange(one.job, sent, min(sent + outlet.advice, survey.scan_count))
-                with naming_scans(item.first, item.stop - 1):
+                with naming_scans(item.first, item.stop):
                     survey.scan(item.stop - 1)  # raises here if a scan cannot be described
-                me.trace("put", range(item.first, item.stop))
+                me.trace("put", item.scans)
                 yield item
                 sent = item.stop
         except ScanError as error:  # others can be described
@@ -108,26 +128,24 @@ def sort_frames(me: StageStart, inlet: Pipe, outlet: Pipe) -> TaskRecord:
     went, or had been handed out already, as they say. A survey is forgotten after its last scan.
     """
     secede()
-    recorder = Recorder(SORT, LIDAR)
     orders: dict[int, _Order] = {}  # {job: where its survey is}
-    count = 0
-    me.trace("start")
-    with suppress(PipeClosed, PipeFailed):
-        while True:
-            ready = []
-            for item in chain.from_iterable(inlet.get_all()):
-                me.trace("get", item.scans)
-                order = orders.setdefault(item.job, _Order())
-                ready += order.take(item)
-                if order.following >= item.scan_count:
-                    del orders[item.job]
-            if ready:
-                scans = [*chain.from_iterable(item.scans for item in ready)]
-                me.trace("put", scans)
-                outlet.put_many(ready, unbounded=True)
-                me.trace("sent", scans)
-                count += len(scans)
-    return recorder.done(count)
+
+    def sort(news: Iterator[Summaries]) -> Iterator[int]:
+        ready = []
+        for item in news:
+            me.trace("get", item.scans)
+            order = orders.setdefault(item.job, _Order())
+            ready += order.take(item)
+            if order.following >= item.scan_count:
+                del orders[item.job]
+        if ready:
+            scans = [*chain.from_iterable(item.scans for item in ready)]
+            me.trace("put", scans)
+            outlet.put_many(ready, unbounded=True)
+            me.trace("sent", scans)
+            yield len(scans)
+
+    return _work(me, inlet, sort)
 
 
 @dataclass(eq=False)
@@ -160,31 +178,12 @@ def collect(
     it go `Receipt`, `ColumnsLost` and `Failed`.
     """
     secede()
-    recorder = Recorder(COLLECT, LIDAR)
-    scans = 0
-    with suppress(PipeClosed, PipeFailed):
-        me.trace("start")
-        there = storage if storage.sees(*probe) else None
-        while True:
-            answers: list[Receipt | ColumnsLost | Failed] = []
-            told = time.monotonic()
-            orders = [*chain.from_iterable(inlet.get_all())]
-            for answer in chain.from_iterable(_collected(me, there, o) for o in orders):
-                answers.append(answer)
-                if time.monotonic() - told > TELL_EVERY_S:
-                    scans += _send(me, outlet, answers)
-                    answers, told = [], time.monotonic()
-            scans += _send(me, outlet, answers)
-    return recorder.done(scans)
+    there = storage if storage.sees(*probe) else None
 
+    def store(orders: Iterator[CollectOrder]) -> Iterator[int]:
+        return _tell(me, outlet, chain.from_iterable(_collected(me, there, o) for o in orders))
 
-def _send(me: StageStart, outlet: Pipe, answers: Sequence[Receipt | ColumnsLost | Failed]) -> int:
-    """Send messages to the driver; returns how many scans are stored."""
-    outlet.put_many(answers, unbounded=True)  # the driver limits its orders
-    stored = [range(a.first, a.stop) for a in answers if isinstance(a, Receipt)]
-    for scans in stored:
-        me.trace("sent", scans)
-    return sum(map(len, stored))
+    return _work(me, inlet, store)
 
 
 def _collected(
@@ -195,27 +194,22 @@ def _collected(
     if order.key not in found:
         yield ColumnsLost(order.key)
         return
-    batches: dict[tuple[int, int], CastBatch] = {
-        (batch.job, batch.part.first): batch for batch in found[order.key]
-    }
+    batches = {(batch.job, batch.part.first): batch for batch in found[order.key]}
     for job, (first, stop), name in order.parts:
-        me.trace("get", range(first, stop))
+        batch: CastBatch = batches[job, first]
+        scans = range(first, stop)
+        me.trace("get", scans)
         try:
-            yield _stored(me, storage, batches[job, first], name)
+            with naming_scans(first, stop):
+                data = pack(batch.part)
+                receipt = Receipt.of_part(batch.part, job, name, len(data), batch.record)
+            me.trace("part", scans)
+            if storage is None:
+                yield replace(receipt, held_at=hold_for_driver(name, data))
+                continue
+            with storing(storage):
+                storage.write(name, data)
+            me.trace("stored", scans)
+            yield receipt
         except ScanError as error:
             yield Failed(job, COLLECT, str(error))
-
-
-def _stored(me: StageStart, storage: Storage | None, batch: CastBatch, name: str) -> Receipt:
-    """Make a part of a batch."""
-    first, stop = batch.part.first, batch.part.stop
-    with naming_scans(first, stop - 1):
-        data = pack(batch.part)
-        receipt = Receipt.of_part(batch.part, batch.job, name, len(data), batch.record)
-    me.trace("part", range(first, stop))
-    if storage is None:
-        return replace(receipt, held_at=hold_for_driver(name, data))
-    with storing(storage):
-        storage.write(name, data)
-    me.trace("stored", range(first, stop))
-    return receipt

@@ -6,22 +6,23 @@ import time
 import warnings
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
-from enum import Enum
-from functools import partial
+from dataclasses import dataclass, field, fields
 from typing import Any
 
+import cloudpickle
 from distributed import Client, Future
 
 from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
+from ..scene.scene import Scene
 from .cast import CastWork, intersect
-from .failures import JobError, error_of, raise_if_failed, sending, was_killed, words_on_memory
+from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
+from .jobs import Outcome
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigFailed, RigMissing, RigPlan, drop_all
+from .rigs import RigFailed, RigMissing, drop_all
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked
@@ -30,16 +31,6 @@ RELEASE_S = 3.0  # for workers to drop their rigs
 SPARE_SCENES = 2  # of which no survey is under way, kept for the next one
 INLINE_BYTES = 1 << 17  # larger things are sent to a worker once, and fetched from there by others
 CHECKING, PREPARING = "checking the GPU workers", "preparing the scene on the GPU workers"
-
-
-class Outcome(Enum):
-    """State of a casting task that has not failed by itself."""
-
-    PENDING = "pending"
-    DONE = "done"
-    KILLED = "killed"  # its worker died or left
-    NO_RIG = "no rig"  # its worker has dropped the scene
-    DIVIDE = "divide"  # it failed by itself, and it is not known which of its jobs is the cause
 
 
 @dataclass(eq=False)
@@ -72,7 +63,7 @@ class CastingWorkers:
         software: Mapping[str, str],
     ) -> None:
         self._client, self._partition, self.run = client, partition, run
-        self.backend, self._software = backend, dict(software)
+        self._backend, self._software = backend, dict(software)
         # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
         self._jobs: dict[int, tuple[_Packed, _Packed]] = {}
         # Of jobs, and those used last; what packs them keeps what they are known by.
@@ -83,7 +74,7 @@ class CastingWorkers:
         # workers: one with a result cannot be returned to the queue.
         self._checked: dict[str, int] = {}
         self._refused: dict[str, str] = {}  # {address: reason of refusal}
-        self._count = self._offered = 0
+        self._count = 0  # of the names and keys that were given
         self._casts: dict[str, tuple[Future, list[int]]] = {}  # {key: casting task, its jobs}
         self._died: list[str] = []  # workers that died while they were checked, in a row
         self._looked_at = float("-inf")
@@ -106,12 +97,10 @@ class CastingWorkers:
     def futures(self) -> list[Future]:
         """All tasks."""
         brought = [one.data for one in self._packed_things if isinstance(one.data, Future)]
-        casts = [future for future, _ in self._casts.values()]
-        return [*casts, *self._setups.values(), *brought]
+        return [*(cast for cast, _ in self._casts.values()), *self._setups.values(), *brought]
 
     @property
     def _packed_things(self) -> list[_Packed]:
-        """What tasks bring."""
         return [*(rig for rig, _ in self._jobs.values()), *self._scenes.values()]
 
     @property
@@ -122,17 +111,18 @@ class CastingWorkers:
 
     # -- jobs ------------------------------------------------------------------------------
 
-    def add(self, job: int, plan: RigPlan) -> str:
-        """Let a job be cast; returns the name of its scene, which it may share with others.
-
-        JobError if it cannot be sent to workers.
-        """
-        with sending():
-            scene = self._scenes.pop(plan.still, None) or self._packed("scene", plan.packed_scene)
-            self._scenes[plan.still] = scene  # the last used
-            rig = self._packed(str(job), partial(plan.packed, scene.name))
-        self._jobs[job] = rig, scene
-        return scene.name
+    def add(self, job: int, scene: Scene, survey: bytes) -> str:
+        """Let a job be cast, its survey pickled; returns a name that jobs of one scene share."""
+        # What identifies its still part while it exists: jobs of it share their trees.
+        key = tuple(id(getattr(scene, f.name)) for f in fields(scene) if f.name != "actors")
+        still = self._scenes.pop(key, None)
+        if still is None:
+            still = self._packed("scene", lambda: _pickled(scene.with_actors(())))
+        self._scenes[key] = still  # the last used
+        plan = still.name, scene.actors, survey, self._backend
+        rig = self._packed(str(job), lambda: _pickled(plan))
+        self._jobs[job] = rig, still
+        return still.name
 
     def remove(self, job: int) -> None:
         """Cast nothing more of a job.
@@ -186,8 +176,8 @@ class CastingWorkers:
         brought = [self._brought(packed, worker) for packed in things]
         # A key of its own for each offer: a task that is released and submitted again under its
         # key stays with the worker that still runs it, whatever `workers` says (in 4 of 4 tries).
-        self._offered += 1
-        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._offered}"
+        self._count += 1
+        key = f"{INTERSECT}-{self.run}-{first}-{spans[first][0][0]}.{self._count}"
         unneeded = self._unneeded.pop(worker, [])
         future = self._partition.submit(
             intersect, works, unneeded, *brought, key=key, workers=worker
@@ -212,7 +202,7 @@ class CastingWorkers:
                 one.there.discard(worker)
             return Outcome.NO_RIG
         if was_killed(future):
-            return Outcome.KILLED
+            return Outcome.DIED
         if status == "error" and len(jobs) > 1:
             return Outcome.DIVIDE
         what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
@@ -250,9 +240,14 @@ class CastingWorkers:
         known = self._setups.keys() | self._checked.keys()
         for address in known - self.seen.members:
             self._remove(address)
-        for address in sorted(self.seen.free.keys() - known):
-            if address not in self._refused:
-                self._prepare(address)
+        for address in sorted(self.seen.free.keys() - known - self._refused.keys()):
+            self._count += 1
+            self._setups[address] = self._partition.submit(
+                _preparation(self._backend),
+                key=f"check-{self.run}-{self._count}",
+                priority=10,
+                workers=address,
+            )
         self._check()
         return self.seen
 
@@ -293,15 +288,6 @@ class CastingWorkers:
                     callback_timeout=RELEASE_S,
                 )
 
-    def _prepare(self, address: str) -> None:
-        self._count += 1
-        self._setups[address] = self._partition.submit(
-            _preparation(self.backend),
-            key=f"check-{self.run}-{self._count}",
-            priority=10,
-            workers=address,
-        )
-
     def _take(self, address: str, future: Future) -> None:
         """Record a worker that has answered; one that has stopped since is asked again."""
         found = fetch_available(self._client, [future.key], ANSWER_S, at=address)
@@ -341,6 +327,11 @@ class CastingWorkers:
                 f"{words_on_memory(self._client, self._died)}: "
                 "look into their logs."
             )
+
+
+def _pickled(thing: object) -> bytes:
+    data: bytes = cloudpickle.dumps(thing, protocol=5)
+    return data
 
 
 def share(partition: Partition, thing: Any, **options: Any) -> Future:

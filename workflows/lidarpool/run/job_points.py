@@ -17,7 +17,7 @@ from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud, read_part, read_tally, unpack
 from ..export.sweeps import Sweeps
 from ..pipeline.database import JobParts
-from ..pipeline.messages import Receipt, samples_of_scan, summary_type
+from ..pipeline.messages import Receipt, samples_of_scan, scans_in_words, summary_type
 from ..scenario.job import Job
 from .jobs import OneJob
 from .progress import Progress
@@ -66,7 +66,8 @@ class JobPoints:
 
     def _drop(self, what: str, parts: Sequence[Receipt]) -> None:
         self._store.db.drop(self.job.number, parts)
-        names, scans = listed([p.name for p in parts]), listed([*map(_span, parts)])
+        names = listed([part.name for part in parts])
+        scans = listed([scans_in_words(part.first, part.stop) for part in parts])
         verb = "was" if len(parts) == 1 else "were"
         self._store.notes.append(
             f"cast again: {scans}; {names} {verb} {what} in {self._store.storage.url}"
@@ -177,12 +178,6 @@ class JobPoints:
                     starts = np.broadcast_to(start, ends.shape)
                     rays.append(np.stack([starts, ends], axis=1))
         return np.concatenate(rays)
-
-
-def _span(part: Receipt) -> str:
-    """Describe the scans of a part."""
-    last = part.stop - 1
-    return f"scan {last}" if part.first == last else f"scans {part.first} to {last}"
 
 
 def listed(names: Sequence[str]) -> str:

@@ -137,7 +137,7 @@ class Run:
 
     def _admit(self) -> bool:
         """Take on jobs that are ready, if there is room for them."""
-        moved, most = False, SPARE + 2 * self._driver.slot_count
+        moved, most = False, SPARE + 2 * self._driver.workers.slot_count
         while self._maker and self._driver.has_room and len(self._made) < most:
             if (found := self._maker.take()) is None:
                 break
@@ -213,7 +213,7 @@ class Run:
         if self._writer is None:
             return ()
         # A stage whose worker has died comes first.
-        slots = 0 if self._driver.lacks_slot else self._cluster.spare
+        slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
         return self._writer.step(slots)
 
     def _fail(self, number: int, error: LidarpoolError) -> None:
@@ -301,9 +301,9 @@ class Run:
         self._begin(self._first)  # and its trials
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         told = saved = float("-inf")
-        while not (driver.ended and (self._trials is None or "planning" in self.times)):
+        while not (driver.stages.ended and (self._trials is None or "planning" in self.times)):
             moved = False
-            if not driver.closed:
+            if not driver.stages.closed:
                 moved = self.step()
                 if self.finished:
                     driver.close()
@@ -323,7 +323,7 @@ class Run:
                 told = now
                 self._tell_progress(show, now - started)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            (time.sleep if driver.ended else driver.wait)(pause_s)
+            (time.sleep if driver.stages.ended else driver.wait)(pause_s)
         self.notes += watch.notes
 
     def _save(self) -> None:
@@ -333,7 +333,7 @@ class Run:
         self._store.save()
 
     def _tell_progress(self, show: Show, seconds: float) -> None:
-        waits_for = LIDAR if self._driver.waiting else ""
+        waits_for = LIDAR if self._driver.stages.waiting else ""
         now = replace(self._progress(), seconds=seconds, waits_for=waits_for)
         self._cluster.call(show, now)
         self._cluster.call(lambda progress: self._page.on_progress(progress, self.under_way), now)
