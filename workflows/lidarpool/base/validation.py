@@ -83,6 +83,7 @@ _ALLOWED = {
     "PathLike": "a path",
 }
 _ITEMS = {float: "numbers", int: "whole numbers", str: "text"}  # of lists
+_LENGTHS = ("min_length", "max_length")
 _LIMITS = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
 _ALIKE = {"position": "translation", "translation": "position"}  # too unlike for `did_you_mean`
 _PLAIN = (bool, int, float, str, bytes, NoneType, list, tuple, dict)
@@ -91,7 +92,7 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     bool: (core_schema.bool_schema, ()),
     int: (core_schema.int_schema, _LIMITS),
     float: (core_schema.float_schema, (*_LIMITS, "allow_inf_nan")),
-    str: (core_schema.str_schema, ("min_length",)),
+    str: (core_schema.str_schema, _LENGTHS),
     datetime: (core_schema.datetime_schema, ()),
     NoneType: (core_schema.none_schema, ()),
 }
@@ -206,7 +207,7 @@ def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
     """
     origin, args = get_origin(hint), get_args(hint)
     if origin is Annotated:
-        schema = _schema(args[0], _limits(hint, (*_LIMITS, "min_length", "allow_inf_nan")))
+        schema = _schema(args[0], _limits(hint, (*_LIMITS, *_LENGTHS, "allow_inf_nan")))
         wraps: list[Any] = [n.func for n in hint.__metadata__ if isinstance(n, WrapValidator)]
         return reduce(lambda s, w: core_schema.no_info_wrap_validator_function(w, s), wraps, schema)
     if origin in (Union, UnionType):
@@ -216,9 +217,8 @@ def _schema(hint: Any, limits: Mapping[str, Any] = MappingProxyType({})) -> Any:
         if core_schema.any_schema() in items:
             return items[0]
         more = None if origin is tuple and ... not in args else 0
-        listed = core_schema.tuple_schema(
-            items, variadic_item_index=more, min_length=limits.get("min_length"), strict=False
-        )
+        lengths = {name: limit for name, limit in limits.items() if name in _LENGTHS}
+        listed = core_schema.tuple_schema(items, variadic_item_index=more, strict=False, **lengths)
         return core_schema.no_info_wrap_validator_function(_once, listed)
     if origin is Literal:
         return core_schema.literal_schema([*args])
