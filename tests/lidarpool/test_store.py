@@ -501,7 +501,7 @@ def test_a_survey_and_a_campaign_do_not_take_each_others_folder(left, folder, un
 @pytest.mark.parametrize("change", ["none", "another height", "of unknown content"])
 def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, folder):
     store, job = campaign(folder)
-    points = store.points_of(job)
+    store.points_of(job)
     add(store, 0, 2, job)
     if change != "of unknown content":
         store.save()
