@@ -26,7 +26,7 @@ from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, Pictured
 from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
-from ..scenario.job import Job
+from ..scenario.build import Job
 from ..scenario.scenario import Scenario
 from ..sensor import Survey
 from .cloud_numbers import CountedCloud
