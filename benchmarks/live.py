@@ -28,7 +28,7 @@ from lidarpool.run.jobs import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.page import Page
 from lidarpool.run.screen import Screen
-from lidarpool.scenario.job import Job
+from lidarpool.scenario.build import Job
 
 NEWS_S = 0.5  # as the page asks
 SCENE, POINTS = "surface?colour=grey", "points?colour=z&most=200000"

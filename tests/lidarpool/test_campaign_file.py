@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from lidarpool import Campaign, Job, LidarpoolError, Noise, Scene, Survey
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.campaign import hashes, is_campaign
-from lidarpool.scenario.draws import Draw
+from lidarpool.scenario.choices import Draw
 from lidarpool.scenario.scenario import Scenario
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

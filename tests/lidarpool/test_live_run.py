@@ -25,7 +25,7 @@ from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Progress
 from lidarpool.run.screen import Screen
 from lidarpool.run.store import RunStore
-from lidarpool.scenario.job import Job
+from lidarpool.scenario.build import Job
 from lidarpool.scene.mesh import Mesh
 
 LONG_S = 120.0

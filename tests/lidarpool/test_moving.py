@@ -20,7 +20,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.run.jobs import identity_of
-from lidarpool.scenario.job import Job
+from lidarpool.scenario.build import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import Returns

@@ -33,9 +33,8 @@ from lidarpool.export.navigation import (
     write_instruments,
 )
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.scenario.build import build
+from lidarpool.scenario.build import Job, build
 from lidarpool.scenario.campaign import Campaign
-from lidarpool.scenario.job import Job
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
 from lidarpool.sensor.trajectory import Stations, matrices, quaternions_of, rotations_of

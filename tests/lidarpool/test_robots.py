@@ -14,7 +14,6 @@ from lidarpool import Actor, LidarpoolError, Pose, Scene, Survey, Track, load_ro
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
-from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
@@ -549,7 +548,7 @@ def test_a_robot_that_leaves_needs_joints_for_its_stay_only(folder):
         },
         folder=folder,
     )
-    job = job_of(build(scenario))
+    job = build(scenario).job()
     for actor in job.scene.actors:
         assert actor.trajectory.presence_ns == pytest.approx((0.2e9, 0.6e9))
 

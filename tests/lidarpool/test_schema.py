@@ -13,8 +13,12 @@ from jsonschema import Draft202012Validator
 from lidarpool import LidarpoolError
 from lidarpool.scenario.campaign import Campaign, is_campaign
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.schema import campaign_schema, scenario_schema, schema_text
-from lidarpool.scenario.template import scenario_template
+from lidarpool.scenario.schema import (
+    campaign_schema,
+    scenario_schema,
+    scenario_template,
+    schema_text,
+)
 
 FILES = sorted((Path(__file__).parents[2] / "examples").glob("*.yaml"))
 CAMPAIGNS = [path for path in FILES if is_campaign(path)]

@@ -7,7 +7,7 @@ import yaml
 
 from lidarpool.base.validation import fields_of, is_section
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scenario.template import scenario_template
+from lidarpool.scenario.schema import scenario_template
 
 TEXT = scenario_template()
 # A field that is commented out: its name, a colon and a value in YAML.

@@ -16,7 +16,6 @@ from lidarpool.export.sweeps import Sweeps
 from lidarpool.run.picture_file import Pictured
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
-from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import Actor, box
 from lidarpool.simulator.rig import Rig
@@ -171,7 +170,7 @@ def test_vehicles_and_persons_are_actors_while_they_are_there(tmp_path):
     np.testing.assert_allclose(again.poses(0, np.array([3e9]))[1][0, :2, 0], [0.5**0.5] * 2)
     assert built.found.sources["fcd.xml"].startswith("3 actors during the survey, of 3 vehicles")
 
-    job = job_of(build(read))
+    job = build(read).job()
     found = made(job.survey, job.scene, "embree")
     for number, semantic_class, (begin, end) in ((2, 10, (0, 1)), (3, 7, (1, 2)), (4, 10, (3, 4))):
         own = found["object"] == number
@@ -305,7 +304,7 @@ def test_classes_are_of_vehicles_alone_and_leave_their_materials(tmp_path):
             {"objects": "car (a.1)", "reflectance": 0.1},
         ],
     )
-    job = job_of(build(read))
+    job = build(read).job()
     names = job.scene.all_names
     assert names[2:] == ("car (a.1)", "walker (a.1)", "car (a.1).2")
     table = Surfaces(job.scene, tuple(job.survey.materials)).materials

@@ -23,7 +23,6 @@ from lidarpool import (
     Survey,
 )
 from lidarpool.scenario.build import build
-from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import one_mesh
 from lidarpool.scene.mesh import Mesh, Voxels
@@ -431,7 +430,7 @@ planning: {enabled: false}
     assert scene.object_bounds[0] == pytest.approx(np.array([[4, -1, 1], [6, 1, 4]]), abs=0.021)
     (line,) = built.found.sources.values()
     assert "2 x 2 x 3 voxels" in line
-    job = job_of(build(scenario))
+    job = build(scenario).job()
     plain = Scene.from_meshes([box("Ground", (0, 0, 0), (1, 1, 1))])
     assert cast_bytes(job.scene, job.survey) > cast_bytes(plain, job.survey)
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from lidarpool.scenario.build import build
-from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.simulator.rig import Rig
 
@@ -27,7 +26,7 @@ def scanned(tmp_path_factory):
         for file in EXAMPLES.glob(pattern):
             shutil.copy(file, folder)
     built = build(Scenario.load(folder / "block.yaml"))
-    job = job_of(built)
+    job = built.job()
     batches = list(Rig(job.scene, job.survey, "embree").cast(0, 72))
     columns = {
         column.name: np.concatenate([column.make(batch) for batch in batches])

@@ -23,7 +23,6 @@ from lidarpool import Mounted, Returns, Sensor, Survey, Track, simulate
 from lidarpool.cli.forecast import forecast, sample_survey
 from lidarpool.run.options import RunOptions
 from lidarpool.scenario.build import build
-from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Cutout, Mesh
@@ -55,7 +54,7 @@ def check(tmp_path, lidarpool) -> Callable[..., Any]:
 
 
 def test_what_is_counted_and_needed_is_what_a_run_gives(cluster, tmp_path):
-    job = job_of(build(Scenario.from_data(SHORT), plans=False))
+    job = build(Scenario.from_data(SHORT), plans=False).job()
     with Client(cluster, set_as_default=False) as client:
         made = forecast(job, RunOptions(backend="numpy", out=tmp_path), client)
         result = simulate(
@@ -104,7 +103,7 @@ def cast(rig: Rig, first: int) -> Iterator[Any]:
 
 
 def test_an_estimate_from_few_rays_is_near(monkeypatch):
-    job = job_of(build(Scenario(), plans=False))
+    job = build(Scenario(), plans=False).job()
     monkeypatch.setattr(lidarpool.cli.forecast, "SAMPLE_RAYS", 40_000)
     part = sample_survey(job.scene, job.survey, "numpy")
     assert 30_000 < part["rays"] < 50_000

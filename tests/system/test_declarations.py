@@ -31,10 +31,9 @@ from lidarpool import LidarpoolError, Noise
 from lidarpool.run.jobs import OneJob
 from lidarpool.run.store import RunStore
 from lidarpool.scenario.build import build
-from lidarpool.scenario.job import job_of
 from lidarpool.scenario.scenario import Scenario
 
-store = RunStore(OneJob(job_of(build(Scenario.load(sys.argv[1])))), place=sys.argv[2])
+store = RunStore(OneJob(build(Scenario.load(sys.argv[1])).job()), place=sys.argv[2])
 store.cast_with("numpy", {})
 commit(store, 0, [3, 3], [0, 1], [3, 3])
 store.db.close()

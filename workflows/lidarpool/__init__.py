@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from .report.comparison import Comparison, compare
     from .run.result import CampaignRun
     from .run.store import remove_run
-    from .scenario.job import Job
+    from .scenario.build import Job
     from .scene.actors import Actor
     from .scene.instances import Instance
     from .scene.mesh import Mesh
@@ -110,7 +110,7 @@ _MODULES = {
     "report.comparison": ("Comparison", "compare"),
     "run.result": ("CampaignRun",),
     "run.store": ("remove_run",),
-    "scenario.job": ("Job",),
+    "scenario.build": ("Job",),
     "scene.actors": ("Actor",),
     "scene.instances": ("Instance",),
     "scene.mesh": ("Mesh",),

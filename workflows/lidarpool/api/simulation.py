@@ -18,7 +18,7 @@ from ..run.jobs import OneJob
 from ..run.options import RunOptions
 from ..run.progress import Progress
 from ..run.screen import Screen
-from ..scenario.job import Job
+from ..scenario.build import Job
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.world import check_backend_here

@@ -38,9 +38,8 @@ from ..run.jobs import identity_of
 from ..run.options import RunOptions
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
-from ..scenario.build import build
+from ..scenario.build import Job, build
 from ..scenario.campaign import Campaign, is_campaign
-from ..scenario.job import Job, job_of
 from ..scenario.scenario import Scenario
 from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
@@ -105,7 +104,7 @@ def look_at(
         assert read is not None, "of a file"
         with terminal.status("reading the scene", logged=False):
             built = build(read, plans=campaign is None and not no_plan)
-            job = job_of(built)
+            job = built.job()
         with terminal.status("casting some rays"):
             found = forecast(job, options_of(read.pool, **given), client)
         found["notes"] += advice(built)

@@ -33,9 +33,8 @@ from ..run.options import RunOptions
 from ..run.result import CampaignRun, RunResult
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
-from ..scenario.build import Built, build
+from ..scenario.build import Built, Job, build
 from ..scenario.campaign import Campaign
-from ..scenario.job import Job, job_of
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection, TaskOptions
@@ -62,7 +61,7 @@ def run_scenario(
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
-        job = job_of(built)
+        job = built.job()
     _run_survey(built, job, options, terminal, only)
 
 

@@ -56,8 +56,13 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.scenario import Scenario
-    from ..scenario.schema import SCHEMA_FILE, scenario_schema, schema_text
-    from ..scenario.template import SCENARIO_FILE, scenario_template
+    from ..scenario.schema import (
+        SCENARIO_FILE,
+        SCHEMA_FILE,
+        scenario_schema,
+        scenario_template,
+        schema_text,
+    )
 
     if not meshes and (unit or up_axis):
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")

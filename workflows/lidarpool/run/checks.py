@@ -25,7 +25,7 @@ from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
 from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT, JobError
-from ..scenario.job import Job
+from ..scenario.build import Job
 from ..scenario.sections import TaskOptions
 from ..simulator.memory import MB, cast_bytes
 from ..simulator.world import AUTO_TAKES

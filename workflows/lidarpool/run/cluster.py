@@ -15,7 +15,7 @@ from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 
 from ..base.errors import LidarpoolError
 from ..pipeline import GPU, LIDAR, OTHER
-from ..scenario.job import Job
+from ..scenario.build import Job
 from .checks import check_workers, find_workers, gpu_note, slots_needed
 from .connection import connected, local_client, started_client
 from .options import RunOptions

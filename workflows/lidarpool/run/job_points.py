@@ -18,7 +18,7 @@ from ..columns.parts import StoredCloud, read_part, read_tally, unpack
 from ..export.sweeps import Sweeps
 from ..pipeline.database import JobParts
 from ..pipeline.messages import Receipt, samples_of_scan, scans_in_words, summary_type
-from ..scenario.job import Job
+from ..scenario.build import Job
 from .jobs import OneJob
 from .progress import Progress
 

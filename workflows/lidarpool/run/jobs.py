@@ -16,8 +16,8 @@ from ..base.fingerprint import fingerprint
 from ..export.jobs import JobRow, Value
 from ..export.sweeps import Sweeps
 from ..pipeline import JobError
+from ..scenario.build import Job
 from ..scenario.campaign import Campaign
-from ..scenario.job import Job
 from ..scenario.static_scene import SceneCache
 
 READY = 16  # jobs that are made ahead: small ones are cast several at a time,

@@ -16,7 +16,7 @@ from ..base.arrays import AnyArray, Floats, Floats32
 from ..base.words import counted
 from ..columns.table import CAUSES, TABLE, Column
 from ..plan import Plan, Planning
-from ..scenario.job import Job
+from ..scenario.build import Job
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.colours import Colours
 from ..scene.drawn import Drawn, cut

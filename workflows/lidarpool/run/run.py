@@ -28,7 +28,7 @@ from ..pipeline import (
     RunDriver,
 )
 from ..pipeline.task_book import StageTotals, TaskBook
-from ..scenario.job import Job
+from ..scenario.build import Job
 from ..simulator.memory import MB, scans_that_fit
 from .cluster import Cluster
 from .job_points import JobPoints

@@ -29,7 +29,7 @@ from ..pipeline.database import (
     read_place,
 )
 from ..pipeline.failures import storing
-from ..scenario.job import Job
+from ..scenario.build import Job
 from ..simulator.world import AUTO_TAKES
 from .job_points import JobPoints
 from .jobs import CONTENT, Jobs, OneJob, identity_of

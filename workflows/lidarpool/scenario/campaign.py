@@ -25,10 +25,8 @@ from ..base.words import counted
 from ..base.yamlfile import read_yaml
 from ..export.jobs import Value
 from ..export.table import check_whole
-from .build import build
-from .choices import COUNT_MOST, CampaignSection, Choice, Keep, Splits
-from .draws import Draw
-from .job import Job, job_of
+from .build import Job, build
+from .choices import COUNT_MOST, CampaignSection, Choice, Draw, Keep, Splits
 from .paths import Steps, find_field, put
 from .scenario import Scenario
 from .sections import PoolSection, file_states
@@ -294,7 +292,7 @@ class _Jobs:
         assert scenario is not None, "of a file"
         made_of = hashes(scenario.files)
         built = build(scenario, plans=False, cache=cache, columns=columns)
-        return job_of(built, values=self.values(number), made_of=made_of, **own)
+        return built.job(values=self.values(number), made_of=made_of, **own)
 
 
 class _Made(_Jobs):

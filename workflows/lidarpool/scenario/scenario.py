@@ -21,7 +21,7 @@ from ..sensor import Material, Navigation
 from ..sensor.survey import SENSORS_MOST, CloudOptions, Steps
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
-from .moving import ActorSection, CarriedSection, MountSection, TrajectoryEntry
+from .moving import ActorSection, CarriedSection, MountSection, TrafficSection, TrajectoryEntry
 from .sections import (
     CopiesSection,
     NoiseSection,
@@ -36,7 +36,6 @@ from .sections import (
     may_be_empty,
     scene_in_short,
 )
-from .traffic import TrafficSection
 
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
@@ -232,7 +231,7 @@ class Scenario(Section):
                 f"actor {carried[0].name!r} has no trajectory: give it one, or give the survey a "
                 "trajectory in place of poses, to be its carrier."
             )
-        if self.links and not any(entry.is_robot for entry in carried):
+        if self.links and not any(entry.robot for entry in carried):
             wrong.append(
                 "mount names a link, and no robot is the carrier: give an actor with a .urdf as "
                 "its file, and without a trajectory."
@@ -259,8 +258,7 @@ class Scenario(Section):
     @property
     def files(self) -> tuple[Path, ...]:
         """Files that it names, each once: meshes, tables, trajectories, data of sensors."""
-        placed: tuple[CopiesSection | ActorSection, ...] = (*self.scene.copies, *self.actors)
-        shaped = (*placed, *(self.traffic.vehicles if self.traffic else ()))
+        shaped = (*self.placed, *(self.traffic.vehicles if self.traffic else ()))
         entries = [*self.scene.files, *(entry.file for entry in shaped if entry.file)]
         files: list[str | None] = [entry.file for entry in entries]
         files += [self.traffic.file] if self.traffic else []
@@ -272,6 +270,11 @@ class Scenario(Section):
             files += [section.calibration]
             files += [section.model] if section.has_own_model else []
         return self.paths(file for file in files if file)
+
+    @property
+    def placed(self) -> tuple[CopiesSection | ActorSection, ...]:
+        """Entries of copies and actors."""
+        return *self.scene.copies, *self.actors
 
     @property
     def folder(self) -> Path:

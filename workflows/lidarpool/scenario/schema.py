@@ -1,15 +1,20 @@
-"""The JSON Schemas of scenario and campaign files, for editors that complete and check them."""
+"""What users and editors start from: JSON Schemas, and the scenario of `lidarpool init`."""
 
 from __future__ import annotations
 
 import inspect
 import json
+import textwrap
+from collections.abc import Iterator, Sequence
 from typing import Any
 
+from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
+from ..base.validation import fields_of, is_section
 from .choices import CampaignSection
-from .scenario import Scenario
+from .placing import Placing, as_entry, on_one_line
+from .scenario import MESH_CLOUD, Scenario
 from .sections import Section
 
 SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
@@ -62,3 +67,92 @@ def _schema_of(section: type[Section], title: str) -> dict[str, Any]:
 def schema_text(schema: dict[str, Any]) -> str:
     """Return a schema as JSON, with a line break at its end."""
     return json.dumps(schema, indent=2, allow_nan=False) + "\n"
+
+
+SCENARIO_FILE = "scenario.yaml"
+
+_WIDTH = 100
+_COMMENT_AT = 30  # column of the comments that stand beside a field
+
+_HEAD = f"""\
+# yaml-language-server: $schema={SCHEMA_FILE}
+# A lidar survey for lidarpool, with path planning. Every field has its default here, and may be
+# left out. A name after "# " is an example for a field whose default lidarpool chooses. Lengths
+# are in metres, angles in degrees, Z is up.
+#
+#     lidarpool check {SCENARIO_FILE}
+#     lidarpool run {SCENARIO_FILE}"""
+
+
+def scenario_template(files: Sequence[dict[str, str]] = (), placing: Placing | None = None) -> str:
+    """Return a commented scenario in YAML that holds all defaults.
+
+    `files` are mesh files to survey, as in `scene.files`. `placing` is where the sensor is put in
+    them; its poses are written if they are around an object.
+    """
+    lines = [_HEAD]
+    given: dict[str, Any] = {}
+    if files:
+        given = {"scene": {"files": [*files]}, "cloud": MESH_CLOUD}
+    for name, field in Scenario.model_fields.items():
+        lines.append("")
+        if name == "poses" and placing is not None:
+            lines += _placed(placing)
+        if name != "poses" or placing is None or not placing.around:
+            lines += _top(name, field, given.get(name, {}))
+    return "\n".join([*lines, ""])
+
+
+def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
+    """Yield the lines of a section or a top-level field, `given` in place of some defaults."""
+    section = field.annotation
+    if not (isinstance(section, type) and is_section(section)):
+        yield from _lines(name, field, "")
+        return
+    summary = (section.__doc__ or "").partition("\n")[0].partition(";")[0].rstrip(".")
+    yield from _beside(f"{name}:", summary, "")
+    for inner, content in fields_of(section).items():
+        if inner in given:
+            yield from _beside(
+                f"{inner}: {on_one_line(given[inner])}", content.description or "", "  "
+            )
+        else:
+            yield from _lines(inner, content, "  ")
+
+
+def _placed(placing: Placing) -> Iterator[str]:
+    """Return the poses around an object, or a remark on where the sensor is."""
+    if placing.note:
+        note = f"{placing.note[:1].upper()}{placing.note[1:]}."
+        # A pose stays on one line, to be copied.
+        text, mark, poses = note.partition("poses: ")
+        yield from textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+        if mark:
+            yield f"# poses: {poses.removesuffix('.')}"
+    if placing.around:
+        yield "poses:"
+        yield from (f"  - {on_one_line(as_entry(pose))}" for pose in placing.poses)
+
+
+def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:
+    """Return a field with its default, or with examples if the default is computed."""
+    text = field.description or ""
+    if not field.examples:
+        yield from _beside(f"{name}: {on_one_line(field.default)}", text, indent)
+        return
+    first, *others = field.examples
+    yield from _beside(f"# {name}: {on_one_line(first)}", text, indent)
+    for other in others:
+        yield f"{indent}# {name}: {on_one_line(other)}"
+
+
+def _beside(code: str, comment: str, indent: str) -> Iterator[str]:
+    """Return code with its comment to the right, or above it where there is no room."""
+    line = f"{indent}{code}".ljust(_COMMENT_AT - 1) + f" # {comment}"
+    if len(line) <= _WIDTH and len(indent + code) < _COMMENT_AT:
+        yield line
+        return
+    mark = f"{indent}# "
+    sentence = f"{comment[:1].upper()}{comment[1:]}."  # prose, not a field to be uncommented
+    yield from textwrap.wrap(sentence, _WIDTH, initial_indent=mark, subsequent_indent=mark)
+    yield f"{indent}{code}"

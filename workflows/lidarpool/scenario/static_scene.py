@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..base.allowance import check_fits
 from ..base.arrays import Floats
-from ..base.errors import Mistakes, prefixed
+from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted
 from ..scene.actors import Actor, box, one_mesh
 from ..scene.instances import Instance
@@ -18,9 +21,19 @@ from ..scene.meshfile import Objects, load_objects
 from ..scene.nodes import Raster
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
-from .copies import copies_of
+from ..sensor.calibrations import said
+from ..sensor.trajectory import rotations_of
+from ..sensor.trajectory_files import columns_of_table
 from .scenario import Scenario
-from .sections import MeshFile, SceneSection, ShapeSection, file_states
+from .sections import (
+    COPIES_MOST,
+    CopiesSection,
+    MeshFile,
+    Scatter,
+    SceneSection,
+    ShapeSection,
+    file_states,
+)
 from .standing import Standing
 
 
@@ -183,3 +196,146 @@ def _ground(section: SceneSection, scene: Scene | None) -> Mesh:
     z = ground.height_m
     corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
     return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+
+
+SCALE_LEAST = 1e-6
+DRAWN = 1 << 14  # places that are drawn at a time
+DRAWS_MOST = 200  # places that are drawn for each copy, if not fewer than
+DRAWS_LEAST = 1 << 21
+
+_PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
+_SCALES = ("scale_x", "scale_y", "scale_z")
+
+
+def copies_of(
+    entry: CopiesSection, mesh: Mesh, standing: Standing, table: Path | None
+) -> list[Instance]:
+    """Place the copies of an entry; `table` is where its table is.
+
+    Raises
+    ------
+    LidarpoolError
+        If a table cannot be read, a place has no surface to stand on, or there is no room.
+    """
+    if entry.scatter is not None:
+        places, angles, scales = _scattered(entry.scatter, entry.name, standing)
+    else:
+        if entry.table is not None and table is not None:
+            places, angles, scales = _of_table(table, entry.table.columns)
+        else:
+            places = np.array([(*one.position, np.nan)[:3] for one in entry.at])
+            angles = np.array([[getattr(one, name) for name in _ANGLES] for one in entry.at])
+            scales = np.array([one.scale for one in entry.at])
+        low = np.flatnonzero(np.isnan(places[:, 2]))
+        if len(low):
+            places[low, 2], _ = standing.under(places[low, :2])
+        if len(low := np.flatnonzero(np.isnan(places[:, 2]))):
+            x, y = places[low[0], :2].tolist()
+            raise LidarpoolError(
+                f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
+                f"on ({counted(len(low), 'copy', 'copies')}): give z."
+            )
+        if (np.abs(scales) < SCALE_LEAST).any():
+            raise LidarpoolError(
+                f"a scale of {scales.flat[np.abs(scales).argmin()]:g} would flatten the mesh: give "
+                f"at least {SCALE_LEAST:g}."
+            )
+    matrices = np.tile(np.eye(4), (len(places), 1, 1))
+    matrices[:, :3, :3] = rotations_of(angles) * scales[:, None]
+    matrices[:, :3, 3] = places
+    return Instance.several(mesh, matrices, entry.name)
+
+
+def _of_table(path: Path, columns: dict[str, str]) -> tuple[Floats, Floats, Floats]:
+    """Places, z nan if there is none, angles in degrees, and scales of a table: (n, 3) each."""
+    try:
+        check_fits(path)
+        text = path.read_text("utf-8-sig")
+        if not text.strip():
+            raise ValueError("it is empty")
+        short = [name.removesuffix("_deg") for name in _ANGLES]  # as people write them
+        known = (*_PLACE, *_ANGLES, "scale", *_SCALES, *short)
+        at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
+        if "scale" in at and any(name in at for name in _SCALES):
+            raise ValueError("it has both scale and scales of axes: leave one out in columns")
+        if unread := [name for name in short if name in at and f"{name}_deg" not in at]:
+            raise ValueError(
+                f"its column {unread[0]!r} has no unit: call it {unread[0]}_deg, in degrees, or "
+                f"give columns: {{{unread[0]}_deg: {unread[0]}}}"
+            )
+    except (OSError, ValueError, LidarpoolError) as error:
+        raise LidarpoolError(f"{path} is not a usable table of copies: {said(error)}") from error
+    count = len(at["x"])
+    if count > COPIES_MOST:
+        raise LidarpoolError(f"{path} has {count:,} rows; at most {COPIES_MOST:,} are allowed.")
+
+    def some(names: Sequence[str], default: Any) -> Floats:
+        return np.stack([at.get(name, np.full(count, default)) for name in names], axis=1)
+
+    scales = some(("scale",) * 3 if "scale" in at else _SCALES, 1.0)
+    return some(_PLACE, np.nan), some(_ANGLES, 0.0), scales
+
+
+def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, Floats, Floats]:
+    """Places, angles in degrees and scales of copies at random: (n, 3) each.
+
+    Places are drawn in a rectangle and kept if the highest surface there is one of those named:
+    only sums, products and comparisons, so that all machines draw the same.
+    """
+    own = standing.only(given.surfaces)
+    x0, y0, x1, y1 = own.rectangle if given.within is None else given.within
+    # The name, so that trees and rocks of one seed are not at the same places.
+    seeds = [given.seed, *name.encode()]
+    draw = np.random.Generator(np.random.PCG64([0, *seeds]))
+    room = _Room(given.spacing_m)
+    found: list[Floats] = []
+    drawn = 0
+    while len(found) < given.count:
+        if drawn > max(DRAWS_LEAST, DRAWS_MOST * given.count):
+            raise LidarpoolError(
+                f"only {len(found):,} of {given.count:,} found room on {', '.join(given.surfaces)} "
+                f"within x {x0:.6g} to {x1:.6g}, y {y0:.6g} to {y1:.6g}: take fewer, a smaller "
+                "spacing_m, or other surfaces."
+            )
+        block = draw.random((DRAWN, 2)) * [x1 - x0, y1 - y0] + [x0, y0]
+        heights, objects = standing.under(block)
+        on = np.flatnonzero(np.isin(objects, own.owners))
+        if not drawn and not len(on):  # they are under a roof: draw the same again without it
+            standing = own
+            heights, objects = standing.under(block)
+            on = np.flatnonzero(objects >= 0)
+        drawn += DRAWN
+        for row in on:
+            x, y = block[row].tolist()
+            if room.takes(x, y):
+                found.append(np.array([x, y, heights[row]]))
+                if len(found) == given.count:
+                    break
+    looks = np.random.Generator(np.random.PCG64([1, *seeds])).random((given.count, 2))
+    yaw = 360.0 * looks[:, 0] if given.yaw_deg is None else np.full(given.count, given.yaw_deg)
+    least, largest = given.scale
+    scales = least + looks[:, 1] * (largest - least)
+    angles = np.column_stack([yaw, np.zeros((given.count, 2))])
+    return np.array(found), angles, np.repeat(scales[:, None], 3, axis=1)
+
+
+class _Room:
+    """Places that are taken, each with so much room around it."""
+
+    def __init__(self, spacing_m: float) -> None:
+        self._apart = spacing_m
+        self._taken: dict[tuple[int, int], list[tuple[float, float]]] = {}  # {cell: places}
+
+    def takes(self, x: float, y: float) -> bool:
+        """Take a place, if no other is too near."""
+        apart = self._apart
+        if not apart:
+            return True
+        column, row = int(x // apart), int(y // apart)
+        for i in (column - 1, column, column + 1):
+            for j in (row - 1, row, row + 1):
+                for u, v in self._taken.get((i, j), ()):
+                    if (x - u) * (x - u) + (y - v) * (y - v) < apart * apart:
+                        return False
+        self._taken.setdefault((column, row), []).append((x, y))
+        return True
