@@ -13,8 +13,7 @@ from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE
 from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
 from lidarpool.live.result_page import open_result, result_page, view_result
-from lidarpool.live.surface import Surface, colours_for
-from lidarpool.live.view import View, range_image
+from lidarpool.live.view import Surface, View, colours_for, range_image
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box

@@ -41,8 +41,7 @@ from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
-from .logs import set_logs
-from .options import show
+from .options import set_logs, show
 from .terminal import Terminal
 
 

@@ -163,7 +163,7 @@ def stations(
     if count is not None and coverage is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     from ..plan.stations import STATIONS_MOST, plan_stations
-    from ..report.station_picture import draw_stations
+    from ..report.pictures import draw_stations
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.scenario import Scenario

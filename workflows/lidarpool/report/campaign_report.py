@@ -16,8 +16,7 @@ from ..export.jobs import JobRow
 from ..render.page import Page
 from ..run.result import CampaignRun
 from ..scenario.campaign import Campaign
-from .campaign_figures import Figures
-from .campaign_pictures import draw_results, draw_varied
+from .campaign_figures import Figures, draw_results, draw_varied
 from .page.page import rendered
 from .report import stage_figures
 
