@@ -18,7 +18,7 @@ from lidarpool.export.formats import Format
 from lidarpool.export.recordings import open_recording
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.report import comparison
-from lidarpool.report.campaign_figures import rank_correlation
+from lidarpool.report.campaign_report import rank_correlation
 from lidarpool.report.comparison import chosen, nearest
 
 RINGS, COLUMNS = 16, 720

@@ -28,8 +28,7 @@ from ..base.words import counted
 from . import options
 from .options import set_logs
 from .result_commands import compare, export, plot, view
-from .scenario_commands import check, import_, init, scene, schema
-from .sensor_commands import sensors, stations
+from .scenario_commands import check, import_, init, scene, schema, sensors, stations
 
 if TYPE_CHECKING:
     from ..base.storage import Storage

@@ -32,16 +32,15 @@ from ..export.jobs import JobRow, Value
 from ..export.sweeps import Sweeps
 from ..pipeline import Frame, Receipt
 from ..plan import best
-from ..report.campaign_figures import Figures, draw_results, draw_varied
+from ..report.campaign_report import Figures, draw_results, draw_varied
 from ..run.job_points import JobPoints
 from ..run.page import JobNow, Page
 from ..run.picture_file import Pictured
 from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
 from ..run.result import RunResult
 from .points import HeldPoints
-from .result_page import wait_for_interrupt
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
-from .view import View
+from .view import View, wait_for_interrupt
 
 DRAWING_SHARE = 0.06  # of a core, for charts: they take half a second to a second
 READING_SHARE = 0.05  # of a core, for points

@@ -1,23 +1,32 @@
-"""What a page shows of a survey: its answers to the page's questions."""
+"""What a page shows of a survey: its answers to the page's questions; the command `view`."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from threading import Event
 from typing import Any
 
+import click
 import numpy as np
 
 from raybeam import RayCaster
 
 from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
+from ..base.errors import LidarpoolError
+from ..base.notebook import cell_display
+from ..base.words import counted
+from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
-from ..export.sweeps import Sweeps
+from ..export.sweeps import SWEEPS_FILE, Sweeps
+from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
 from ..render.colouring import (
     MOST_ENTRIES,
@@ -31,13 +40,14 @@ from ..render.colouring import (
 from ..render.hits import HITS_TITLE, hit_colours
 from ..render.surface import apart
 from ..render.theme import mapped, object_colours
-from ..run.picture_file import PLACES_MOST, Pictured, SensorWay, ways_of
+from ..run.picture_file import PICTURE_FILE, PLACES_MOST, Pictured, SensorWay, ways_of
+from ..run.store import RUN_FOLDER
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.drawn import simplified
 from ..scene.scene import Scene
 from ..sensor.trajectory import presence_ns
 from .points import Eye, Filter, PointFinder, Points, Scans, corners_of, positions
-from .server import Answer, Arguments
+from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MOST_POINTS = 20_000_000  # in an answer
 MOST_RAYS = 150  # more rays would hide the surfaces
@@ -57,6 +67,7 @@ _INWARDS = 1e-4  # of the scene's diagonal
 _MOST_INWARDS_OF = 200.0  # metres: some centimetres are enough for any scene
 MOST_LABELS = 1000  # in a legend
 Legend = dict[str, Any]  # what the page is told of it
+CLOUD = "cloud.ply"
 
 
 @dataclass(eq=False)
@@ -534,3 +545,58 @@ def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]
 def as_bytes(colours: Floats) -> Bytes:
     """Colours of 0 to 1 as bytes."""
     return np.round(255 * colours).astype(np.uint8)
+
+
+@contextmanager
+def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
+    """Serve the page of a result while the body runs; see `announced`."""
+    count = counted(len(view.points), "point")
+    with page_server(view.answer, port) as page:
+        ends = "" if cell_display() else "; Ctrl-C ends it"
+        with announced(page, f"{page.url} shows {count}{ends}", browser):
+            yield page
+
+
+def wait_for_interrupt(stopped: Event | None = None) -> None:
+    """Keep a page open until Ctrl-C, or until its user has stopped it."""
+    stopped = stopped or Event()
+    with suppress(KeyboardInterrupt):
+        while not stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+            pass
+
+
+def view_result(path: Path, *, port: int, browser: bool = True) -> None:
+    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`."""
+    view = open_result(path)
+    if view.note:
+        click.echo(f"note: {view.note}", err=True)
+    with result_page(view, port=port, browser=browser):
+        wait_for_interrupt()
+
+
+def open_result(path: Path) -> View:
+    """Open a cloud or the folder of a result; with its scene and sweeps if there are any.
+
+    That these cannot be read is only noted. LidarpoolError if there is no cloud, or a damaged one.
+    """
+    title = f"{path.resolve().name} - lidarpool"
+    if not path.is_dir():
+        return View(CloudFile(path), title=title)
+    cloud, scene, beside = path / CLOUD, path / PICTURE_FILE, path / SWEEPS_FILE
+    if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
+        raise LidarpoolError(
+            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
+            "--live shows its points."
+        )
+    if not cloud.exists():
+        raise LidarpoolError(
+            f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
+        )
+    pictured, sweeps, note = None, None, ""
+    try:
+        sweeps = Sweeps.load(beside) if beside.exists() else None
+        pictured = Pictured.load(scene) if scene.exists() else None
+    except LidarpoolError as error:
+        note = f"The cloud is shown without all that belongs to it. {error}"
+    file = CloudFile(cloud, pictured.own if pictured else ())
+    return View(file, pictured, sweeps, note, title)

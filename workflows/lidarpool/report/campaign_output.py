@@ -25,8 +25,7 @@ from ..run.job_points import listed
 from ..run.result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, drop_run
 from ..scenario.campaign import Campaign, hashes
-from .campaign_figures import draw_sweep
-from .campaign_report import write_card
+from .campaign_report import draw_sweep, write_card
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 

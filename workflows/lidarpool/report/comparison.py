@@ -29,7 +29,7 @@ from ..export.recordings import Recording, Turn, open_recording
 from ..render import theme
 from ..render.page import Page
 from ..sensor.noise import Purpose, uniform
-from .campaign_figures import rank_correlation
+from .campaign_report import rank_correlation
 from .page.page import millimetres, rendered
 from .range_image import RangeImages, paired_images, range_images
 
