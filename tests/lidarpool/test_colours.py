@@ -38,7 +38,7 @@ from lidarpool import (
     Track,
 )
 from lidarpool.columns.table import COLOURS
-from lidarpool.live.surface import Surface, colours_for
+from lidarpool.live.view import Surface, colours_for
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario

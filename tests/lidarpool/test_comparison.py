@@ -18,8 +18,8 @@ from lidarpool.export.formats import Format
 from lidarpool.export.recordings import open_recording
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.report import comparison
+from lidarpool.report.campaign_report import rank_correlation
 from lidarpool.report.comparison import chosen, nearest
-from lidarpool.report.ranks import rank_correlation
 
 RINGS, COLUMNS = 16, 720
 ELEVATION = np.linspace(-15, 15, RINGS)

@@ -10,7 +10,7 @@ from click.testing import CliRunner
 from tests.lidarpool.test_echoes import beam_along_x, cast, wall
 
 from lidarpool import LidarpoolError, Material, Returns, datasheet
-from lidarpool.cli.sensor_commands import sensors
+from lidarpool.cli.scenario_commands import sensors
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.models import Detection, Performance, model_names, read_model

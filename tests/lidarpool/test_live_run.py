@@ -17,8 +17,7 @@ from tests.pages import ask
 from lidarpool import Column, Planning, Scene, Sensor, Survey
 from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN
-from lidarpool.live.live_job import LiveJob
-from lidarpool.live.live_page import LivePage, live_page
+from lidarpool.live.live_page import LiveJob, LivePage, live_page
 from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.jobs import OneJob
 from lidarpool.run.options import RunOptions

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from lidarpool.columns.table import CHANNEL, OBJECT, TABLE, Column, Z
-from lidarpool.live.legend import as_bytes, legend_of
+from lidarpool.live.view import as_bytes, legend_of
 from lidarpool.render.colouring import TURBO
 from lidarpool.render.colouring import colours_of as colouring_of
 

@@ -12,9 +12,15 @@ from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
 from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE
 from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
-from lidarpool.live.result_page import open_result, result_page, view_result
-from lidarpool.live.surface import Surface, colours_for
-from lidarpool.live.view import View, range_image
+from lidarpool.live.view import (
+    Surface,
+    View,
+    colours_for,
+    open_result,
+    range_image,
+    result_page,
+    view_result,
+)
 from lidarpool.plan import Plan
 from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
 from lidarpool.scene.actors import Actor, box
@@ -366,7 +372,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
     def look():
         asked.append(capsys.readouterr().err)
 
-    monkeypatch.setattr("lidarpool.live.result_page.wait_for_interrupt", look)
+    monkeypatch.setattr("lidarpool.live.view.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
     view_result(cloud.parent, port=0, browser=False)
     (said,) = asked

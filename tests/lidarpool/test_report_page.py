@@ -29,10 +29,8 @@ from lidarpool.pipeline import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.cloud_numbers import CountedCloud
-from lidarpool.report.page.page import write_page
-from lidarpool.report.page.timeline import ROWS_MOST
-from lidarpool.report.report import STAGES, make_report
+from lidarpool.report.page.page import ROWS_MOST, write_page
+from lidarpool.report.report import STAGES, CountedCloud, make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.mesh import Mesh

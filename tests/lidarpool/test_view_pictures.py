@@ -13,7 +13,7 @@ from lidarpool.plan import Planning, best, run_trial
 from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene
 from lidarpool.render.shot import take_shot
 from lidarpool.render.theme import object_colours
-from lidarpool.report.path_picture import draw_path
+from lidarpool.report.pictures import draw_path
 from lidarpool.scene.actors import box
 from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene

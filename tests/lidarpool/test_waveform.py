@@ -14,7 +14,7 @@ from tests.lidarpool.test_echoes import beam_along_x, cast, wall
 from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
 from lidarpool.columns.table import AXES, CAUSES, SCAN
 from lidarpool.columns.waveforms import WAVEFORM
-from lidarpool.report.cloud_numbers import CountedCloud
+from lidarpool.report.report import CountedCloud
 from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
 from lidarpool.simulator.batch import columns_of

@@ -641,7 +641,7 @@ def test_several_scenarios_are_a_campaign(files, lidarpool, slots, no_pictures):
 DRIVERS = """
 import json, os, signal, sys, traceback
 import lidarpool.cli.run_command, lidarpool.report.campaign_output as output
-import lidarpool.report.sweep_picture
+import lidarpool.report.campaign_report
 from lidarpool.__main__ import main
 from lidarpool.pipeline.database import RunDatabase
 from lidarpool.export.dataset import DataSet

@@ -10,7 +10,7 @@ import trimesh
 import yaml
 from PIL import Image
 
-from lidarpool.report.station_picture import COLOURS, COVERED, UNCOVERED
+from lidarpool.report.pictures import COLOURS, COVERED, UNCOVERED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 

@@ -11,7 +11,7 @@ EVERYTHING_ELSE = """
 from pathlib import Path
 from lidarpool import LidarpoolError, Scene, Survey, read_cloud, simulate
 from lidarpool.cli.commands import main
-from lidarpool.live.result_page import open_result, result_page
+from lidarpool.live.view import open_result, result_page
 
 def command(*arguments):
     try:

@@ -128,8 +128,7 @@ class Result(RunResult):
             Whether to open a browser where there is a desktop.
         """
         from ..columns.cloud_file import CloudFile
-        from ..live.result_page import result_page, wait_for_interrupt
-        from ..live.view import View
+        from ..live.view import View, result_page, wait_for_interrupt
 
         with ExitStack() as stack:
             file = CloudFile(self._cloud_file, self._pictured.own)

@@ -26,11 +26,9 @@ from ..base.interrupts import (
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import counted
 from . import options
-from .logs import set_logs
+from .options import set_logs
 from .result_commands import compare, export, plot, view
-from .scenario_commands import check, import_, init, schema
-from .scene_commands import scene
-from .sensor_commands import sensors, stations
+from .scenario_commands import check, import_, init, scene, schema, sensors, stations
 
 if TYPE_CHECKING:
     from ..base.storage import Storage

@@ -1,8 +1,11 @@
-"""Options and output that several commands have."""
+"""Options, output and logs of several commands."""
 
 from __future__ import annotations
 
 import json
+import logging
+import sys
+import warnings
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial, reduce, wraps
 from pathlib import Path
@@ -102,3 +105,18 @@ def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> Non
         lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
     for line in lines:
         click.echo(line)
+
+
+def set_logs(shown: bool) -> None:
+    """Show log messages and warnings of libraries in this process, or drop them.
+
+    The command itself tells users what matters. For a log file, redirect the output of `-v`. In
+    workers that share the terminal, too: the driver reports a failed task once, and Dask's worker
+    would log it as well, with a traceback.
+    """
+    logging.disable(logging.NOTSET if shown else logging.CRITICAL)
+    if shown:
+        for handler in logging.getLogger("distributed").handlers:
+            handler.setLevel(logging.INFO)  # a local cluster has raised it
+    elif not sys.warnoptions:
+        warnings.simplefilter("ignore")

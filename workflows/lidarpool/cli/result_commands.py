@@ -178,7 +178,7 @@ def view(result: Path | Storage, port: int, no_browser: bool) -> None:
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
     from ..export.sweeps import SWEEPS_FILE
-    from ..live.result_page import CLOUD, view_result
+    from ..live.view import CLOUD, view_result
     from ..run.picture_file import PICTURE_FILE
 
     with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:

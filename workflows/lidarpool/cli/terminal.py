@@ -16,7 +16,7 @@ from rich.console import Console
 from ..base.streams import Unheard
 from ..run.progress import STAGES, Pace, Progress, Show, bars, standing_still
 from ..run.screen import Screen
-from .logs import set_logs
+from .options import set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
 # of hours does not fill a log.

@@ -1,33 +1,53 @@
-"""What a page shows of a survey: its answers to the page's questions."""
+"""What a page shows of a survey: its answers to the page's questions; the command `view`."""
 
 from __future__ import annotations
 
 import math
 import threading
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
+from pathlib import Path
+from threading import Event
 from typing import Any
 
+import click
 import numpy as np
 
 from raybeam import RayCaster
 
 from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
+from ..base.errors import LidarpoolError
+from ..base.notebook import cell_display
+from ..base.words import counted
+from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
-from ..export.sweeps import Sweeps
+from ..export.sweeps import SWEEPS_FILE, Sweeps
+from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
-from ..render.colouring import MOST_ENTRIES, Colouring, colours_of, values_of, with_rgb, word_of
+from ..render.colouring import (
+    MOST_ENTRIES,
+    TURBO,
+    Colouring,
+    colours_of,
+    values_of,
+    with_rgb,
+    word_of,
+)
+from ..render.hits import HITS_TITLE, hit_colours
+from ..render.surface import apart
 from ..render.theme import mapped, object_colours
-from ..run.picture_file import PLACES_MOST, Pictured, SensorWay, ways_of
+from ..run.picture_file import PICTURE_FILE, PLACES_MOST, Pictured, SensorWay, ways_of
+from ..run.store import RUN_FOLDER
 from ..scene.actors import Actor, samples_each, shapes_of
+from ..scene.drawn import simplified
+from ..scene.scene import Scene
 from ..sensor.trajectory import presence_ns
-from .legend import Legend, as_bytes, legend_of
 from .points import Eye, Filter, PointFinder, Points, Scans, corners_of, positions
-from .server import Answer, Arguments
-from .surface import Surface, colours_for
+from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MOST_POINTS = 20_000_000  # in an answer
 MOST_RAYS = 150  # more rays would hide the surfaces
@@ -41,6 +61,13 @@ _DOWNWARDS = -0.7  # sine of the elevation
 _NARROW = math.radians(300)  # a sensor that sees less is no spinning one
 _NS = 1e9
 IN_SENSOR_AXES = "Points are in the axes of their sensor, where the scene does not fit."
+MOST_TRIANGLES = 300_000  # 50 bytes each, whenever their colours have changed
+MOST_PIECES = 60_000  # that large ones are divided into, where hits are shown
+_INWARDS = 1e-4  # of the scene's diagonal
+_MOST_INWARDS_OF = 200.0  # metres: some centimetres are enough for any scene
+MOST_LABELS = 1000  # in a legend
+Legend = dict[str, Any]  # what the page is told of it
+CLOUD = "cloud.ply"
 
 
 @dataclass(eq=False)
@@ -413,3 +440,163 @@ def _scans(text: str) -> Scans:
     """Read ranges of scans, ``first-last,first-last``."""
     pairs = (entry.split("-") for entry in text.split(",") if entry)
     return tuple((int(first), int(last)) for first, last in pairs)
+
+
+class Surface:
+    """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
+
+    Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
+    triangle that vanishes go to one beside it. `reflectance` is the share of the light that each
+    object reflects, (objects,), if it is known.
+    """
+
+    def __init__(
+        self,
+        scene: Scene,
+        reflectance: Floats | None = None,
+        most: int = MOST_TRIANGLES,
+    ) -> None:
+        self._scene, self._reflectance = scene, reflectance
+        self.coarse = scene
+        self._stands: Ints | None = None  # for each triangle of the scene
+        if len(scene.faces) > most:
+            self.coarse, self._stands = simplified(scene, most)
+        self._objects = self.coarse.face_object
+        size = float(np.linalg.norm(np.ptp(scene.bounds, axis=0)))
+        moved = apart(self.coarse, self._objects, _INWARDS * min(size, _MOST_INWARDS_OF))
+        self.corners = moved.vertices[moved.faces].astype(np.float32)  # (f, 3, 3)
+
+    def coloured(
+        self, by: str, hit_counts: AnyArray, points: Floats32
+    ) -> tuple[dict[str, AnyArray], Legend | None]:
+        """Corners (k, 3, 3), objects (k,), colours (k, 3, 3) at the corners; and their legend.
+
+        `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
+        some of the hit points, (n, 3). There are no colours for "grey": the page has its own.
+        """
+        if by == "hits":
+            return self._by_hits(hit_counts, points)
+        arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
+        legend = None
+        if by == "object":
+            colouring = colours_of(self._objects, OBJECT, self._scene.names)
+            colours, legend = colouring.paint(self._objects), legend_of(colouring)
+        elif by == "reflectance" and self._reflectance is not None:
+            colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])
+            greys = mapped("gray", np.linspace(0.1, 1.0, 9))
+            legend = scale_legend("reflectance", ("0", "0.5", "1"), greys)
+        elif by == "colour" and self.coarse.colours is not None:
+            colours = self.coarse.colours.means() / 255
+        else:
+            return arrays, None
+        corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
+        return arrays | {"colours": corners}, legend
+
+    def _by_hits(
+        self, hit_counts: AnyArray, points: Floats32
+    ) -> tuple[dict[str, AnyArray], Legend | None]:
+        hits = hit_counts.astype(np.float64)
+        if self._stands is not None:
+            left = self._stands >= 0
+            hits = np.bincount(self._stands[left], hits[left], len(self.corners)).astype(np.float64)
+        most = len(self.corners) + MOST_PIECES
+        shown = self.coarse, self.corners
+        corners, owner, colours, (low, high) = hit_colours(*shown, hits, points, most)
+        middle = (low * high) ** 0.5
+        marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
+        arrays: dict[str, AnyArray] = {
+            "corners": corners, "objects": self._objects[owner], "colours": as_bytes(colours),
+        }  # fmt: skip
+        return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
+
+
+def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:
+    """List the ways to colour a scene, with or without known reflectance, and its own colours."""
+    own = ("colour",) if scene.coloured else ()
+    more = ("reflectance",) if reflectance is not None and len(np.unique(reflectance)) > 1 else ()
+    return ("grey", "hits", "object", *more, *own)
+
+
+def legend_of(colouring: Colouring) -> Legend:
+    """Legend of colours: a scale with numbers, or labels with their values."""
+    if colouring.limits is None:
+        labels = [
+            [name, as_bytes(colour).tolist(), value]
+            for (name, colour), value in zip(colouring.labels, colouring.values, strict=True)
+        ]
+        more = len(labels) - MOST_LABELS
+        return {"labels": labels[:MOST_LABELS], "more": max(more, 0), "column": colouring.name}
+    low, high = colouring.limits
+    title = f"{colouring.name}, {colouring.unit}" if colouring.unit else colouring.name
+    title += f": {colouring.meaning}" if colouring.meaning else ""
+    if colouring.logarithmic:
+        marks = [f"{at:.2g}" for at in (low, (low * high) ** 0.5, high)]
+    else:  # as many digits as a bar of this span needs, and never -0
+        digits = int(np.clip(np.ceil(1 - np.log10(high - low)), 0, 6)) if high > low else 2
+        marks = [f"{round(at, digits) + 0.0:,.{digits}f}" for at in (low, (low + high) / 2, high)]
+    return scale_legend(title, marks, colouring.scale[::15])
+
+
+def scale_legend(title: str, marks: Sequence[str], colours: Floats = TURBO[::15]) -> Legend:
+    """Legend of a scale of colours (n, 3), with evenly spread marks."""
+    return {"title": title, "marks": list(marks), "colours": as_bytes(colours).tolist()}
+
+
+def as_bytes(colours: Floats) -> Bytes:
+    """Colours of 0 to 1 as bytes."""
+    return np.round(255 * colours).astype(np.uint8)
+
+
+@contextmanager
+def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
+    """Serve the page of a result while the body runs; see `announced`."""
+    count = counted(len(view.points), "point")
+    with page_server(view.answer, port) as page:
+        ends = "" if cell_display() else "; Ctrl-C ends it"
+        with announced(page, f"{page.url} shows {count}{ends}", browser):
+            yield page
+
+
+def wait_for_interrupt(stopped: Event | None = None) -> None:
+    """Keep a page open until Ctrl-C, or until its user has stopped it."""
+    stopped = stopped or Event()
+    with suppress(KeyboardInterrupt):
+        while not stopped.wait(0.2):  # one without limit is not left on Ctrl-C everywhere
+            pass
+
+
+def view_result(path: Path, *, port: int, browser: bool = True) -> None:
+    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`."""
+    view = open_result(path)
+    if view.note:
+        click.echo(f"note: {view.note}", err=True)
+    with result_page(view, port=port, browser=browser):
+        wait_for_interrupt()
+
+
+def open_result(path: Path) -> View:
+    """Open a cloud or the folder of a result; with its scene and sweeps if there are any.
+
+    That these cannot be read is only noted. LidarpoolError if there is no cloud, or a damaged one.
+    """
+    title = f"{path.resolve().name} - lidarpool"
+    if not path.is_dir():
+        return View(CloudFile(path), title=title)
+    cloud, scene, beside = path / CLOUD, path / PICTURE_FILE, path / SWEEPS_FILE
+    if not cloud.exists() and (path / RUN_FOLDER / FILE).exists():
+        raise LidarpoolError(
+            f"{path} holds an unfinished run: continue it with lidarpool run --resume, where "
+            "--live shows its points."
+        )
+    if not cloud.exists():
+        raise LidarpoolError(
+            f"{path} holds no {CLOUD}: give the folder of a result (its --out), or a cloud."
+        )
+    pictured, sweeps, note = None, None, ""
+    try:
+        sweeps = Sweeps.load(beside) if beside.exists() else None
+        pictured = Pictured.load(scene) if scene.exists() else None
+    except LidarpoolError as error:
+        note = f"The cloud is shown without all that belongs to it. {error}"
+    file = CloudFile(cloud, pictured.own if pictured else ())
+    return View(file, pictured, sweeps, note, title)

@@ -144,8 +144,8 @@ class DataSetOutput(Output[CampaignRun]):
 
     def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
         """Write what all jobs share, and last what says that the data set is complete."""
-        from .campaign_report import write_card  # Matplotlib takes as long as all other imports
-        from .sweep_picture import draw_sweep
+        # Matplotlib takes as long as all other imports.
+        from .campaign_report import draw_sweep, write_card
 
         campaign, place = self.campaign, self.dataset.place
         made: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}

@@ -28,8 +28,7 @@ from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
 from ..scenario.scenario import Scenario
 from ..sensor import Survey
-from .cloud_numbers import CountedCloud
-from .report import make_report
+from .report import CountedCloud, make_report
 
 ROOM_BYTES = 32 << 20  # room for pictures and report
 

@@ -1,29 +1,42 @@
-"""Fills the templates of pages, and writes the page of a result."""
+"""Fills the templates of pages, with a timeline of tasks and with numbers and names as text."""
 
 from __future__ import annotations
 
+import math
 import re
-from collections.abc import Mapping, Sequence
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import yaml
 from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
+from poolpart import TaskRecord
+
 from ...base.declared import declared
-from ...base.words import counted
-from ...pipeline.task_book import StageTotals
+from ...base.words import counted, natural
+from ...pipeline.task_book import StageTotals, union
 from ...render.page import shortened, without_common_prefix
+from ...render.stage import nice_step
 from ...run.result import RunResult
 from ...scenario.scenario import Scenario
 from ...sensor import Noise, Returns
 from ...sensor.weather import Weather
-from ..cloud_numbers import CountedCloud
-from . import words
-from .timeline import make_timeline
+from ..report import STAGES, CountedCloud, in_order
 
 SCENARIO_MOST = 50_000  # letters of the scenario; a survey may have a million poses
+WIDTH = 1000  # units of the drawing, which the page scales
+ROW = 18  # height of a row
+ROWS_MOST = 24  # rows of a partition; the busiest are drawn
+_THIN = 1.2  # least width of a bar, in units
+_GAP = 0.6  # bars nearer than this are drawn as one
+Span = tuple[float, float]
+MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
+_SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
 
 
 def write_page(
@@ -68,7 +81,7 @@ def rendered(
     `pictures` are elements of HTML, and `stages` are for a timeline. All other values are escaped
     as the format needs; a missing one is an error.
     """
-    escaped = words.markdown if template.endswith(".md") else words.printable
+    escaped = markdown if template.endswith(".md") else printable
     environment = Environment(
         loader=PackageLoader(__package__ or ""),
         autoescape=template.endswith(".html"),
@@ -79,9 +92,9 @@ def rendered(
         finalize=lambda value: escaped(value) if type(value) is str else value,  # not of Markup
     )
     for filter_ in (
-        words.duration, words.rate, words.large, words.share, words.excess,
-        words.numbers, words.grouped, words.told, words.code, words.markdown, words.millimetres,
-        words.ratio, counted,
+        duration, rate, large, share, excess,
+        numbers, grouped, told, code, markdown, millimetres,
+        ratio, counted,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
     environment.filters["shortened"] = lambda name, most=60: shortened(name, most)
@@ -109,4 +122,191 @@ def _written(scenario: Scenario) -> str:
 def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
     """Name and value of each field of a dataclass that differs from its default."""
     usual = declared(kind(), kind)
-    return [(name, words.told(values[name])) for name in usual if values[name] != usual[name]]
+    return [(name, told(values[name])) for name in usual if values[name] != usual[name]]
+
+
+class Row(NamedTuple):
+    """The bars of one stage, on one worker or on all: a path of thick lines for SVG."""
+
+    label: str
+    detail: str  # the tooltip
+    stage: str  # gives the colour
+    bars: str
+
+
+class Group(NamedTuple):
+    """Rows under one heading."""
+
+    title: str
+    detail: str
+    rows: Sequence[Row]
+
+
+class Timeline(NamedTuple):
+    """All groups on one axis: the stages, then each partition's workers."""
+
+    begun: str  # when the first task was, UTC
+    seconds: float  # from the first start to the last stop
+    ticks: Sequence[tuple[float, str]]  # per cent of the width, label
+    groups: Sequence[Group]
+    stages: Sequence[StageTotals]  # in the order of the pipeline
+    names: Mapping[str, str] = STAGES
+    row: int = ROW  # height of a row
+
+
+def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
+    """Lay out the tasks of a run, of which some have records; None if nothing ran."""
+    if not stages:
+        return None
+    stages = in_order(stages)
+    begin = min(stage.start for stage in stages)
+    seconds = max(1e-6, max(stage.stop for stage in stages) - begin)
+
+    def bars(times: Iterable[Span]) -> str:
+        """Draw spans of time, each wide enough to see, near ones joined."""
+        wide = []
+        for start, stop in times:
+            low = min((start - begin) * WIDTH / seconds, WIDTH - _THIN)
+            wide.append((low, max((stop - begin) * WIDTH / seconds, low + _THIN)))
+        return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in union(wide, _GAP))
+
+    overview = [
+        Row(
+            STAGES[stage.stage],
+            f"{STAGES[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
+            f"work within {duration(stage.stop - stage.start)}",
+            stage.stage,
+            bars(stage.busy),
+        )
+        for stage in stages
+    ]
+    groups = [Group("Stages", "while at least one task ran", overview)]
+    ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
+    # {partition: {(worker, stage): tasks}}
+    drawn: dict[str, dict[tuple[str, str], list[TaskRecord]]] = defaultdict(
+        lambda: defaultdict(list)
+    )
+    for record in (record for stage in stages for record in stage.records):
+        where = record.partition if not record.misplaced else " + ".join(record.resources)
+        drawn[where or "no partition"][record.worker, record.stage].append(record)
+    for partition, tasks in sorted(drawn.items()):
+        workers = {worker for worker, _ in tasks}  # of tasks that have a record
+        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
+        count = sum(map(len, tasks.values()))
+        detail = f"{counted(len(workers), 'worker')}, {counted(max(ran[partition], count), 'task')}"
+        if ran[partition] > count:  # else gaps would look like idle time
+            detail += f", of which {count:,} are drawn: gaps are not all idle time"
+        if len(tasks) > ROWS_MOST:
+            detail += f"; the busiest {ROWS_MOST} of {len(tasks):,} rows"
+        work = {row: sum(task.seconds for task in tasks[row]) for row in tasks}
+        busiest = sorted(work, key=lambda row: -work[row])[:ROWS_MOST]
+        rows = [
+            Row(
+                worker,
+                f"{worker}: {STAGES[stage]}, {counted(len(tasks[worker, stage]), 'task')}, "
+                + duration(work[worker, stage]),
+                stage,
+                bars((task.start, task.stop) for task in tasks[worker, stage]),
+            )
+            for worker, stage in sorted(
+                busiest, key=lambda row: (natural(row[0]), [*STAGES].index(row[1]))
+            )
+        ]
+        groups.append(Group(partition, detail, rows))
+    marks = np.arange(0, seconds, nice_step(seconds / 6))
+    ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
+    begun = f"{datetime.fromtimestamp(begin, UTC):%Y-%m-%d %H:%M UTC}"
+    return Timeline(begun, seconds, ticks, groups, stages)
+
+
+def printable(text: str) -> str:
+    """Replace unprintable characters; names in files may contain ones that reverse a line."""
+    return "".join(
+        c if c.isprintable() or c in _SPACES else "\N{REPLACEMENT CHARACTER}" for c in text
+    )
+
+
+def markdown(text: str) -> str:
+    """Text of a user as one line of Markdown that shows it as it is."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return re.sub(r"([\\`*{}\[\]<>|#&~]|(?<!\w)_|_(?!\w))", r"\\\1", line)
+
+
+def code(text: str) -> Markup:
+    """Name as code of Markdown; with letters that end code or a cell, as text."""
+    is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
+    return Markup(f"`{text}`" if is_plain else markdown(text))
+
+
+def grouped(count: int) -> str:
+    """Return a whole number with thousands separated."""
+    return f"{count:,}"
+
+
+def duration(seconds: float) -> str:
+    """Return a time in the unit that suits it."""
+    if seconds < 0.001:
+        return f"{1e6 * seconds:.0f} µs"
+    if seconds < 0.9995:
+        return f"{1e3 * seconds:.3g} ms"
+    if seconds < 99.95:
+        return f"{seconds:.3g} s"
+    whole = round(seconds)
+    if whole < 3600:
+        return f"{whole // 60} min {whole % 60:02d} s"
+    return f"{whole // 3600:,} h {whole % 3600 // 60:02d} min"
+
+
+def rate(number: float, seconds: float) -> str:
+    """Return a rate per second; a dash if the time is unknown."""
+    return f"{large(number / seconds)}/s" if seconds > 0 else "–"
+
+
+def large(number: float) -> str:
+    """Return a number with three digits, and k, M or G if it is large."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e4, "k")):
+        if number >= size:
+            scaled = number / (1e3 if letter == "k" else size)
+            return f"{scaled:.{max(0, 2 - int(math.log10(scaled)))}f}{NARROW}{letter}"
+    return f"{number:,.0f}" if number >= 100 else f"{number:.3g}"
+
+
+def share(part: float, whole: float) -> str:
+    """Return a part in per cent."""
+    return f"{100 * part / whole:.1f}%" if whole else "–"
+
+
+def excess(fraction: float) -> str:
+    """Return an excess in per cent: «+0.12%»."""
+    if 0 < fraction < 1e-4:
+        return "< 0.01%"
+    return f"{fraction:+.2%}".replace("-", MINUS)
+
+
+def told(value: Any, digits: int = 6) -> str:
+    """Return a number, whole ones with all their digits; text, true or false, or several."""
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if isinstance(value, list | tuple):
+        return " × ".join(told(one, digits) for one in value)
+    if isinstance(value, float):
+        return f"{value:,.{digits}g}"
+    return f"{value:,}" if isinstance(value, int) else str(value)
+
+
+def numbers(values: Sequence[float]) -> str:
+    """Coordinates, short."""
+    return ", ".join(f"{value:,.10g}" for value in values).replace("-", MINUS)
+
+
+def millimetres(value: float | None) -> str:
+    """Length in the unit that suits it, or words for none."""
+    if value is None:
+        return "unknown"
+    text = f"{value:.3f} m" if abs(value) >= 0.9995 else f"{1000 * value:.3g} mm"
+    return text.replace("-", MINUS)
+
+
+def ratio(value: float | None) -> str:
+    """Return a share from 0 to 1, or words for none."""
+    return "undefined" if value is None else f"{value:.3f}"
