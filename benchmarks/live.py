@@ -27,7 +27,7 @@ from lidarpool.run.connection import local_cluster
 from lidarpool.run.jobs import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.page import Page
-from lidarpool.run.screen import Screen
+from lidarpool.run.progress import Screen
 from lidarpool.scenario.build import Job
 
 NEWS_S = 0.5  # as the page asks

@@ -14,7 +14,7 @@ from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.connection import local_client
 from lidarpool.run.jobs import OneJob
 from lidarpool.run.options import RunOptions
-from lidarpool.run.screen import Screen
+from lidarpool.run.progress import Screen
 from lidarpool.scenario.build import Job
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]

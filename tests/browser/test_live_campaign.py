@@ -12,7 +12,7 @@ from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.conductor import Conductor
 from lidarpool.run.connection import local_client
 from lidarpool.run.options import RunOptions
-from lidarpool.run.screen import Screen
+from lidarpool.run.progress import Screen
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 

@@ -18,8 +18,7 @@ from lidarpool.report.campaign_output import DataSetOutput
 from lidarpool.run.conductor import Conductor
 from lidarpool.run.options import RunOptions
 from lidarpool.run.page import JobNow
-from lidarpool.run.progress import Progress
-from lidarpool.run.screen import Screen
+from lidarpool.run.progress import Progress, Screen
 from lidarpool.scene.mesh import Mesh
 
 LONG_S = 120.0

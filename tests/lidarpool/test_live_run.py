@@ -21,8 +21,7 @@ from lidarpool.live.live_page import LiveJob, LivePage, live_page
 from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.jobs import OneJob
 from lidarpool.run.options import RunOptions
-from lidarpool.run.progress import Progress
-from lidarpool.run.screen import Screen
+from lidarpool.run.progress import Progress, Screen
 from lidarpool.run.store import RunStore
 from lidarpool.scenario.build import Job
 from lidarpool.scene.mesh import Mesh

@@ -7,9 +7,8 @@ from ._version import __version__
 from .base import ports
 
 if TYPE_CHECKING:
-    from .api.campaigns import Campaign
     from .api.result import Result
-    from .api.simulation import simulate
+    from .api.simulation import Campaign, simulate
     from .base.errors import LidarpoolError
     from .columns.cloud import Cloud
     from .columns.table import Column
@@ -97,9 +96,8 @@ __all__ = [
 # Where the names above are. They are imported when they are asked for, which takes a second:
 # the command has to see to its signals before (`__main__.py`).
 _MODULES = {
-    "api.campaigns": ("Campaign",),
     "api.result": ("Result",),
-    "api.simulation": ("simulate",),
+    "api.simulation": ("Campaign", "simulate"),
     "base.errors": ("LidarpoolError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),

@@ -14,8 +14,7 @@ from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.progress import STAGES, Pace, Progress, Show, bars, standing_still
-from ..run.screen import Screen
+from ..run.progress import STAGES, Pace, Progress, Screen, Show, bars, standing_still
 from .options import set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey

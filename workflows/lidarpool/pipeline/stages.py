@@ -31,7 +31,6 @@ from poolpart import (
 from ..base.storage import Storage
 from ..columns.parts import pack
 from ..sensor import Survey
-from .cast import CastBatch
 from .failures import ScanError, naming_scans, storing
 from .messages import (
     CollectOrder,
@@ -45,6 +44,7 @@ from .messages import (
     Summaries,
 )
 from .names import COLLECT, GENERATE, LIDAR
+from .rigs import CastBatch
 
 TELL_EVERY_S = 0.02  # messages that follow each other so fast travel together
 FETCH_PATIENCE_S = 2.0  # longest wait for a sign of life of a batch's worker

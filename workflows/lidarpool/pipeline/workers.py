@@ -17,12 +17,11 @@ from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software_there
 from ..scene.scene import Scene
-from .cast import CastWork, intersect
 from .failures import JobError, error_of, raise_if_failed, was_killed, words_on_memory
 from .jobs import Outcome
 from .messages import Span
 from .names import INTERSECT
-from .rigs import RigFailed, RigMissing, drop_all
+from .rigs import CastWork, RigFailed, RigMissing, drop_all, intersect
 
 LOOK_EVERY_S = 1.0
 SETUP_DEATHS = 4  # workers in a row that may die while they are checked

@@ -24,8 +24,8 @@ from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..export.table import EXPORTS, FORMATS
 from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, Pictured
-from ..run.ranges import LidarWorkers
 from ..run.result import RunResult
+from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from ..sensor import Survey
 from .report import CountedCloud, make_report

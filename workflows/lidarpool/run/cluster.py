@@ -19,7 +19,7 @@ from ..scenario.build import Job
 from .checks import check_workers, find_workers, gpu_note, slots_needed
 from .connection import connected, local_client, started_client
 from .options import RunOptions
-from .screen import Screen
+from .progress import Screen
 from .store import RunStore
 from .tasks import Tasks
 from .watch import Waiting, Watch

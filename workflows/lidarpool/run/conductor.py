@@ -19,9 +19,9 @@ from .cluster import Cluster
 from .jobs import JobMaker, Jobs, Made, OneJob
 from .options import RunOptions
 from .page import Page
+from .progress import Screen
 from .result import RunResult
 from .run import Run
-from .screen import Screen
 from .store import RunStore, remove_run
 
 R = TypeVar("R")

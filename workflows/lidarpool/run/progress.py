@@ -1,11 +1,13 @@
-"""Progress of a run, its texts, and its bars at a terminal or in a notebook."""
+"""Progress of a run, its texts, and what is shown of it at a terminal or in a notebook."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass
 
+from distributed import Client
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn
 from rich.progress import Progress as Bars
@@ -129,3 +131,36 @@ def bars_here() -> Iterator[Show]:
             yield show
     else:
         yield lambda progress: None
+
+
+logger = logging.getLogger(__name__)
+
+
+class Screen:
+    """Tells a caller of Python: notes go to the log, and bars are where they can be seen.
+
+    `on_progress` is called in place of bars.
+    """
+
+    def __init__(self, on_progress: Callable[[Progress], None] | None = None) -> None:
+        self._on_progress = on_progress
+
+    def tell(self, words: str) -> None:
+        """Tell something that the user should know."""
+        logger.info(words)
+
+    def status(self, words: str) -> AbstractContextManager[None]:
+        """Show what is going on while the body runs."""
+        return nullcontext()
+
+    def progress(self) -> AbstractContextManager[Show]:
+        """Show the progress while the body runs; gives the function that does."""
+        return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
+
+    @contextmanager
+    def starting(
+        self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
+    ) -> Iterator[Client]:
+        """Show that a cluster is being started; `own` if its workers share the terminal."""
+        with cluster as client:
+            yield client

@@ -1,4 +1,4 @@
-"""LIDAR workers that write jobs into a data set, several small ones at a time."""
+"""LIDAR workers that write: jobs into a data set, and ranges of formats of many files."""
 
 from __future__ import annotations
 
@@ -8,18 +8,26 @@ from collections.abc import Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 from typing import Any, NamedTuple
 
-from poolpart import Recorder, TaskRecord
+from distributed import Reschedule
+
+from poolpart import Recorder, TaskRecord, fetch_available, own_client
 
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import TEMPORARY
 from ..columns.parts import StoredCloud
 from ..export.dataset import DataSet, Listing
 from ..export.jobs import JobRow
+from ..export.pieces import RangeWriter, Span
+from ..export.pieces import Written as Range
 from ..export.sweeps import Sweeps
 from ..pipeline import EXPORT, LIDAR, JobError
 from ..pipeline.failures import raise_if_failed, was_killed
+from ..pipeline.workers import share
+from .cluster import Cluster
+from .result import RunResult
 from .store import RunStore
 from .tasks import Tasks
 
@@ -170,3 +178,79 @@ class JobWriter:
         place, name, _ = self._probes[0]
         with suppress(OSError):
             place.remove([name])
+
+
+LOOK_EVERY_S = 0.01
+FETCH_S = 1.0
+ENDS_S = 10.0  # for ranges that are being written when the others are stopped
+
+
+class LidarWorkers:
+    """Has the workers of LIDAR write ranges of files."""
+
+    def __init__(self, cluster: Cluster) -> None:
+        self._cluster, self._tasks = cluster, cluster.tasks(LIDAR)
+
+    def __call__(self, writer: RangeWriter, spans: Sequence[Span]) -> dict[Span, Range]:
+        """Write ranges; returns what was written of those whose workers see the folder.
+
+        The range of a worker that dies is written by another. LidarpoolError if one cannot write,
+        several die of a range, or there is none for too long.
+        """
+        partition, running = self._tasks.partition, self._tasks.running
+        waiting, most = deque(spans), 2 * partition.slots
+        written: dict[Span, Range] = {}
+        watch = self._cluster.watch([LIDAR])
+        # Workers fetch it from the one that has it: as an argument of the tasks it would make Dask
+        # send them all to that worker.
+        shared = share(partition, writer, priority=10)
+        try:
+            while waiting or running:
+                while waiting and len(running) < most:
+                    span = waiting.popleft()
+                    self._tasks.submit(span, _write_range, shared.key, span)
+                for future in (shared, *running):
+                    raise_if_failed(future, f"Writing {writer.place}")
+                done = self._tasks.take_done()
+                written |= {span: made for span, made in done if made is not None}
+                watch.look(time.monotonic())
+                if not done:
+                    time.sleep(LOOK_EVERY_S)
+        except OSError as error:
+            raise LidarpoolError(f"The cluster was lost while it wrote {writer.place}.") from error
+        finally:
+            if running:
+                writer.stop()
+                until = time.monotonic() + ENDS_S
+                while any(f.status == "pending" for f in running) and time.monotonic() < until:
+                    time.sleep(LOOK_EVERY_S)
+                running.clear()
+        return written
+
+    def recorded(self, result: RunResult) -> RunResult:
+        """Return a result with the tasks that wrote ranges."""
+        return replace(result, stages=(*result.stages, *self._tasks.book.stages.values()))
+
+
+@lru_cache(maxsize=1)
+def _fetched(key: str) -> RangeWriter:
+    """Fetch the writer once for all ranges; it is made again if its worker has died."""
+    until = time.monotonic() + FETCH_S
+    while not (found := fetch_available(own_client(), [key])):
+        if time.monotonic() > until:
+            raise Reschedule  # what makes it again needs a slot
+        time.sleep(LOOK_EVERY_S)
+    writer: RangeWriter = found[key]
+    return writer
+
+
+def _write_range(key: str, span: Span) -> tuple[Range | None, TaskRecord]:
+    """Write a range on a worker."""
+    recorder = Recorder(EXPORT, LIDAR)
+    try:
+        made = _fetched(key)(span)
+    except OSError as error:
+        raise LidarpoolError(
+            f"the worker {recorder.done().worker} cannot write there: {error.strerror or error}."
+        ) from None
+    return made, recorder.done(span[1] - span[0])
