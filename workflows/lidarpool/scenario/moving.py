@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import model_validator
 
 from ..base.arrays import Floats
-from ..base.declared import Several, Text, TextOrTexts, Triple, declared, is_text, short, told
+from ..base.declared import Several, Text, TextOrTexts, Triple, by_text, declared, one_of, told
 from ..base.errors import LidarpoolError, prefixed
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
@@ -131,11 +131,7 @@ class TrajectorySection(Section):
         ),
     ] = "refuse"
 
-    @model_validator(mode="after")
-    def _one_source(self) -> TrajectorySection:
-        if (self.file is None) != bool(self.points):
-            raise ValueError("give either file or points.")
-        return self
+    _one_source = one_of("file", "points")
 
     def track(self, path: PathOf, standing: Standing, start_s: float | None = None) -> Track:
         """Return it in a scene's local coordinates; LidarpoolError if it cannot be used.
@@ -190,9 +186,7 @@ class TrajectorySection(Section):
         )
 
 
-TrajectoryEntry = Annotated[
-    TrajectorySection, short(is_text, lambda v: {"file": v}, Text | TrajectorySection)
-]
+TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection)]
 
 
 class ActorSection(ShapeSection):
