@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import hashlib
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from itertools import chain, combinations, count
+from itertools import chain, combinations, count, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -523,7 +523,7 @@ class _Base:
             try:
                 found = self.changed(changes, f"{source}: {self._where}")
             except LidarpoolError as error:
-                wrong = [line for text in self._vary for line in self._tried(text)[:1]]
+                wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
                 mistakes.lines += [f"{source}: {self._where}: {line}" for line in wrong]
                 mistakes.lines += () if wrong else str(error).splitlines()
                 return
@@ -539,10 +539,9 @@ class _Base:
         pieces = [table[begin : begin + most] for begin in begins]
         return [table[:least], *pieces]
 
-    def _tried(self, text: str) -> list[str]:
-        """Lines on the values of a path that are not valid in the base."""
+    def _tried(self, text: str) -> Iterator[str]:
+        """Yield lines on the values of a path that are not valid in the base."""
         choice, place = self._vary[text], dotted([key for key, _ in self._steps[text]])
-        lines = []
         for value in () if choice.sample else choice.ends:
             try:
                 self.changed({text: value}, "")
@@ -550,8 +549,7 @@ class _Base:
                 told = str(error).partition("\n")[0].removeprefix(": ")
                 own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
                 given = f"{text} can be {shown(value)}"
-                lines.append(f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}")
-        return lines
+                yield f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}"
 
     def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
         """Return the scenario with other values, and with a seed of its noise if it has none."""

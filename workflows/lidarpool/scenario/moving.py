@@ -157,8 +157,12 @@ class TrajectorySection(Section):
 
     def _level(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
         """Return it without surfaces."""
-        start_s = self.start_s if start_s is None else start_s
-        smooth = self.interpolation == "smooth"
+        own: dict[str, Any] = {
+            "smooth": self.interpolation == "smooth",
+            "start_s": self.start_s if start_s is None else start_s,
+            "duration_s": self.duration_s,
+            "beyond": self.beyond,
+        }
         if self.file is not None:
             track = load_trajectory(
                 path(self.file),
@@ -167,10 +171,7 @@ class TrajectorySection(Section):
                 columns=self.columns,
                 camera_axes=self.camera_axes,
                 offset_s=self.offset_s,
-                smooth=smooth,
-                start_s=start_s,
-                duration_s=self.duration_s,
-                beyond=self.beyond,
+                **own,
             )
             return replace(track, positions=track.positions - origin)
         angles = [[p.yaw_deg, p.pitch_deg, p.roll_deg] for p in self.points]
@@ -179,10 +180,7 @@ class TrajectorySection(Section):
             np.array([p.time_s + self.offset_s for p in self.points]),
             np.array([p.position for p in self.points]) - origin,
             quaternions_from_degrees(np.array(angles)) if turned else None,
-            smooth,
-            start_s,
-            self.duration_s,
-            self.beyond,
+            **own,
         )
 
 

@@ -106,11 +106,7 @@ class MeshFile(Section):
     translation: Annotated[Triple, told("translation in metres, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
         Three[Angle], told("rotation about the world's x, y and z axes, degrees")
-    ] = (
-        0,
-        0,
-        0,
-    )
+    ] = (0, 0, 0)
     scale: Annotated[Scale, told("one factor, or one for each axis; applied first")] = (1, 1, 1)
     matrix: Annotated[
         Four[Four[Factor]] | None, told("instead of the three: 4 rows of 4, metres")
