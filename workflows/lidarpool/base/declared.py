@@ -18,6 +18,7 @@ from pydantic import (
     Strict,
     ValidationError,
     WrapValidator,
+    model_validator,
 )
 from pydantic_core import PydanticCustomError
 
@@ -60,6 +61,24 @@ def short(is_short: Callable[[Any], bool], long: Callable[[Any], Any], allowed: 
     return BeforeValidator(
         lambda value: long(value) if is_short(value) else value, json_schema_input_type=allowed
     )
+
+
+def by_text(field: str, kind: Any) -> Any:
+    """Let a scenario give just the text of one field of a section: «hall.glb»."""
+    return short(is_text, lambda value: {field: value}, Text | kind)
+
+
+def one_of(*fields: str) -> Any:
+    """Let a section have exactly one of some fields."""
+    *others, last = fields
+    words = f"one of {', '.join(others)} and" if others[1:] else f"either {others[0]} or"
+
+    def one(section: Any) -> Any:
+        if sum(bool(getattr(section, field)) for field in fields) != 1:
+            raise ValueError(f"give {words} {last}.")
+        return section
+
+    return model_validator(mode="after")(one)
 
 
 def allowed(words: str) -> WrapValidator:

@@ -7,6 +7,7 @@ import os
 import re
 import reprlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields as dataclass_fields
 from datetime import datetime
 from functools import cache, partial, reduce, wraps
@@ -37,7 +38,7 @@ from pydantic_core import (
 )
 
 from .arrays import AnyArray
-from .errors import LidarpoolError
+from .errors import LidarpoolError, Mistakes
 from .words import counted, did_you_mean
 
 P = ParamSpec("P")
@@ -250,6 +251,18 @@ def _having(protocol: type) -> Callable[[Any], Any]:
         return value
 
     return having
+
+
+@contextmanager
+def sentences(section: Any, source: object = "") -> Iterator[None]:
+    """Turn pydantic's error of the body into a LidarpoolError with a line for each mistake."""
+    try:
+        yield
+    except ValidationError as error:
+        mistakes = Mistakes()
+        lines = validation_errors(error, section)
+        mistakes.lines += [f"{source}: {line}" if source else line for line in lines]
+        mistakes.tell()
 
 
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:

@@ -10,14 +10,14 @@ from typing import Any
 
 from distributed import SpecCluster, SSHCluster
 from distributed.deploy import ssh
-from pydantic import BaseModel, ConfigDict, Field, PrivateAttr, ValidationError
+from pydantic import BaseModel, ConfigDict, Field, PrivateAttr
 
 from poolpart import start_partitions
 from poolpart.clusters import INFORMATION
 
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
-from ..base.validation import validation_errors
+from ..base.validation import sentences
 from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..pipeline import GPU, LIDAR, OTHER
@@ -79,11 +79,8 @@ class ClusterFile(BaseModel):
         not a cluster.
         """
         content = read_yaml(path, "a cluster file has cluster:, arguments: and partitions:")
-        try:
+        with sentences(cls, path):
             file = cls.model_validate(content)
-        except ValidationError as error:
-            told = [f"{path}: {line}" for line in validation_errors(error, cls)]
-            raise LidarpoolError("\n".join(told)) from error
         file._source = str(path)
         for name, workers in file.partitions.items():
             if name not in (GPU, LIDAR, OTHER):

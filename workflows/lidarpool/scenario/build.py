@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
-from functools import partial
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,6 @@ from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor
 from ..scene.cityjson import CLASSES as CITY_CLASSES
-from ..scene.mesh import Mesh
 from ..scene.meshfile import CITYJSON
 from ..scene.robot import Robot
 from ..scene.scene import Scene
@@ -38,7 +36,7 @@ from .moving import ActorSection, MountSection, VehicleSection, actors_of, read_
 from .placing import Placing, place
 from .scenario import Scenario
 from .sections import CopiesSection, MeshFile, SensorSection
-from .static_scene import Findings, SceneCache, StaticScene, mesh_of, read_static_scene
+from .static_scene import SceneCache, Shapes, StaticScene, read_static_scene
 
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
@@ -120,35 +118,6 @@ def _check_precision(scene: Scene, survey: Survey) -> None:
         )
 
 
-@dataclass(frozen=True, eq=False)
-class Built:
-    """What a scenario describes.
-
-    Parameters
-    ----------
-    scenario
-        What it was built of.
-    scene, survey, planning
-        In the scene's local coordinates; the planning is None for none.
-    placing
-        Where the sensor was put, if the scenario has no poses; else None.
-    found
-        What was noted meanwhile, and what each file gave.
-    """
-
-    scenario: Scenario
-    scene: Scene
-    survey: Survey
-    planning: Planning | None
-    placing: Placing | None
-    found: Findings
-
-    def job(self, **own: Any) -> Job:
-        """Return it as a job; `own` are further fields, such as `name`."""
-        outputs = tuple(one for one in self.scenario.output.write if one.format != "ply")
-        return Job(self.scene, self.survey, self.planning, outputs=outputs, **own)
-
-
 def build(
     scenario: Scenario,
     *,
@@ -173,39 +142,60 @@ def build(
         If a file cannot be read, or fields do not fit together or the scene.
     """
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
-    made = _Building(scenario, static)
-    vehicles = made.move()
-    survey, planning, mistakes = None, None, Mistakes()
-    with mistakes.noted():
-        with prefixed(scenario.source):
-            survey = made.survey(made.materials(vehicles), columns)
-        names = made.scene.all_names
-        MaterialTable.of(survey.materials, names, voxels=made.scene.has_voxels)
-    with mistakes.noted(), prefixed(scenario.source):
-        planning = made.planning() if plans else None
-    mistakes.tell()
-    assert survey is not None, "without mistakes"
-    return Built(scenario, made.scene, survey, planning, made.placing, made.found)
+    return Built(scenario, static, plans, columns)
 
 
-class _Building:
-    """A scenario that is being built: its scene, robots, sensors, and their way so far."""
+class Built:
+    """What a scenario describes; `build` makes it.
 
-    def __init__(self, scenario: Scenario, static: StaticScene) -> None:
+    Attributes
+    ----------
+    scenario
+        What it was built of.
+    scene, survey, planning
+        In the scene's local coordinates; the planning is None for none.
+    placing
+        Where the sensor was put, if the scenario has no poses; else None.
+    found
+        What was noted meanwhile, and what each file gave.
+    """
+
+    def __init__(
+        self, scenario: Scenario, static: StaticScene, plans: bool, columns: Sequence[str]
+    ) -> None:
         self.scenario, self.found = scenario, static.found.copy()
-        self.scene, self.standing = static.scene, static.standing
-        self.robots = self._robots()
-        self.epsg = self._common_epsg()
+        self.scene, self._standing = static.scene, static.standing
+        self._shapes, self._robots = Shapes(scenario, self.found), self._read_robots()
+        self._epsg = self._common_epsg()
         way = scenario.trajectory
         with prefixed(scenario.source):
-            self.track = None if way is None else way.track(scenario.path, self.standing)
-            self.sensors = self._sensors()
+            self._track = None if way is None else way.track(scenario.path, self._standing)
+            self._sensors = self._mounted()
         self.placing: Placing | None = None
-        if scenario.poses is None and self.track is None and not scenario.scene.has_seed:
+        if scenario.poses is None and self._track is None and not scenario.scene.has_seed:
             rasters = bool(self.found.rasters)
-            self.placing = place(self.scene, self.sensors[0], landscape=rasters)
+            self.placing = place(self.scene, self._sensors[0], landscape=rasters)
+        actors, vehicles = self._actors(), self._vehicles()
+        if actors or vehicles:
+            traffic = (actor for actor, _ in vehicles)
+            self.scene = self.scene.with_actors([*self.scene.actors, *actors, *traffic])
+        mistakes = Mistakes()
+        with mistakes.noted():
+            with prefixed(scenario.source):
+                materials = self._materials([entry.semantic_class for _, entry in vehicles])
+                self.survey = self._survey(materials, columns)
+            names, voxels = self.scene.all_names, self.scene.has_voxels
+            MaterialTable.of(self.survey.materials, names, voxels=voxels)
+        with mistakes.noted(), prefixed(scenario.source):
+            self.planning = self._planning() if plans else None
+        mistakes.tell()
 
-    def _robots(self) -> dict[MeshFile, Robot]:
+    def job(self, **own: Any) -> Job:
+        """Return it as a job; `own` are further fields, such as `name`."""
+        outputs = tuple(one for one in self.scenario.output.write if one.format != "ply")
+        return Job(self.scene, self.survey, self.planning, outputs=outputs, **own)
+
+    def _read_robots(self) -> dict[MeshFile, Robot]:
         """Read the robots, each file once."""
         robots: dict[MeshFile, Robot] = {}
         for file in dict.fromkeys(entry.robot for entry in self.scenario.actors if entry.robot):
@@ -232,7 +222,7 @@ class _Building:
             )
         return next((raster.epsg for _, raster in stay if raster.crs), None)
 
-    def _sensors(self) -> list[Mounted]:
+    def _mounted(self) -> list[Mounted]:
         """Return the sensors on their carrier."""
         given = self.scenario
         sections: Mapping[str, SensorSection] = given.sensors or {"": given.sensor}
@@ -252,7 +242,7 @@ class _Building:
         if mount is None or mount.link is None:
             return CENTRE if mount is None else mount.pose()
         carriers = [
-            (entry, self.robots[entry.robot])
+            (entry, self._robots[entry.robot])
             for entry in self.scenario.actors
             if entry.trajectory is None and entry.robot
         ]
@@ -276,28 +266,17 @@ class _Building:
     def _joints(self, entry: ActorSection) -> Path | None:
         return None if entry.joints is None else self.scenario.path(entry.joints)
 
-    def move(self) -> list[int | None]:
-        """Add the actors and traffic to the scene; return the classes of traffic, added last."""
-        if not self.scenario.actors and self.scenario.traffic is None:
-            return []
-        actors = self._actors()
-        vehicles = self._vehicles()
-        traffic = (actor for actor, _ in vehicles)
-        self.scene = self.scene.with_actors([*self.scene.actors, *actors, *traffic])
-        return [entry.semantic_class for _, entry in vehicles]
-
     def _actors(self) -> list[Actor]:
         """Build the actors; their trajectories begin with that of the survey."""
-        scenario, shapes, out = self.scenario, dict[Any, Mesh](), list[Actor]()
+        scenario, out = self.scenario, list[Actor]()
         with prefixed(scenario.source):
-            ways = [e.way(scenario.path, self.standing, self.track) for e in scenario.actors]
+            ways = [e.way(scenario.path, self._standing, self._track) for e in scenario.actors]
         for entry, way in zip(scenario.actors, ways, strict=True):
             if entry.robot:
                 with prefixed(f"{scenario.source}: actor {entry.name!r}"):
-                    out += self._links(entry, self.robots[entry.robot], way)
+                    out += self._links(entry, self._robots[entry.robot], way)
             else:
-                mesh = mesh_of(scenario, entry, shapes, self.found)
-                out.append(Actor(replace(mesh, name=entry.name), way))
+                out.append(Actor(replace(self._shapes.of(entry), name=entry.name), way))
         return out
 
     def _links(self, entry: ActorSection, robot: Robot, way: Track) -> Sequence[Actor]:
@@ -314,14 +293,13 @@ class _Building:
         section = self.scenario.traffic
         if section is None:
             return []
-        start_s = 0.0 if self.track is None else self.track.start_s or 0.0
-        shape_of = partial(mesh_of, self.scenario, made={}, found=self.found)
+        start_s = 0.0 if self._track is None else self._track.start_s or 0.0
         with prefixed(self.scenario.source):
-            duration = self.survey([]).duration_ns / 1e9
+            duration = self._survey([]).duration_ns / 1e9
             begin = start_s - section.offset_s
             path = self.scenario.path(section.file)
             passages, count = read_fcd(path, begin, begin + duration)
-            made = actors_of(section, passages, shape_of, self.standing, start_s)
+            made = actors_of(section, passages, self._shapes.of, self._standing, start_s)
         if not made:
             self.found.notes.append(
                 f"{section.file}: no vehicle or person is in the scene from {begin:g} to "
@@ -333,7 +311,7 @@ class _Building:
         )
         return made
 
-    def materials(self, vehicles: Sequence[int | None]) -> list[Material]:
+    def _materials(self, vehicles: Sequence[int | None]) -> list[Material]:
         """Materials by name, with the classes of actors and copies, and of city objects.
 
         `vehicles` are the classes of the last actors of the scene.
@@ -367,23 +345,23 @@ class _Building:
             made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
         return made
 
-    def survey(self, materials: list[Material], columns: Sequence[str] = ()) -> Survey:
+    def _survey(self, materials: list[Material], columns: Sequence[str] = ()) -> Survey:
         """Build the survey, its poses in local coordinates."""
-        given, carried = self.scenario, self.sensors
+        given, carried = self.scenario, self._sensors
         needs, cloud = given.output.needs, declared(given.cloud, CloudOptions)
         cloud["columns"] = (*given.cloud.columns, *needs, *columns)
-        cloud["epsg"] = given.cloud.epsg or self.epsg
+        cloud["epsg"] = given.cloud.epsg or self._epsg
         if given.scene.has_seed and cloud["keep_every"] is None:
             cloud["keep_every"] = 1 if "ray" in needs else SEED_KEPT
         check_whole((*needs, *columns), cloud["keep_every"] or 1)
         placed = SEED_POSES if self.placing is None else self.placing.poses
-        poses = (given.poses or placed) if self.track is None else ()
+        poses = (given.poses or placed) if self._track is None else ()
         origin = self.scene.origin
         own_noise = all(one.noise is not None for one in carried)
         alone = not given.sensors and given.mount is None and carried[0].noise is None
         return Survey(
             poses=[replace(p, position=tuple(np.subtract(p.position, origin))) for p in poses],
-            trajectory=self.track,
+            trajectory=self._track,
             **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
             steps=given.steps,
             materials=materials,
@@ -394,7 +372,7 @@ class _Building:
             **cloud,
         )
 
-    def planning(self) -> Planning | None:
+    def _planning(self) -> Planning | None:
         """Build the planning in local coordinates; None if the scenario asks for none."""
         section, (x0, y0, _) = self.scenario.planning, self.scene.origin
         start, target = section.start, section.target

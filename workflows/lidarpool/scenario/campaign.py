@@ -3,35 +3,32 @@
 from __future__ import annotations
 
 import hashlib
-import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from itertools import combinations
+from itertools import chain, combinations, count, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import Field, ValidationError
+from pydantic import BaseModel, Field
 
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.validation import checked, dotted, shown, validation_errors
-from ..base.words import counted
+from ..base.validation import checked, dotted, fields_of, is_section, sections_in, sentences, shown
+from ..base.words import counted, did_you_mean
 from ..base.yamlfile import read_yaml
 from ..export.jobs import Value
 from ..export.table import check_whole
 from .build import Job, build
-from .choices import COUNT_MOST, CampaignSection, Choice, Draw, Keep, Splits
-from .paths import Steps, find_field, put
+from .choices import COUNT_MOST, CampaignSection, Choice, Draw, Keep, Splits, read_rows
 from .scenario import Scenario
-from .sections import PoolSection, file_states
+from .sections import PoolSection, file_states, missing
 from .static_scene import SceneCache
-from .tables import read_rows
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
 _SUFFIXES = (".yaml", ".yml")
@@ -98,15 +95,13 @@ class Campaign:
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> None:
-        given = {"keep": keep, "splits": splits, "license": license, "title": title}
-        self._begin(_Made(make, count, seed), _head(count=count, seed=seed, **given))
+        given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
+        self._begin(_Made(make, count, seed), _head(**given))
 
     def _begin(self, jobs: _Jobs, head: CampaignSection) -> None:
-        assert head.count is not None, "known by now"
-        self.count, self.seed, self.license = head.count, head.seed, head.license
-        self.title, self.splits = head.title, dict(head.splits)
-        self.keep, self.files = head.keep, jobs.files
-        self.choices = jobs.choices
+        self.seed, self.keep, self.splits = head.seed, head.keep, head.splits
+        self.license, self.title = head.license, head.title
+        self.count, self.files, self.choices = jobs.count, jobs.files, jobs.choices
         self._jobs, self._splits = jobs, Splits(head.splits, head.seed)
 
     @classmethod
@@ -121,11 +116,11 @@ class Campaign:
             to no field, a value that can be drawn is not valid there, or a file is missing.
         """
         path = Path(path)
-        section = _valid(read_yaml(path, _FORM), str(path))
+        with sentences(CampaignSection, path):
+            section = CampaignSection.model_validate(read_yaml(path, _FORM))
         jobs = _Varied(section, path)
-        title = section.title or path.stem
         self = cls.__new__(cls)
-        self._begin(jobs, section.model_copy(update={"count": jobs.count, "title": title}))
+        self._begin(jobs, section.model_copy(update={"title": section.title or path.stem}))
         self.command, self.description = path.name, path.read_text("utf-8-sig")
         return self
 
@@ -151,7 +146,7 @@ class Campaign:
         jobs = _Given([Path(path) for path in paths])
         given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
         self = cls.__new__(cls)
-        self._begin(jobs, _head(count=jobs.count, **given))
+        self._begin(jobs, _head(**given))
         self.command = " ".join(Path(path).name for path in jobs.paths[:SHOWN_MOST])
         if len(jobs.paths) > SHOWN_MOST:
             self.command += " …"
@@ -221,9 +216,7 @@ class Campaign:
     def check_files(self) -> None:
         """Check that all files are there that jobs may be made of, or raise LidarpoolError."""
         mistakes = Mistakes()
-        for path in self.files:
-            if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
-                mistakes.lines.append(f"{self.command}: {str(path)!r} does not exist.")
+        mistakes.lines += missing(self.files, self.command)
         mistakes.tell()
 
     @cached_property
@@ -251,22 +244,13 @@ def is_campaign(path: str | Path) -> bool:
         return False  # what is wrong, the reader of scenarios says
 
 
-def _valid(data: Mapping[str, Any], source: str) -> CampaignSection:
-    try:
-        return CampaignSection.model_validate(data)
-    except ValidationError as error:
-        mistakes = Mistakes()
-        lines = validation_errors(error, CampaignSection)
-        mistakes.lines += [f"{source}: {line}" if source else line for line in lines]
-        mistakes.tell()
-        raise AssertionError("an error has lines") from error
-
-
 def _head(**given: Any) -> CampaignSection:
     """Check the fields that Python gives."""
     keep = given.pop("keep")
     keep = dict(keep) if isinstance(keep, Mapping) else keep
-    return _valid({"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}, "")
+    with sentences(CampaignSection):
+        data = {"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}
+        return CampaignSection.model_validate(data)
 
 
 class _Jobs:
@@ -322,8 +306,16 @@ class _Made(_Jobs):
                 f"job {number} has the value {extra[0]!r}, which the first has not: give all jobs "
                 "the same names, with None where there is no value."
             )
-        values = {name: _plain(number, name, value) for name, value in made.values.items()}
-        values = {name: value for name, value in values.items() if value is not None}
+        values: dict[str, Value] = {}
+        for name, value in made.values.items():
+            plain = value.item() if isinstance(value, np.generic) else value
+            if not isinstance(name, str) or not isinstance(plain, Value | None):
+                raise LidarpoolError(
+                    f"job {number} has the value {name!r}: {shown(plain)}; values are numbers, "
+                    "text, True or False, by names."
+                )
+            if plain is not None:
+                values[name] = plain
         survey, seed = made.survey, _noise_seed(self._seed, number)
         check_whole(columns, survey.keep_every)
         survey = replace(
@@ -335,30 +327,18 @@ class _Made(_Jobs):
         return Job(made.scene, survey, values=values, **own)
 
     def _made(self, number: int) -> Job:
-        try:
-            made = self._make(number, Draw(self._seed, number, "make").generator())
-        except LidarpoolError as error:
-            raise LidarpoolError(f"job {number}: {error}") from error
-        except Exception as error:
-            # One job's failure must not end the others.
-            told = f"job {number}: the function raised {type(error).__name__}: {error}"
-            raise LidarpoolError(told) from error
-        if not isinstance(made, Job):
-            raise LidarpoolError(
-                f"job {number}: the function returned {shown(made)}; it must return a "
-                "Job(scene, survey)."
-            )
+        with prefixed(f"job {number}"):
+            try:
+                made = self._make(number, Draw(self._seed, number, "make").generator())
+            except LidarpoolError:
+                raise
+            except Exception as error:  # one job's failure must not end the others
+                told = f"the function raised {type(error).__name__}: {error}"
+                raise LidarpoolError(told) from error
+            if not isinstance(made, Job):
+                told = f"the function returned {shown(made)}; it must return a Job(scene, survey)."
+                raise LidarpoolError(told)
         return made
-
-
-def _plain(number: int, name: Any, value: Any) -> Value | None:
-    value = value.item() if isinstance(value, np.generic) else value
-    if not isinstance(name, str) or not isinstance(value, (bool, int, float, str, type(None))):
-        raise LidarpoolError(
-            f"job {number} has the value {name!r}: {shown(value)}; values are numbers, text, True "
-            "or False, by names."
-        )
-    return value
 
 
 class _Given(_Jobs):
@@ -393,11 +373,10 @@ def _unique(stems: Iterable[str]) -> list[str]:
     out: list[str] = []
     taken: set[str] = set()
     for stem in stems:
-        first = name = _UNSAFE.sub("_", stem).lstrip(".") or "job"
-        number = 1
-        while name.lower() in taken:  # some systems know no capitals
-            number += 1
-            name = f"{first}-{number}"
+        first = _UNSAFE.sub("_", stem).lstrip(".") or "job"
+        names = chain([first], (f"{first}-{number}" for number in count(2)))
+        # Some systems know no capitals.
+        name = next(name for name in names if name.lower() not in taken)
         taken.add(name.lower())
         out.append(name)
     return out
@@ -469,37 +448,24 @@ class _Varied(_Jobs):
                 f"{error}\nIts values are {shown or 'those of the base'}."
             ) from error
 
-    def _drawn(self, number: int) -> tuple[dict[str, Value], Changes]:
+    def _drawn(self, number: int) -> tuple[dict[str, Value], dict[str, Any]]:
         """Draw what a job has of its own: for the table of jobs, and for the scenario."""
         base = self._bases[number % len(self._bases)]
         told: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
-        changes: Changes = {}
+        changes: dict[str, Any] = {}  # {path: value, or rows to be added}
         for text, choice in self._vary.items():
             draw = Draw(self._seed, number, text)
             if choice.sample is not None:
                 chosen = draw.integer(*choice.sample.count)
                 table = base.tables[text]
                 rows = [table[i] for i in draw.subset(len(table), chosen)]
-                changes[text], told[text] = partial(_extended, rows), chosen
-                continue
-            if choice.each is not None:
+                changes[text], told[text] = rows, chosen
+            elif choice.each is not None:
                 turn = number // self._strides[text] % len(choice.options)
-                value, told[text] = choice.options[turn]
+                changes[text], told[text] = choice.options[turn]
             else:
-                value, told[text] = choice.drawn(draw)
-            changes[text] = partial(_replaced, value)
+                changes[text], told[text] = choice.drawn(draw)
         return {name: value for name, value in told.items() if value is not None}, changes
-
-
-Changes = dict[str, Callable[[Any], Any]]  # {path: what it makes of the value there}
-
-
-def _replaced(value: Any, _: Any) -> Any:
-    return value
-
-
-def _extended(entries: Sequence[Any], there: Sequence[Any] | None) -> list[Any]:
-    return [*(there or ()), *entries]
 
 
 class _Base:
@@ -557,39 +523,43 @@ class _Base:
             try:
                 found = self.changed(changes, f"{source}: {self._where}")
             except LidarpoolError as error:
-                wrong = [line for text in self._vary for line in self._tried(text)[:1]]
+                wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
                 mistakes.lines += [f"{source}: {self._where}: {line}" for line in wrong]
                 mistakes.lines += () if wrong else str(error).splitlines()
                 return
             self.files.update(found.files)
 
-    def _trials(self, text: str) -> list[Callable[[Any], Any]]:
-        """Return changes of a path, valid if all jobs are; of a table, all rows in pieces."""
+    def _trials(self, text: str) -> list[Any]:
+        """Return values for a path, valid if all jobs are; of a table, all rows in pieces."""
         choice = self._vary[text]
         if choice.sample is None:
-            return [partial(_replaced, end) for end in choice.ends]
+            return choice.ends
         (least, most), table = choice.sample.count, self.tables[text]
         begins = range(0, len(table), max(1, most)) if most else ()
         pieces = [table[begin : begin + most] for begin in begins]
-        return [partial(_extended, rows) for rows in (table[:least], *pieces)]
+        return [table[:least], *pieces]
 
-    def _tried(self, text: str) -> list[str]:
-        """Lines on the values of a path that are not valid in the base."""
+    def _tried(self, text: str) -> Iterator[str]:
+        """Yield lines on the values of a path that are not valid in the base."""
         choice, place = self._vary[text], dotted([key for key, _ in self._steps[text]])
-        lines = []
         for value in () if choice.sample else choice.ends:
             try:
-                self.changed({text: partial(_replaced, value)}, "")
+                self.changed({text: value}, "")
             except LidarpoolError as error:
                 told = str(error).partition("\n")[0].removeprefix(": ")
                 own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
                 given = f"{text} can be {shown(value)}"
-                lines.append(f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}")
-        return lines
+                yield f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}"
 
-    def changed(self, changes: Changes, source: str, noise_seed: int = 0) -> Scenario:
-        """Return the scenario with changes, and with a seed of its noise if it has none."""
-        ways = [(self._steps[text], change) for text, change in changes.items()]
+    def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
+        """Return the scenario with other values, and with a seed of its noise if it has none."""
+
+        def changed(text: str, there: Any) -> Any:
+            added = self._vary[text].sample is not None
+            return [*(there or ()), *changes[text]] if added else changes[text]
+
+        ways: list[tuple[Steps, Callable[[Any], Any]]]
+        ways = [(self._steps[text], partial(changed, text)) for text in changes]
         if noise_seed and _NOISE not in changes:
             ways.append((self._noise, lambda seed: seed or noise_seed))
         made: Any = self.scenario
@@ -630,3 +600,101 @@ def _hash(path: Path, *_: int) -> str:
     """SHA-256 of a file, which is read once for each of its states."""
     with path.open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# Keys and numbers of entries, each with the value there; of a section that is left out, one of
+# defaults.
+Steps = tuple[tuple[str | int, Any], ...]
+
+
+def find_field(scenario: Scenario, text: str) -> tuple[Steps, Any]:
+    """Find out where a path such as ``sensors.roof.model`` leads in a scenario.
+
+    Returns
+    -------
+    The steps to the field, and its annotation.
+
+    Raises
+    ------
+    LidarpoolError
+        If it leads to no field; the message has the nearest name.
+    """
+    node: Any = scenario
+    kind: Any = type(scenario)
+    rest = text.split(".")
+    steps: list[tuple[str | int, Any]] = []
+    key: str | int
+    while rest:
+        at = ".".join(text.split(".")[: -len(rest)])
+        if node is None and not rest[0].isdecimal() and (sections := list(sections_in(kind))):
+            model = issubclass(sections[0], BaseModel)  # of defaults
+            node = sections[0].model_construct() if model else object.__new__(sections[0])
+            steps[-1] = (steps[-1][0], node)
+        if is_section(type(node)):
+            key, node, kind = _field(node, rest[0], at)
+            used = 1
+        elif isinstance(node, dict):
+            key, used = _named(list(node), rest, at)
+            node = node[key]
+        elif isinstance(node, (tuple, list)):
+            number, used = _entry(node, rest, at)
+            key, node = number, node[number]
+        else:
+            what = f"the base has no {at}" if node is None else f"{at} has no fields of its own"
+            raise LidarpoolError(f"{text} leads to no field: {what}.")
+        steps.append((key, node))
+        rest = rest[used:]
+    return tuple(steps), kind
+
+
+def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
+    fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
+    if name not in fields:
+        place = f"a field of {at}" if at else "a section of a scenario"
+        raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
+    own = fields[name]
+    return name, getattr(node, own, None), fields_of(type(node))[own].annotation
+
+
+def _named(names: Sequence[str], rest: Sequence[str], at: str) -> tuple[str, int]:
+    """Return the longest of the names that a path goes on with, for a name may have dots."""
+    for used in range(len(rest), 0, -1):
+        if (name := ".".join(rest[:used])) in names:
+            return name, used
+    hint = did_you_mean(rest[0], names) or (f" It has {', '.join(names[:5])}." if names else "")
+    raise LidarpoolError(f"{at} of the base has no {rest[0]!r}.{hint}")
+
+
+def _entry(entries: Sequence[Any], rest: Sequence[str], at: str) -> tuple[int, int]:
+    if rest[0].isdecimal():
+        if (number := int(rest[0])) < len(entries):
+            return number, 1
+        raise LidarpoolError(
+            f"{at} of the base has {counted(len(entries), 'entry', 'entries')}, counted from 0, "
+            f"and no entry {number}."
+        )
+    names = [name for one in entries if isinstance(name := getattr(one, "name", None), str)]
+    name, used = _named(names, rest, at)
+    return next(i for i, one in enumerate(entries) if getattr(one, "name", None) == name), used
+
+
+def put(node: Any, steps: Steps, change: Callable[[Any], Any]) -> Any:
+    """Return a section with what `change` makes of the value where the steps lead.
+
+    The original stays as it is. Sections on the way become mappings of their own fields, to be
+    checked again; those beside it stay as they are.
+    """
+    if not steps:
+        return change(node)
+    (key, base), *rest = steps
+    own: Any = list(node) if isinstance(node, (tuple, list)) else _own_fields(node)
+    below = own[key] if isinstance(own, list) else own.get(key, base)  # type: ignore[index]
+    own[key] = put(base if below is None else below, tuple(rest), change)
+    return own
+
+
+def _own_fields(node: Any) -> dict[Any, Any]:
+    if is_section(type(node)):
+        fields, given = fields_of(type(node)), getattr(node, "model_fields_set", vars(node))
+        return {f.alias or n: getattr(node, n) for n, f in fields.items() if n in given}
+    return dict(node)

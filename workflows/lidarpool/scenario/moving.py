@@ -17,7 +17,7 @@ import numpy as np
 from pydantic import model_validator
 
 from ..base.arrays import Floats
-from ..base.declared import Several, Text, TextOrTexts, Triple, declared, is_text, short, told
+from ..base.declared import Several, Text, TextOrTexts, Triple, by_text, declared, one_of, told
 from ..base.errors import LidarpoolError, prefixed
 from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
@@ -131,11 +131,7 @@ class TrajectorySection(Section):
         ),
     ] = "refuse"
 
-    @model_validator(mode="after")
-    def _one_source(self) -> TrajectorySection:
-        if (self.file is None) != bool(self.points):
-            raise ValueError("give either file or points.")
-        return self
+    _one_source = one_of("file", "points")
 
     def track(self, path: PathOf, standing: Standing, start_s: float | None = None) -> Track:
         """Return it in a scene's local coordinates; LidarpoolError if it cannot be used.
@@ -161,8 +157,12 @@ class TrajectorySection(Section):
 
     def _level(self, path: PathOf, origin: Floats, start_s: float | None) -> Track:
         """Return it without surfaces."""
-        start_s = self.start_s if start_s is None else start_s
-        smooth = self.interpolation == "smooth"
+        own: dict[str, Any] = {
+            "smooth": self.interpolation == "smooth",
+            "start_s": self.start_s if start_s is None else start_s,
+            "duration_s": self.duration_s,
+            "beyond": self.beyond,
+        }
         if self.file is not None:
             track = load_trajectory(
                 path(self.file),
@@ -171,10 +171,7 @@ class TrajectorySection(Section):
                 columns=self.columns,
                 camera_axes=self.camera_axes,
                 offset_s=self.offset_s,
-                smooth=smooth,
-                start_s=start_s,
-                duration_s=self.duration_s,
-                beyond=self.beyond,
+                **own,
             )
             return replace(track, positions=track.positions - origin)
         angles = [[p.yaw_deg, p.pitch_deg, p.roll_deg] for p in self.points]
@@ -183,16 +180,11 @@ class TrajectorySection(Section):
             np.array([p.time_s + self.offset_s for p in self.points]),
             np.array([p.position for p in self.points]) - origin,
             quaternions_from_degrees(np.array(angles)) if turned else None,
-            smooth,
-            start_s,
-            self.duration_s,
-            self.beyond,
+            **own,
         )
 
 
-TrajectoryEntry = Annotated[
-    TrajectorySection, short(is_text, lambda v: {"file": v}, Text | TrajectorySection)
-]
+TrajectoryEntry = Annotated[TrajectorySection, by_text("file", TrajectorySection)]
 
 
 class ActorSection(ShapeSection):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import Counter
 from collections.abc import Iterable
 from contextlib import suppress
@@ -34,6 +33,7 @@ from .sections import (
     Section,
     SensorSection,
     may_be_empty,
+    missing,
     scene_in_short,
 )
 
@@ -216,10 +216,10 @@ class Scenario(Section):
         """
         wrong, planning = [], self.planning
         # The default objects have a start and a target.
-        missing = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
-        if planning.enabled and missing:
+        lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
+        if planning.enabled and lacking:
             wrong.append("planning is enabled: give planning.start and planning.target.")
-        if planning.enabled is None and missing == 1:
+        if planning.enabled is None and lacking == 1:
             wrong.append("give both planning.start and planning.target, or neither.")
         if self.trajectory is not None and self.trajectory.beyond != "refuse":
             wrong.append("trajectory.beyond is for actors; the carrier's has to cover the survey.")
@@ -251,9 +251,7 @@ class Scenario(Section):
                 with mistakes.noted(), prefixed(self._source):
                     one = section.mounted(self.path, CENTRE, self.noise, self.returns)
                     (one.returns or self.returns).of(one.sensor.optics)
-        for path in self.files if mistakes.lines else ():
-            if not os.path.exists(path):  # noqa: PTH110 - also of names that no file can have
-                mistakes.lines.append(f"{self._source}: {str(path)!r} does not exist.")
+        mistakes.lines += missing(self.files, self._source) if mistakes.lines else ()
 
     @property
     def files(self) -> tuple[Path, ...]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -29,8 +30,9 @@ from ..base.declared import (
     Three,
     Triple,
     Two,
-    is_text,
+    by_text,
     must_be,
+    one_of,
     short,
     told,
 )
@@ -104,11 +106,7 @@ class MeshFile(Section):
     translation: Annotated[Triple, told("translation in metres, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
         Three[Angle], told("rotation about the world's x, y and z axes, degrees")
-    ] = (
-        0,
-        0,
-        0,
-    )
+    ] = (0, 0, 0)
     scale: Annotated[Scale, told("one factor, or one for each axis; applied first")] = (1, 1, 1)
     matrix: Annotated[
         Four[Four[Factor]] | None, told("instead of the three: 4 rows of 4, metres")
@@ -149,7 +147,7 @@ class MeshFile(Section):
         return Transform.place(self.translation, self.rotation_deg, self.scale)
 
 
-MeshEntry = Annotated[MeshFile, short(is_text, lambda v: {"file": v}, Text | MeshFile)]
+MeshEntry = Annotated[MeshFile, by_text("file", MeshFile)]
 MeshEntries = Several[MeshEntry]
 
 
@@ -228,11 +226,7 @@ class ShapeSection(Section):
         told("class of its points; by default that of its material", alias="class"),
     ] = None
 
-    @model_validator(mode="after")
-    def _one_shape(self) -> ShapeSection:
-        if (self.file is None) == (self.box is None):
-            raise ValueError("give either file or box.")
-        return self
+    _one_shape = one_of("file", "box")
 
 
 class CopiesSection(ShapeSection):
@@ -248,18 +242,14 @@ class CopiesSection(ShapeSection):
         told("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
     ] = ()
     table: Annotated[
-        Annotated[CopyTable, short(is_text, lambda v: {"file": v}, Text | CopyTable)] | None,
+        Annotated[CopyTable, by_text("file", CopyTable)] | None,
         told("instead of at: a table of places", "trees.csv"),
     ] = None
     scatter: Annotated[
         Scatter | None, told("instead of at: so many on surfaces, at random", {"count": 100})
     ] = None
 
-    @model_validator(mode="after")
-    def _one_of_each(self) -> CopiesSection:
-        if [bool(self.at), self.table is not None, self.scatter is not None].count(True) != 1:
-            raise ValueError("give one of at, table and scatter.")
-        return self
+    _one_list = one_of("at", "table", "scatter")
 
 
 class Ground(Section):
@@ -368,7 +358,9 @@ class SensorSection(Section):
     def _one_source(self) -> SensorSection:
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults are allowed, because `lidarpool init` writes them.
-        grid = [name for name in _GRID if getattr(self, name) != _GRID[name]]
+        grid = ["rays_per_revolution", "layers", "vertical_fov_deg"]
+        known = SensorSection.model_fields
+        grid = [name for name in grid if getattr(self, name) != known[name].default]
         if own and grid:
             raise ValueError(f"a {own[0]} defines the beams: leave out {grid[0]}.")
         if self.performance == "datasheet" and self.model is None:
@@ -440,6 +432,13 @@ def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
     return tuple(states)
 
 
+def missing(files: Iterable[Path], source: str) -> list[str]:
+    """Lines on files that are not there."""
+    # `Path.exists` fails at names that no file can have.
+    lost = [path for path in files if not os.path.exists(path)]  # noqa: PTH110
+    return [f"{source}: {str(path)!r} does not exist." for path in lost]
+
+
 _grid = lru_cache(Sensor.grid)
 
 
@@ -448,17 +447,11 @@ def _loaded(_: object, **given: Any) -> Sensor:
     return load_sensor(**given)
 
 
-_GRID = {  # {field of a grid: its default}
-    name: SensorSection.model_fields[name].default
-    for name in ("rays_per_revolution", "layers", "vertical_fov_deg")
-}
-
-
 class OutputSection(Section):
     """Further files of the result; the columns that they need are kept."""
 
     write: Annotated[
-        Several[Annotated[Format, short(is_text, lambda v: {"format": v}, Text | Format)]],
+        Several[Annotated[Format, by_text("format", Format)]],
         told("further formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 
@@ -506,7 +499,7 @@ class Obstacle(Section):
         return self
 
 
-Obstacles = Several[Annotated[Obstacle, short(is_text, lambda v: {"object": v}, Text | Obstacle)]]
+Obstacles = Several[Annotated[Obstacle, by_text("object", Obstacle)]]
 
 
 class _Route:

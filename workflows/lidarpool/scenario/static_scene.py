@@ -95,17 +95,18 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
         If a file cannot be read, or copies have no place.
     """
     section, found = scenario.scene, Findings()
+    shapes = Shapes(scenario, found)
     meshes: list[Mesh | Instance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
     mistakes = Mistakes()
     for entry in section.files:
         with mistakes.noted():
-            read = _read(scenario, entry, found)
+            read = shapes.read(entry)
             meshes += read.standing
             moving += read.moving
     mistakes.tell()
     if section.copies:
-        meshes += _copies(scenario, meshes, found)
+        meshes += _copies(shapes, meshes)
     objects = Objects(tuple(meshes), tuple(moving))
     if section.ground is not None:
         below = Scene.from_meshes(meshes or objects.still(lambda _: None))
@@ -114,63 +115,68 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     return StaticScene(scene, Standing(scene), found)
 
 
-def mesh_of(
-    scenario: Scenario, entry: ShapeSection, made: dict[Any, Mesh], found: Findings
-) -> Mesh:
-    """Return the mesh of an entry, of those in `made` if it is there: {file or size: mesh}."""
-    shape = entry.file or entry.box or (1.0, 1.0, 1.0)
-    if shape not in made:
-        name = entry.name or "vehicle"
-        if isinstance(shape, MeshFile):
-            lost = f"{scenario.path(shape.file)} moves "
-            read = _read(scenario, shape, found)
-            made[shape] = one_mesh(name, read.still(lambda line: found.notes.append(lost + line)))
-        else:
-            made[shape] = box(name, shape)
-    return made[shape]
+class Shapes:
+    """Meshes of a scenario, each file read once; `found` is added to."""
+
+    def __init__(self, scenario: Scenario, found: Findings) -> None:
+        self.scenario, self.found = scenario, found
+        self._made: dict[Any, Mesh] = {}  # {file or size: mesh}
+
+    def of(self, entry: ShapeSection) -> Mesh:
+        """Return the mesh of a copy, an actor or vehicles, under any name."""
+        shape, made = entry.file or entry.box or (1.0, 1.0, 1.0), self._made
+        if shape not in made:
+            name = entry.name or "vehicle"
+            if isinstance(shape, MeshFile):
+                read, lost = self.read(shape), f"{self.scenario.path(shape.file)} moves "
+                still = read.still(lambda line: self.found.notes.append(lost + line))
+                made[shape] = one_mesh(name, still)
+            else:
+                made[shape] = box(name, shape)
+        return made[shape]
+
+    def read(self, entry: MeshFile) -> Objects:
+        """Read the objects of a file; LidarpoolError if it cannot be used."""
+        scenario, found = self.scenario, self.found
+        with prefixed(scenario.source):
+            path, transform = scenario.path(entry.file), entry.transform()
+            assets = None if entry.assets is None else scenario.path(entry.assets)
+        return load_objects(
+            path,
+            unit=entry.unit,
+            up_axis=entry.up_axis,
+            transform=transform,
+            opacity=entry.opacity,
+            colours=scenario.coloured,
+            step_m=entry.step_m,
+            window=entry.window,
+            epsg=scenario.cloud.epsg,
+            assets=assets,
+            tell=found.notes.append,
+            axes=found.remarks.append,
+            tell_raster=lambda raster: found.rasters.append((entry, raster)),
+            taken=partial(found.sources.setdefault, entry.file),
+        )
 
 
-def _read(scenario: Scenario, entry: MeshFile, found: Findings) -> Objects:
-    with prefixed(scenario.source):
-        path, transform = scenario.path(entry.file), entry.transform()
-        assets = None if entry.assets is None else scenario.path(entry.assets)
-    return load_objects(
-        path,
-        unit=entry.unit,
-        up_axis=entry.up_axis,
-        transform=transform,
-        opacity=entry.opacity,
-        colours=scenario.coloured,
-        step_m=entry.step_m,
-        window=entry.window,
-        epsg=scenario.cloud.epsg,
-        assets=assets,
-        tell=found.notes.append,
-        axes=found.remarks.append,
-        tell_raster=lambda raster: found.rasters.append((entry, raster)),
-        taken=partial(found.sources.setdefault, entry.file),
-    )
-
-
-def _copies(scenario: Scenario, base: list[Mesh | Instance], found: Findings) -> list[Instance]:
+def _copies(shapes: Shapes, base: list[Mesh | Instance]) -> list[Instance]:
     """Place the copies; they stand on other objects and on the ground, not on one another."""
-    section = scenario.scene
+    scenario, section = shapes.scenario, shapes.scenario.scene
     scene = Scene.from_meshes(base) if base else None
     if section.ground is not None and (base or _copied_to(section)):
         scene = Scene.from_meshes([*base, _ground(section, scene)])
     standing = Standing(scene)
-    shapes: dict[Any, Mesh] = {}
     out: list[Instance] = []
     mistakes = Mistakes()
     for number, entry in enumerate(section.copies):
         with mistakes.noted():
-            mesh = mesh_of(scenario, entry, shapes, found)
+            mesh = shapes.of(entry)
             with prefixed(f"{scenario.source}: scene.copies[{number}]"):
                 table = scenario.path(entry.table.file) if entry.table else None
                 made = copies_of(entry, mesh, standing, table)
             if entry.file is not None:
                 words = f", {counted(len(made), 'copy', 'copies')}"
-                found.sources[entry.file.file] += words
+                shapes.found.sources[entry.file.file] += words
             out += made
     mistakes.tell()
     return out

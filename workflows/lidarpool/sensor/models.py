@@ -12,12 +12,12 @@ from statistics import NormalDist
 from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_validator
 
 from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
-from ..base.validation import checked, validation_errors
+from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
 from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
@@ -290,10 +290,8 @@ def _read(path: Path | Traversable) -> SensorModel:
     try:
         if isinstance(path, Path):
             check_fits(path)
-        return SensorModel.model_validate(load_yaml(path.read_text("utf-8-sig")))
-    except ValidationError as error:
-        lines = validation_errors(error, SensorModel)
-        raise LidarpoolError("\n".join(f"{path}: {line}" for line in lines)) from error
+        with sentences(SensorModel, path):
+            return SensorModel.model_validate(load_yaml(path.read_text("utf-8-sig")))
     except UNUSABLE as error:
         raise LidarpoolError(f"{path} is not a usable model: {said(error)}") from error
 
