@@ -10,7 +10,7 @@ from distributed import Client
 
 from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..live.pages import page_of
+from ..live import page_of
 from ..pipeline import Frame
 from ..plan import Planning
 from ..run.conductor import Conductor, Kept
