@@ -13,7 +13,7 @@ from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
-from ..live.pages import page_of
+from ..live import page_of
 from ..pipeline import Frame
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput

@@ -17,7 +17,7 @@ from ..base.words import counted
 from ..export.dataset import DataSet
 from ..export.folder import local_result, output_place
 from ..export.jobs import Tally, read_table
-from ..live.pages import page_of
+from ..live import page_of
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
     DataSetOutput,

@@ -1,1 +1,15 @@
 """Runs and results in the browser, only on this machine and without the internet."""
+
+from contextlib import AbstractContextManager, nullcontext
+
+from ..run.jobs import Jobs
+from ..run.page import Page
+
+
+def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[Page]:
+    """Show jobs in the browser, or nothing: Matplotlib is imported only if it is wanted."""
+    if not wanted:
+        return nullcontext(Page())
+    from .live_page import live_page
+
+    return live_page(jobs.count, jobs.names, jobs.title or "lidarpool")

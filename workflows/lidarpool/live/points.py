@@ -141,15 +141,11 @@ def even_shares(counts: AnyArray, most: int) -> Floats:
 
     A part with fewer points shows all of them; they are `most` in all.
     """
-    each, few = np.inf, np.zeros(len(counts), np.bool_)
-    for _ in range(len(counts)):
-        rest = int((~few & (counts > 0)).sum())
-        each = max(most - float(counts[few].sum()), 0.0) / rest if rest else np.inf
-        fewer = counts <= each
-        if (fewer == few).all():
-            break
-        few = fewer
-    return np.minimum(each / np.maximum(counts, 1e-9), 1.0)
+    ordered = np.sort(counts)
+    # All points of the parts before, and as many of each of the others.
+    each = (most - np.cumsum(ordered) + ordered) / np.arange(len(counts), 0, -1)
+    level = each[(each <= ordered).argmax()] if ordered.sum() > most else np.inf
+    return np.minimum(level / np.maximum(counts, 1e-9), 1.0)
 
 
 def positions(points: Points, rows: Ints | slice) -> Floats:

@@ -85,10 +85,18 @@ class Comparison:
             explained(f"The comparison cannot be written to {place}", "make room"),
             staging(place) as staged,
         ):
-            names = write_comparison(staged, self)
-            for name in names:
-                (staged / name).replace(place / name)
-        return [place / name for name in names]
+            drawn = {"distances": draw_distances(self), "above": draw_above(self)}
+            if self.images is not None:
+                drawn = {"ranges": draw_ranges(self), "rings": draw_rings(self)} | drawn
+            images = {name: page.svg() for name, page in drawn.items()}
+            text = json.dumps(self.figures, indent=1, allow_nan=False) + "\n"
+            page = rendered("comparison.html", report=self.figures, pictures=images)
+            (staged / "compare.json").write_text(text, encoding="utf-8")
+            (staged / "compare.html").write_text(page, encoding="utf-8")
+            for name, drawing in drawn.items():
+                (staged / f"compare-{name}.png").write_bytes(drawing.png())
+            names = ["compare.json", "compare.html", *(f"compare-{name}.png" for name in drawn)]
+            return [(staged / name).replace(place / name) for name in names]
 
 
 @checked
@@ -402,21 +410,6 @@ def _distances(values: Floats) -> dict[str, Any]:
         "mean_m": float(values.mean()),
         **dict(zip(shares, quantiles, strict=True)),
     }
-
-
-def write_comparison(folder: Path, found: Comparison) -> list[str]:
-    """Write compare.json, compare.html and pictures as PNG into a folder; return their names."""
-    drawn = {"distances": draw_distances(found), "above": draw_above(found)}
-    if found.images is not None:
-        drawn = {"ranges": draw_ranges(found), "rings": draw_rings(found)} | drawn
-    for name, page in drawn.items():
-        (folder / f"compare-{name}.png").write_bytes(page.png())
-    images = {name: page.svg() for name, page in drawn.items()}
-    text = rendered("comparison.html", report=found.figures, pictures=images)
-    (folder / "compare.html").write_text(text, encoding="utf-8")
-    text = json.dumps(found.figures, indent=1, allow_nan=False) + "\n"
-    (folder / "compare.json").write_text(text, encoding="utf-8")
-    return ["compare.json", "compare.html", *(f"compare-{name}.png" for name in drawn)]
 
 
 def draw_ranges(found: Comparison) -> Page:

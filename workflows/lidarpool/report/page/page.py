@@ -8,7 +8,7 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import yaml
@@ -93,7 +93,7 @@ def rendered(
     )
     for filter_ in (
         duration, rate, large, share, excess,
-        numbers, grouped, told, code, markdown, millimetres,
+        numbers, told, code, markdown, millimetres,
         ratio, counted,
     ):  # fmt: skip
         environment.filters[filter_.__name__] = filter_
@@ -125,37 +125,13 @@ def _changed(values: Mapping[str, Any], kind: type) -> list[tuple[str, str]]:
     return [(name, told(values[name])) for name in usual if values[name] != usual[name]]
 
 
-class Row(NamedTuple):
-    """The bars of one stage, on one worker or on all: a path of thick lines for SVG."""
+def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
+    """Lay out the tasks of a run, of which some have records; None if nothing ran.
 
-    label: str
-    detail: str  # the tooltip
-    stage: str  # gives the colour
-    bars: str
-
-
-class Group(NamedTuple):
-    """Rows under one heading."""
-
-    title: str
-    detail: str
-    rows: Sequence[Row]
-
-
-class Timeline(NamedTuple):
-    """All groups on one axis: the stages, then each partition's workers."""
-
-    begun: str  # when the first task was, UTC
-    seconds: float  # from the first start to the last stop
-    ticks: Sequence[tuple[float, str]]  # per cent of the width, label
-    groups: Sequence[Group]
-    stages: Sequence[StageTotals]  # in the order of the pipeline
-    names: Mapping[str, str] = STAGES
-    row: int = ROW  # height of a row
-
-
-def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
-    """Lay out the tasks of a run, of which some have records; None if nothing ran."""
+    The template gets groups of rows on one axis, which begins with the first task: the stages, then
+    each partition's workers. A row is of one stage, on one worker or on all; its bars are a path of
+    thick lines for SVG, and its detail is a tooltip. Ticks are per cent of the width, and labels.
+    """
     if not stages:
         return None
     stages = in_order(stages)
@@ -170,17 +146,18 @@ def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
             wide.append((low, max((stop - begin) * WIDTH / seconds, low + _THIN)))
         return "".join(f"M{low:.1f} {ROW / 2:g}H{high:.1f}" for low, high in union(wide, _GAP))
 
-    overview = [
-        Row(
-            STAGES[stage.stage],
-            f"{STAGES[stage.stage]}: {counted(stage.tasks, 'task')}, {duration(stage.seconds)} of "
-            f"work within {duration(stage.stop - stage.start)}",
-            stage.stage,
-            bars(stage.busy),
-        )
-        for stage in stages
+    def row(label: str, stage: str, detail: str, times: Iterable[Span]) -> dict[str, str]:
+        text = f"{label}: {detail}"
+        return {"label": label, "detail": text, "stage": stage, "bars": bars(times)}
+
+    overview = []
+    for one in stages:
+        work = f"{duration(one.seconds)} of work within {duration(one.stop - one.start)}"
+        detail = f"{counted(one.tasks, 'task')}, {work}"
+        overview.append(row(STAGES[one.stage], one.stage, detail, one.busy))
+    groups: list[dict[str, Any]] = [
+        {"title": "Stages", "detail": "while at least one task ran", "rows": overview}
     ]
-    groups = [Group("Stages", "while at least one task ran", overview)]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
     # {partition: {(worker, stage): tasks}}
     drawn: dict[str, dict[tuple[str, str], list[TaskRecord]]] = defaultdict(
@@ -198,25 +175,26 @@ def make_timeline(stages: Sequence[StageTotals]) -> Timeline | None:
             detail += f", of which {count:,} are drawn: gaps are not all idle time"
         if len(tasks) > ROWS_MOST:
             detail += f"; the busiest {ROWS_MOST} of {len(tasks):,} rows"
-        work = {row: sum(task.seconds for task in tasks[row]) for row in tasks}
-        busiest = sorted(work, key=lambda row: -work[row])[:ROWS_MOST]
+        busy = {key: sum(task.seconds for task in tasks[key]) for key in tasks}
+        busiest = sorted(busy, key=lambda key: -busy[key])[:ROWS_MOST]
         rows = [
-            Row(
+            row(
                 worker,
-                f"{worker}: {STAGES[stage]}, {counted(len(tasks[worker, stage]), 'task')}, "
-                + duration(work[worker, stage]),
                 stage,
-                bars((task.start, task.stop) for task in tasks[worker, stage]),
+                f"{STAGES[stage]}, {counted(len(tasks[worker, stage]), 'task')}, "
+                + duration(busy[worker, stage]),
+                ((task.start, task.stop) for task in tasks[worker, stage]),
             )
             for worker, stage in sorted(
-                busiest, key=lambda row: (natural(row[0]), [*STAGES].index(row[1]))
+                busiest, key=lambda key: (natural(key[0]), [*STAGES].index(key[1]))
             )
         ]
-        groups.append(Group(partition, detail, rows))
+        groups.append({"title": partition, "detail": detail, "rows": rows})
     marks = np.arange(0, seconds, nice_step(seconds / 6))
     ticks = [(100 * t / seconds, f"{t:.6g} s") for t in marks]
     begun = f"{datetime.fromtimestamp(begin, UTC):%Y-%m-%d %H:%M UTC}"
-    return Timeline(begun, seconds, ticks, groups, stages)
+    drawing = {"ticks": ticks, "groups": groups, "row": ROW}
+    return {"begun": begun, "seconds": seconds, "stages": stages, "names": STAGES} | drawing
 
 
 def printable(text: str) -> str:
@@ -236,11 +214,6 @@ def code(text: str) -> Markup:
     """Name as code of Markdown; with letters that end code or a cell, as text."""
     is_plain = text.isprintable() and not re.search(r"[`|\\]", text)
     return Markup(f"`{text}`" if is_plain else markdown(text))
-
-
-def grouped(count: int) -> str:
-    """Return a whole number with thousands separated."""
-    return f"{count:,}"
 
 
 def duration(seconds: float) -> str:
