@@ -162,7 +162,7 @@ class Stages:
             self.unsorted, self._following = [], Counter()
         return changes
 
-    def wait(self, seconds, keys, *, scans):
+    def wait(self, seconds, keys, *, scans, linger_s=0.0):
         self.wanted = scans
 
     def send(self, name, messages):

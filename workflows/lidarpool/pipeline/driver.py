@@ -43,7 +43,8 @@ from .task_book import TaskBook
 from .workers import CastingWorkers
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
-WAIT_S = 0.02  # for news, where there is nothing else to do
+WAIT_S = 0.05  # for news, where there is nothing else to do
+LINGER_S, MOST_LINGERING = 0.004, 6  # of a wait, for more news, for each of so many jobs at most
 CLOSING_S = 0.001  # longest wait while the stages end
 ANNOUNCED = 2  # jobs that stage 1 should have before it, however large they are
 _UNSENT = pickle.PicklingError, TypeError, AttributeError, ValueError, RecursionError
@@ -179,13 +180,15 @@ class RunDriver:
         moved |= self.dispatcher.offer()
         return moved
 
-    def wait(self, seconds: float) -> None:
-        """Wait until there may be something to do, at most so long."""
+    def wait(self, seconds: float, keys: Iterable[str] = ()) -> None:
+        """Wait until there may be something to do, also when one of more tasks has ended."""
         if self.stages.closed:
             self.stages.wait(min(seconds, CLOSING_S), [], scans=False)
         else:
-            seconds, keys = max(seconds, WAIT_S), self.workers.pending
-            self.stages.wait(seconds, keys, scans=self._wants_scans)
+            seconds, keys = max(seconds, WAIT_S), [*self.workers.pending, *keys]
+            # Small jobs come in dozens, and nobody waits for any of them.
+            linger_s = LINGER_S * min(len(self.jobs), MOST_LINGERING)
+            self.stages.wait(seconds, keys, scans=self._wants_scans, linger_s=linger_s)
 
     def _take(self, message: Message) -> None:
         if isinstance(message, ColumnsLost):

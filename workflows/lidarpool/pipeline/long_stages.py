@@ -38,7 +38,6 @@ SETTLE_S = 2.0  # for a task that was just submitted to start
 DEATHS_MOST = 12  # deaths of one stage with nothing committed in between
 ASK_LOCK_S = 0.05
 LAST_WORDS_S = 3.0  # for the stages to end after everything was committed
-LINGER_S = 0.004  # of a wait, for more messages
 
 Order = Description | CollectOrder | Summaries  # to a stage
 
@@ -114,8 +113,12 @@ class LongStages:
 
     # -- messages --------------------------------------------------------------------------
 
-    def wait(self, seconds: float, keys: Sequence[str], *, scans: bool) -> None:
+    def wait(
+        self, seconds: float, keys: Sequence[str], *, scans: bool, linger_s: float = 0.0
+    ) -> None:
         """Wait until there are messages or one of some tasks has ended, at most so long.
+
+        Then it waits a moment for more, `linger_s`.
 
         The same request sends what was to be sent, and takes all messages, those of stage 1 only
         if `scans` are wanted: each request costs driver and scheduler a millisecond.
@@ -123,7 +126,7 @@ class LongStages:
         pipes = [self._news.name, *([self._scans.name] if scans else [])]
         puts = {name: [orders] for name, orders in self._outbox.items()}
         self._outbox = {}
-        found = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=LINGER_S)
+        found = take_news(self.client, seconds, pipes, keys, puts=puts, linger_s=linger_s)
         for items in found.values():
             self.inbox += items
 

@@ -301,6 +301,7 @@ class Run:
         self._begin(self._first)  # and its trials
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         told = saved = float("-inf")
+        beside = [one.tasks for one in (self._writer, self._trials) if one is not None]
         while not (driver.stages.ended and (self._trials is None or "planning" in self.times)):
             moved = False
             if not driver.stages.closed:
@@ -323,7 +324,10 @@ class Run:
                 told = now
                 self._tell_progress(show, now - started)
             pause_s = 0.0 if moved else min(max(0.001, 2 * pause_s), LONGEST_PAUSE_S)
-            (time.sleep if driver.stages.ended else driver.wait)(pause_s)
+            if driver.stages.ended:
+                time.sleep(pause_s)
+            else:
+                driver.wait(pause_s, [future.key for one in beside for future in one.running])
         self.notes += watch.notes
 
     def _save(self) -> None:
