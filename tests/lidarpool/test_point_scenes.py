@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from lidarpool.cli.scene_commands import scene as command
+from lidarpool.cli.scenario_commands import scene as command
 
 from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor
 from lidarpool.base.errors import LidarpoolError

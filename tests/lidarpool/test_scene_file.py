@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import trimesh
 from click.testing import CliRunner
-from lidarpool.cli.scene_commands import scene as command
+from lidarpool.cli.scenario_commands import scene as command
 
 from lidarpool import LidarpoolError, Scene
 from lidarpool.scene.actors import box
