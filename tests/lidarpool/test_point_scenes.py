@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 from click.testing import CliRunner
-from lidarpool.cli.scenario_commands import scene as command
 
 from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.open3d_module import load_open3d
+from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scene.points import scene_of_points
 from lidarpool.scene.scene_file import write_scene
 

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 import trimesh
 from click.testing import CliRunner
-from lidarpool.cli.scenario_commands import scene as command
 
 from lidarpool import LidarpoolError, Scene
+from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scene.actors import box
 from lidarpool.scene.city import city
 from lidarpool.scene.colours import WHITE, Colours
