@@ -240,13 +240,9 @@ class LivePage(Page):
 
     def _words(self, values: Mapping[str, Value]) -> list[str]:
         """Values in the order of the table's columns; "" for one that is not there."""
-        return [_word(values.get(name, "")) for name in self._names]
-
-
-def _word(value: Value) -> str:
-    if isinstance(value, bool):
-        return str(value).lower()
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+        shown = (values.get(name, "") for name in self._names)
+        words = (f"{one:.4g}" if isinstance(one, float) else one for one in shown)
+        return [str(one).lower() if isinstance(one, bool) else str(one) for one in words]
 
 
 class Share:
@@ -439,8 +435,10 @@ class LiveJob:
     def news(self) -> Answer:
         """Tell what is new of the job while it goes on, and at its end."""
         view, frames = self.view, [] if self._ends else list(self.frames)
-        if view.path is None and not self._ends:
-            view.path = self._planned()
+        planning, trials = self._job.planning, self._points_of.parts.trials
+        is_new = view.path is None and not self._ends
+        if planning is not None and is_new and len(trials) >= self._job.trials:
+            view.path = best(trials, planning).path
         newest = frames[-1].scan if frames else -1
         header = {
             "version": view.version,
@@ -452,13 +450,6 @@ class LiveJob:
             "ends": self._ends,
         }
         return header, {"rays": _rays_of(frames) if frames else view.rays_shown}
-
-    def _planned(self) -> Floats | None:
-        """Return the planned path, once all trials have ended."""
-        planning, trials = self._job.planning, self._points_of.parts.trials
-        if planning is None or len(trials) < self._job.trials:
-            return None
-        return best(trials, planning).path
 
 
 def _rays_of(frames: list[Frame]) -> Floats32:

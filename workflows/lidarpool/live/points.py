@@ -199,7 +199,10 @@ class PointFinder:
             ranges = sorted(map(self.points.rows_of, scans))
         whole = sum(high - low for low, high in ranges)
         if not wanted.limits and (eye is None or whole <= most):
-            rows = _spread(ranges, one_of_each_part(whole, most))
+            numbers = one_of_each_part(whole, most)
+            before = np.cumsum([0, *(high - low for low, high in ranges)])[:-1]
+            part = np.searchsorted(before, numbers, "right") - 1
+            rows = numbers + (np.array([low for low, _ in ranges], np.int64) - before)[part]
             return rows[wanted.keeps(self.points, rows)], whole
         if eye is None:
             return self._search(ranges, most, wanted, None, None, abandoned)
@@ -250,11 +253,3 @@ class PointFinder:
                     joined = np.concatenate(kept)
                     kept = [joined[random.random(len(joined)) < _KEPT]]
         return np.concatenate(kept), found
-
-
-def _spread(ranges: Sequence[tuple[int, int]], numbers: Ints) -> Ints:
-    """Rows of the n-th points of ranges of rows."""
-    firsts = np.array([low for low, _ in ranges], np.int64)
-    before = np.cumsum([0, *(high - low for low, high in ranges)])[:-1]
-    part = np.searchsorted(before, numbers, "right") - 1
-    return numbers + (firsts - before)[part]

@@ -340,7 +340,12 @@ class View:
         counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
         if colour == "hits":
             counts = counts if self.hits is None else self.hits()
-            counts, places = counts[: len(pictured.scene.faces)], self._on_statics()
+            counts = counts[: len(pictured.scene.faces)]
+            rows, _ = self._finder.find(_HITS_SAMPLE)
+            if "object" in self.columns:  # some points on static objects, local
+                owners = self._finder.points.values("object", rows)
+                rows = rows[(owners >= 0) & (owners < len(pictured.scene.names))]
+            places = (positions(self._finder.points, rows) - self.origin).astype(np.float32)
         arrays, legend = surface.coloured(colour, counts, places)
         arrays["objects"] = arrays["objects"].astype(np.int32)
         return {"legend": legend} | self._look_around, arrays
@@ -356,14 +361,6 @@ class View:
         caster = RayCaster(scene.vertices, scene.faces)
         floor, cut = floor_and_cut(scene, caster, np.concatenate(poses))
         return {"floor": floor, "roof_cut": cut}
-
-    def _on_statics(self) -> Floats32:
-        """Positions (n, 3) of some points on static objects, local."""
-        rows, _ = self._finder.find(_HITS_SAMPLE)
-        if self.pictured is not None and "object" in self.columns:
-            owners = self._finder.points.values("object", rows)
-            rows = rows[(owners >= 0) & (owners < len(self.pictured.scene.names))]
-        return (positions(self._finder.points, rows) - self.origin).astype(np.float32)
 
     def _range(self, sweep: int) -> Answer:
         """Range image of a sweep: rows are channels from above, columns go from left to right."""
@@ -474,10 +471,21 @@ class Surface:
         `by` is one of `colours_for` the scene; "hits" needs the hits (f,) of its triangles, and
         some of the hit points, (n, 3). There are no colours for "grey": the page has its own.
         """
-        if by == "hits":
-            return self._by_hits(hit_counts, points)
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
-        legend = None
+        legend: Legend | None = None
+        if by == "hits":
+            hits = hit_counts.astype(np.float64)
+            if self._stands is not None:
+                left = self._stands >= 0
+                sums = np.bincount(self._stands[left], hits[left], len(self.corners))
+                hits = sums.astype(np.float64)
+            most = len(self.corners) + MOST_PIECES
+            made = hit_colours(self.coarse, self.corners, hits, points, most)
+            arrays["corners"], owner, colours, (low, high) = made
+            arrays |= {"objects": self._objects[owner], "colours": as_bytes(colours)}
+            named = (low, (low * high) ** 0.5, high)
+            marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in named]
+            return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
         if by == "object":
             colouring = colours_of(self._objects, OBJECT, self._scene.names)
             colours, legend = colouring.paint(self._objects), legend_of(colouring)
@@ -491,23 +499,6 @@ class Surface:
             return arrays, None
         corners = as_bytes(colours).repeat(3, axis=0).reshape(-1, 3, 3)
         return arrays | {"colours": corners}, legend
-
-    def _by_hits(
-        self, hit_counts: AnyArray, points: Floats32
-    ) -> tuple[dict[str, AnyArray], Legend | None]:
-        hits = hit_counts.astype(np.float64)
-        if self._stands is not None:
-            left = self._stands >= 0
-            hits = np.bincount(self._stands[left], hits[left], len(self.corners)).astype(np.float64)
-        most = len(self.corners) + MOST_PIECES
-        shown = self.coarse, self.corners
-        corners, owner, colours, (low, high) = hit_colours(*shown, hits, points, most)
-        middle = (low * high) ** 0.5
-        marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in (low, middle, high)]
-        arrays: dict[str, AnyArray] = {
-            "corners": corners, "objects": self._objects[owner], "colours": as_bytes(colours),
-        }  # fmt: skip
-        return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
 
 
 def colours_for(scene: Scene, reflectance: Floats | None) -> tuple[str, ...]:

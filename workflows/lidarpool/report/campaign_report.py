@@ -237,9 +237,16 @@ class Scale:
     @classmethod
     def of(cls, varied: Varied) -> Scale:
         """Choose bins for a quantity: of labels one each, of few whole numbers, or equal ones."""
-        if varied.labels:
-            return _of_labels(varied)
-        there = varied.there
+        values, labels, there = varied.values, varied.labels, varied.there
+        if len(labels) > MOST_LABELS:
+            counts = np.bincount(there.astype(np.intp), minlength=len(labels))
+            kept = np.sort(np.argsort(-counts, kind="stable")[: MOST_LABELS - 1])
+            place = np.append(np.full(len(labels), MOST_LABELS - 1.0), np.nan)
+            place[kept] = np.arange(len(kept))
+            values = place[np.nan_to_num(values, nan=-1).astype(np.intp)]
+            labels = (*(labels[k] for k in kept), f"{len(labels) - len(kept)} others")
+        if labels:
+            return cls(values, np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1), labels)
         low, high = (float(there.min()), float(there.max())) if len(there) else (0.0, 1.0)
         if high - low <= 30 and (there == np.round(there)).all():
             return cls(varied.values, np.arange(low - 0.5, high + 1))
@@ -259,18 +266,6 @@ class Scale:
         found = np.searchsorted(self.edges, self.places, "right") - 1
         found = found.clip(0, len(self.edges) - 2)
         return np.where(np.isfinite(self.places), found, -1)
-
-
-def _of_labels(varied: Varied) -> Scale:
-    values, labels = varied.values, varied.labels
-    if len(labels) > MOST_LABELS:
-        counts = np.bincount(varied.there.astype(np.intp), minlength=len(labels))
-        kept = np.sort(np.argsort(-counts, kind="stable")[: MOST_LABELS - 1])
-        place = np.append(np.full(len(labels), MOST_LABELS - 1.0), np.nan)
-        place[kept] = np.arange(len(kept))
-        values = place[np.nan_to_num(values, nan=-1).astype(np.intp)]
-        labels = (*(labels[k] for k in kept), f"{len(labels) - len(kept)} others")
-    return Scale(values, np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1), labels)
 
 
 def draw_varied(figures: Figures) -> Page | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -36,14 +36,7 @@ from .range_image import RangeImages, paired_images, range_images
 DISTANCES_M = (0.05, 0.1, 0.2, 0.5)
 MOST_POINTS = 10_000_000  # of each cloud in memory
 MOST_VALUES = 4_000_000  # cells and points of all sweeps, whose figures are taken
-RESIDUALS: dict[str, Callable[[Floats], Any]] = {
-    "bias_m": np.mean,
-    "rmse_m": lambda values: np.sqrt(np.mean(values**2)),
-    "median_m": lambda values: np.quantile(values, 0.5),
-    "mad_m": lambda values: np.median(np.abs(values - np.quantile(values, 0.5))),
-    "p05_m": lambda values: np.quantile(values, 0.05),
-    "p95_m": lambda values: np.quantile(values, 0.95),
-}
+RESIDUALS = ("bias_m", "rmse_m", "median_m", "mad_m", "p05_m", "p95_m")
 
 # Points (n, 3) of a cloud, and their distances (n,) to the other.
 Above = tuple[Floats, Floats]
@@ -382,8 +375,12 @@ def nearest(points: Floats, others: Floats) -> tuple[Floats, Ints]:
 
 
 def _residuals(values: Floats) -> dict[str, Any]:
-    """Figures of residuals A - B, `RESIDUALS`; None where there are none."""
-    figures = (float(figure(values)) if len(values) else None for figure in RESIDUALS.values())
+    """Figures of residuals A - B; None where there are none."""
+    if not len(values):
+        return {"cells": 0, **dict.fromkeys(RESIDUALS)}
+    low, median, high = np.quantile(values, (0.05, 0.5, 0.95)).tolist()
+    mad, rmse = np.median(np.abs(values - median)), np.sqrt(np.mean(values**2))
+    figures = map(float, (values.mean(), rmse, median, mad, low, high))
     return {"cells": len(values), **dict(zip(RESIDUALS, figures, strict=True))}
 
 

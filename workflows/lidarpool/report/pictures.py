@@ -45,16 +45,6 @@ COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY)])
 _BLOCK = 4  # pixels a side
 
 
-def check_size(size: tuple[int, int]) -> None:
-    """Check the size of a picture in pixels; LidarpoolError gives the limits."""
-    least, most = min(size), max(size)
-    if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
-        raise LidarpoolError(
-            f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
-            f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
-        )
-
-
 def draw_pictures(
     shown: Pictured,
     cloud: Path,
@@ -64,7 +54,12 @@ def draw_pictures(
     colour: str = Z.name,
 ) -> Iterator[Path]:
     """Draw pictures, those in `only`, into a folder, which is made; see `picture_makers`."""
-    check_size(size)
+    least, most = min(size), max(size)
+    if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
+        raise LidarpoolError(
+            f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
+            f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
+        )
     columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     makers = picture_makers(shown, cloud, columns, size, colour)
     for name in only:
