@@ -41,7 +41,7 @@ class Dispatcher:
         self._count = 0  # of batches so far
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
         self._total = (0.0, 0)  # casting time of scans, and their number
-        self._per_task = 1  # small batches of a task
+        self.per_task = 1  # small batches of a task
         # {job: batches that were tried alone before any was cast, each with a worker that died}
         self._first_deaths: dict[JobState, list[Batch]] = {}
         self._hidden: set[str] = set()  # addresses of LIDAR workers that do not see the storage
@@ -78,7 +78,7 @@ class Dispatcher:
     def most(self) -> int:
         """Batches that may be under way, by weight."""
         slots, collectors = self._workers.slot_count, self._stages.collector_count
-        return policies.most_under_way(slots, collectors, self._per_task)
+        return policies.most_under_way(slots, collectors, self.per_task)
 
     def room(self, job: JobState) -> float:
         """Batches that may be taken of a job, by weight; none far ahead of its oldest."""
@@ -86,7 +86,7 @@ class Dispatcher:
         span = max((self._count - batch.number for batch in self._of(job)), default=0)
         if span >= policies.SPAN * self.most:
             return 0
-        return self.most - policies.weight(self.batches.values(), self._per_task)
+        return self.most - policies.weight(self.batches.values(), self.per_task)
 
     def slots_wanted(self, left: int) -> int:
         """Slots that so many scans are worth; at least 1."""
@@ -102,7 +102,7 @@ class Dispatcher:
             job.seconds += record.seconds
             self._seconds.append(record.seconds)
             self._total = (self._total[0] + record.seconds, self._total[1] + record.items)
-        self._per_task = policies.batches_per_task(self._seconds)
+        self.per_task = policies.batches_per_task(self._seconds)
         for job, stop, last in records[-1:]:
             seconds, scans, slots = last.seconds, last.items, self._workers.slot_count
             if stop == job.survey.scan_count and scans < self.advice:
@@ -133,7 +133,7 @@ class Dispatcher:
         if not waiting:
             return False
         there = [*waiting, *self.at(Place.CASTING, Place.CAST, Place.COLLECTING)]
-        chosen = policies.offers(there, self._workers.slots, self.most, self._per_task)
+        chosen = policies.offers(there, self._workers.slots, self.most, self.per_task)
         for task, worker in chosen:
             spans = [(batch.job.number, (batch.first, batch.stop)) for batch in task]
             key = self._workers.cast(spans, worker)

@@ -102,6 +102,10 @@ class JobMaker:
             raise found
         return found
 
+    def has(self, jobs: int) -> bool:
+        """Whether so many are ready, or as many as will ever be."""
+        return self._ready.qsize() >= min(jobs, READY) or not self._thread.is_alive()
+
     def _work(self) -> None:
         last: BaseException | None = None
         try:

@@ -138,7 +138,11 @@ class Run:
     def _admit(self) -> bool:
         """Take on jobs that are ready, if there is room for them."""
         moved, most = False, SPARE + 2 * self._driver.workers.slot_count
-        while self._maker and self._driver.has_room and len(self._made) < most:
+        # Small jobs begin together, and go on together: then they share messages and tasks.
+        together = self._driver.dispatcher.per_task if self._driver.jobs else 1
+        if self._maker is None or not self._maker.has(together):
+            return False
+        while self._driver.has_room and len(self._made) < most:
             if (found := self._maker.take()) is None:
                 break
             moved = True
