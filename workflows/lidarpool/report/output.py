@@ -55,15 +55,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     only_cloud: bool = False
     judge: Callable[[RunResult], str] = lambda result: ""
 
-    @property
-    def formats(self) -> list[Format]:
-        """Formats that the cloud is written in as well."""
-        return [one for one in self.job.outputs if one.format != "ply"]
-
     @contextmanager
     def held(self) -> Iterator[None]:
         """Lock the folder while the body runs."""
-        for one in self.formats:
+        for one in self.job.outputs:
             one.check_installed()
         load_open3d()  # what writes the cloud in the end
         with result_folder(self.place) as self._folder:
@@ -72,7 +67,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     def begin(self, conductor: Conductor[tuple[RunResult, dict[str, Any]]]) -> None:
         """Refuse the result of another survey."""
         if not conductor.goes_on:
-            further = further_files(self.job.survey, self.formats)
+            further = further_files(self.job.survey, self.job.outputs)
             overwrite = conductor.options.overwrite
             identity = partial(getattr, conductor.jobs, "identity")
             refuse_to_replace(self.place, identity, further, overwrite=overwrite)
@@ -82,7 +77,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     ) -> tuple[RunResult, dict[str, Any]]:
         """Write the result, and remove the run."""
         result = conductor.result()
-        in_pieces = any(one.in_pieces for one in self.formats)
+        in_pieces = any(one.in_pieces for one in self.job.outputs)
         workers = conductor.lidar_workers() if in_pieces else None
         if not in_pieces:
             conductor.leave_cluster()
@@ -98,7 +93,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         with conductor.screen.status(f"writing {what}"):
             report = write_result(
                 self._folder, self.place, result, self.scenario, in_place, self.only_cloud,
-                self.formats, workers,
+                self.job.outputs, workers,
             )  # fmt: skip
         return result, report
 
