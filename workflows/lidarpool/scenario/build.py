@@ -70,8 +70,6 @@ class Job:
         Formats that its cloud is also written in.
     made_of
         Names and SHA-256 of the files that it was made of.
-    notes
-        Remarks for the user.
 
     Raises
     ------
@@ -89,7 +87,6 @@ class Job:
     split: str = ""
     outputs: Sequence[Format] = ()
     made_of: Sequence[tuple[str, str]] = ()
-    notes: Sequence[str] = ()
 
     def __post_init__(self) -> None:
         scene, survey = self.scene, self.survey

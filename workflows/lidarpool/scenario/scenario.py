@@ -275,11 +275,6 @@ class Scenario(Section):
         return *self.scene.copies, *self.actors
 
     @property
-    def folder(self) -> Path:
-        """Where relative file names start from."""
-        return self._folder
-
-    @property
     def source(self) -> str:
         """Its name in messages."""
         return self._source

@@ -82,7 +82,7 @@ def _key(scenario: Scenario) -> object:
     for copies in section.copies:
         names += [one.file for one in (copies.file, copies.table) if one is not None]
     states = file_states(scenario.paths(names))
-    read_by = scenario.folder, scenario.coloured, scenario.cloud.epsg
+    read_by = scenario.path(""), scenario.coloured, scenario.cloud.epsg
     return section.model_dump_json(), *read_by, states
 
 
