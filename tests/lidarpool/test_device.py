@@ -20,7 +20,7 @@ from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
 
 from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scanner, Scene, Survey, Track
 from lidarpool.columns.parts import pack
-from lidarpool.pipeline import cast
+from lidarpool.pipeline import rigs as stage
 from lidarpool.scene.actors import box
 from lidarpool.scene.colours import Colours
 from lidarpool.scene.shapes import seed_objects
@@ -183,12 +183,12 @@ def test_columns_of_actors(scene, name, scenes, backend):
 
 def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeypatch):
     survey, spans = MADE["on the move"], [(0, 9), (9, 28)]
-    monkeypatch.setattr(cast, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
+    monkeypatch.setattr(stage, "Recorder", lambda *_: SimpleNamespace(done=lambda scans: None))
     tasks = []
     for name in (backend, "numpy"):
         rig = Rig(scenes["both"], survey, name)
-        monkeypatch.setattr(cast, "rig_of", lambda *_, rig=rig: rig)
-        done = cast.intersect([cast.CastWork(0, "a run", spans)], (), None, None)
+        monkeypatch.setattr(stage, "rig_of", lambda *_, rig=rig: rig)
+        done = stage.intersect([stage.CastWork(0, "a run", spans)], (), None, None)
         tasks.append(pickle.loads(pickle.dumps(done, protocol=5)))
     for mine, other in zip(*tasks, strict=True):
         samples, exact = mine.part.samples, other.part.samples
