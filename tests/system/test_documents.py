@@ -31,7 +31,7 @@ import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
 
-import lidarpool.api.simulation
+import lidarpool.run.cluster
 from lidarpool import Cloud
 from lidarpool.cli.commands import cli
 from lidarpool.scenario.choices import CampaignSection
@@ -105,7 +105,7 @@ def in_threads(monkeypatch, cluster_client):
     theirs = partial(distributed.LocalCluster, processes=False, protocol="tcp")
     monkeypatch.setattr(distributed, "LocalCluster", theirs)
     ours = nullcontext(cluster_client)
-    monkeypatch.setattr(lidarpool.api.simulation, "local_client", lambda **_: ours)
+    monkeypatch.setattr(lidarpool.run.cluster, "local_client", lambda *_, **__: ours)
 
 
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
