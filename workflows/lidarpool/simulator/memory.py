@@ -155,9 +155,11 @@ def _others(survey: Survey, sensor: Sensor) -> float:
 def scans_that_fit(scene: Scene, survey: Survey, limit: float, *, on_device: bool = False) -> int:
     """Find how many scans can be cast at a time in so many bytes, at least 1; see `cast_bytes`.
 
-    The counts of hits do not count: each cast takes them, and smaller ones would take no less.
+    Of a small survey these may be more than it has. The counts of hits do not count: each cast
+    takes them, and smaller ones would take no less.
     """
     limit += TRIANGLE * scene.counters
-    counts = range(1, survey.scan_count + 1)
     takes = partial(cast_bytes, scene, survey, on_device=on_device)
-    return max(1, bisect_right(counts, limit, key=takes))
+    if (whole := takes(survey.scan_count)) <= limit:
+        return int(survey.scan_count * limit / whole)
+    return max(1, bisect_right(range(1, survey.scan_count + 1), limit, key=takes))
