@@ -84,6 +84,7 @@ class JobMaker:
         self._cache = SceneCache()
         self._ready: Queue[Made | JobRow | BaseException | None] = Queue(READY)
         self._stopped = Event()
+        self._full = False  # whether it waits because of the memory of scenes
         self.ended = False  # whether the last was taken
         self._thread = Thread(target=self._work, name="jobs", daemon=True)
         self._thread.start()
@@ -103,8 +104,9 @@ class JobMaker:
         return found
 
     def has(self, jobs: int) -> bool:
-        """Whether so many are ready, or as many as will ever be."""
-        return self._ready.qsize() >= min(jobs, READY) or not self._thread.is_alive()
+        """Whether so many are ready, or as many as will be until some are taken."""
+        most = self._full or not self._thread.is_alive()
+        return most or self._ready.qsize() >= min(jobs, READY)
 
     def _work(self) -> None:
         last: BaseException | None = None
@@ -130,7 +132,8 @@ class JobMaker:
     def _put(self, found: Made | JobRow | BaseException | None) -> bool:
         while not self._stopped.is_set():
             waiting = [one.job.scene for one in [*self._ready.queue] if isinstance(one, Made)]
-            if len({id(scene.vertices) for scene in waiting}) > SCENES:
+            self._full = len({id(scene.vertices) for scene in waiting}) > SCENES
+            if self._full:
                 time.sleep(0.05)
                 continue
             with suppress(Full):
