@@ -50,6 +50,16 @@ _HANDLERS = {number: signal.getsignal(number) for number in (signal.SIGINT, sign
 
 
 @pytest.fixture(scope="session", autouse=True)
+def _fork_server() -> None:
+    """Start the fork server as the product does, before a cluster of Dask's own starts another."""
+    try:
+        from lidarpool.base.fork_server import start_fork_server
+    except ImportError:
+        return
+    start_fork_server()
+
+
+@pytest.fixture(scope="session", autouse=True)
 def _outside_the_checkout(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """Run fixtures of modules in a folder of their own, too."""
     with pytest.MonkeyPatch.context() as patch:

@@ -31,7 +31,6 @@ from poolpart.pipe import pipes_of
 @pytest.fixture(scope="session")
 def local_client() -> Iterator[Client]:
     """A local cluster of processes: two casting workers, one each of LIDAR and OTHER."""
-    lidarpool.base.fork_server.start_fork_server()  # as the product does
     with (
         local_cluster(gpu_workers=2, other_workers=1) as cluster,
         Client(cluster, set_as_default=False) as client,
