@@ -23,8 +23,6 @@ from ..scenario.static_scene import SceneCache
 READY = 16  # jobs that are made ahead: small ones are cast several at a time,
 SCENES = 2  # and they have so many scenes at most
 STOP_S = 10.0  # for a job that is being made when the run ends
-
-
 CONTENT = ("scene", "survey", "planning")  # the fields of a job that its result depends on
 
 

@@ -62,9 +62,8 @@ class Run:
     ) -> None:
         self._cluster, self._store, self._page = cluster, store, page
         self._first, self._maker = first, maker
-        self.on_frame: Callable[[Frame], None] | None = (
-            None  # is called with frames of the only job
-        )
+        # Is called with frames of the only job.
+        self.on_frame: Callable[[Frame], None] | None = None
         options, run = cluster.options, uuid.uuid4().hex[:8]
         stages = LongStages(
             cluster.client,
@@ -335,9 +334,9 @@ class Run:
         self.notes += watch.notes
 
     def _save(self) -> None:
-        if self._trials is not None:
-            done = len(self._store.db.job(0, 0).trials)
-            self._store.db.add_trials(0, self._trials.trials[done:])
+        if self._trials is not None and (only := self._store.only) is not None:
+            done = len(only.parts.trials)
+            self._store.db.add_trials(only.job.number, self._trials.trials[done:])
         self._store.save()
 
     def _tell_progress(self, show: Show, seconds: float) -> None:
