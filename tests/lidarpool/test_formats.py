@@ -6,6 +6,7 @@ import re
 import signal
 import sys
 import threading
+import time
 import tomllib
 import types
 from dataclasses import replace
@@ -794,6 +795,8 @@ def test_an_interrupt_leaves_nothing_of_what_threads_write(sweeps, cloud, tmp_pa
 
     def interrupted(storage, name, data):
         if name.endswith(".bin") and once.acquire(blocking=False):
+            # Python's thread pool forgets a thread if it is interrupted while it starts that one.
+            time.sleep(0.5)
             signal.pthread_kill(main, signal.SIGINT)
         write(storage, name, data)
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import pickle
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from tests.lidarpool.casting import Cart, cast_between, tally_of
 
 from lidarpool import Actor, Beams, Column, Mounted, Pose, Scene, Sensor, Spin, Survey, Track
 from lidarpool.columns.parts import pack
+from lidarpool.pipeline import rigs
 from lidarpool.pipeline.failures import naming_scans
 from lidarpool.scene.actors import box
 from lidarpool.scene.shapes import seed_objects
@@ -189,3 +192,24 @@ def test_a_rig_of_another_survey_shares_the_trees_and_casts_the_same(monkeypatch
     for one, two in ((other, fresh), (rig, Rig(scene, surveys[0], "numpy"))):
         assert pack(columns_of(list(one.cast(0, 14)))) == pack(columns_of(list(two.cast(0, 14))))
     assert other.scene.actors == (car,) and rig.scene.actors == ()
+
+
+def test_a_cast_that_outlives_its_run_keeps_no_rig(monkeypatch):
+    monkeypatch.setattr(
+        rigs, "get_worker", lambda: SimpleNamespace(state=SimpleNamespace(nthreads=1))
+    )
+    monkeypatch.setattr(rigs, "own_device", lambda: None)
+    scene = pickle.dumps(Scene.from_meshes([box("Room", (8, 6, 3))]))
+    packed = pickle.dumps(survey(poses=TURNED))
+
+    def made(run):
+        plan = pickle.dumps((f"{run}.scene-1", (), packed, "numpy"))
+        return rigs.rig_of(f"{run}.0-2", plan, scene)
+
+    assert made("a") is rigs.rig_of("a.0-2")
+    rigs.drop_all("a")
+    assert made("a").survey.steps == 14  # of a task that is under way yet
+    with pytest.raises(rigs.RigMissing):
+        rigs.rig_of("a.0-2")
+    assert made("b") is rigs.rig_of("b.0-2")
+    rigs.drop_all("b")

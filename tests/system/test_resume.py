@@ -138,8 +138,8 @@ def report_of(folder: Path) -> dict[str, Any]:
 
 MOMENTS = [
     ("COMMIT", 1),  # parts are in storage, and nothing is in the database
+    ("COMMIT", 2),  # a run's first is of less than half: few batches are under way until then
     ("driver.frame", 100),
-    ("COMMIT", 2),
     ("OPEN", 1),
     ("SAVE", 1),
     ("REMOVE", 1),

@@ -11,6 +11,7 @@ from __future__ import annotations
 import pickle
 import threading
 import time
+from collections import deque
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 
@@ -53,6 +54,7 @@ class _Kept:
 
 
 _kept: dict[str, _Kept] = {}  # {handle of a rig, or of a scene: a rig of it in this process}
+_ended: deque[str] = deque(maxlen=64)  # runs: a task that is still casting for one keeps nothing
 _lock = threading.Lock()
 
 
@@ -68,6 +70,8 @@ def rig_of(handle: str, plan: bytes | None = None, scene: bytes | None = None) -
             kept = _kept.get(handle)
             if kept is None:
                 kept = _kept[handle] = _made(handle, plan, scene)
+                if (run := handle.partition(".")[0]) in _ended:
+                    drop_all(run)
     its_scene = _kept.get(kept.scene, kept)
     kept.used_at = its_scene.used_at = time.monotonic()
     return kept.rig
@@ -110,7 +114,8 @@ def drop(handles: Collection[str]) -> None:
 
 
 def drop_all(run: str) -> None:
-    """Drop the rigs and scenes of a run."""
+    """Drop the rigs and scenes of a run that has ended."""
+    _ended.append(run)
     # Without the lock: this runs in the worker's event loop, and a tree takes long to build.
     drop([handle for handle in [*_kept] if handle.partition(".")[0] == run])
 

@@ -272,7 +272,7 @@ class CastingWorkers:
 
     def release(self) -> None:
         """Let the workers drop their rigs, as far as they can be reached."""
-        addresses = [a for a in self.slots if a in self.seen.members]
+        addresses = [*self._checked.keys() & self.seen.members]
         self._checked.clear()
         if self._client.status == "running":
             self.want(0)
