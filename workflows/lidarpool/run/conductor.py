@@ -156,13 +156,10 @@ class Conductor(Generic[R]):
     def _cast_what_is_left(self) -> None:
         if self.cluster is None or self._first is None:
             return
-        run = self.run = Run(self.cluster, self.store, self.page, self._first, self._maker)
-        if self.output.dataset is None:
-            run.on_frame = self._frame
-        else:
-            run.write_into(self.output.dataset)
+        jobs, dataset = (self._first, self._maker), self.output.dataset
+        self.run = Run(self.cluster, self.store, self.page, *jobs, dataset, self._frame)
         with self.screen.progress() as show:
-            run.cast(show)
+            self.run.cast(show)
 
     def _frame(self, frame: Frame) -> None:
         self.page.on_frame(frame)

@@ -38,6 +38,7 @@ class JobPoints:
         self.parts: JobParts = store.db.job(job.number, job.survey.scan_count)
         self.parts.has_frames = isinstance(store.jobs, OneJob)  # whose frames are handed out
         self.identified = False
+        self.sweeps: Sweeps | None = None  # of a job for a data set, once it was made
         self.resumed = self.parts.scans_done  # scans whose points are of an earlier run
 
     def check(self, sizes: Mapping[str, int], strays: Sequence[str]) -> None:

@@ -15,7 +15,6 @@ from distributed.comm.core import CommClosedError
 from ..base.errors import LidarpoolError
 from ..export.dataset import DataSet
 from ..export.jobs import JobRow
-from ..export.sweeps import Sweeps
 from ..pipeline import (
     GPU,
     LIDAR,
@@ -49,7 +48,8 @@ SPARE = 32  # jobs under way beside two for each GPU slot
 class Run:
     """The jobs that are left of a run, on a cluster: the `first`, and those of `maker`.
 
-    They are written into a data set; without `write_into` there is only one, whose parts are kept.
+    They are written into a `dataset`; without one there is only one job, whose parts are kept, and
+    whose frames `on_frame` is called with.
     """
 
     def __init__(
@@ -58,12 +58,12 @@ class Run:
         store: RunStore,
         page: Page,
         first: Made,
-        maker: JobMaker | None = None,
+        maker: JobMaker | None,
+        dataset: DataSet | None,
+        on_frame: Callable[[Frame], None],
     ) -> None:
         self._cluster, self._store, self._page = cluster, store, page
-        self._first, self._maker = first, maker
-        # Is called with frames of the only job.
-        self.on_frame: Callable[[Frame], None] | None = None
+        self._first, self._maker, self._on_frame = first, maker, on_frame
         options, run = cluster.options, uuid.uuid4().hex[:8]
         stages = LongStages(
             cluster.client,
@@ -80,10 +80,11 @@ class Run:
             cluster.client, cluster.partitions[GPU], run, cluster.backend, cluster.software
         )
         self._driver = RunDriver(workers, stages, store.db, store.storage)
-        self._probe = stages.probe
         self._writer: JobWriter | None = None
+        if dataset is not None:
+            self._writer = JobWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
         self._trials: TrialPump | None = None
-        self._made: dict[int, tuple[JobPoints, Sweeps | None]] = {}  # {number: job under way}
+        self._made: dict[int, JobPoints] = {}  # {number: job under way}
         self._rows: list[JobRow] = []  # of jobs that have ended, and are not yet committed
         self._scans_begun = self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
@@ -91,11 +92,6 @@ class Run:
         self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
         self.notes: list[str] = []
         self.stages: tuple[StageTotals, ...] = ()
-
-    def write_into(self, dataset: DataSet) -> None:
-        """Have jobs written into a data set once they are cast."""
-        tasks: Tasks[list[JobFiles]] = self._cluster.tasks(LIDAR)
-        self._writer = JobWriter(tasks, dataset, self._store, self._probe)
 
     # -- jobs come and go --------------------------------------------------------------------
 
@@ -152,8 +148,8 @@ class Run:
         return moved
 
     def _begin(self, made: Made) -> None:
-        points = self._store.points_of(made.job)
-        self._made[made.job.number] = points, made.sweeps
+        points = self._made[made.job.number] = self._store.points_of(made.job)
+        points.sweeps = made.sweeps
         try:
             if self._writer is not None:  # else it was checked before anything was started
                 self._cluster.check(made.job)
@@ -162,8 +158,8 @@ class Run:
             self._fail(made.job.number, error)
 
     def _cast(self, job: Job, points: JobPoints) -> None:
-        cluster, on_frame = self._cluster, self.on_frame
-        if self._writer is None and job.planning is not None:
+        cluster, kept = self._cluster, self._writer is None
+        if kept and job.planning is not None:
             self._plan(job, points)
         # Of a campaign's job many follow, so that its batches need not be divided among all.
         left = self._store.jobs.count - self._store.db.ended_count
@@ -178,9 +174,9 @@ class Run:
                 on_device=cluster.backend == "cuda",
             ),
             in_all=job.survey.scan_count * left,
-            on_frame=None if on_frame is None else lambda frame: cluster.call(on_frame, frame),
+            on_frame=(lambda frame: cluster.call(self._on_frame, frame)) if kept else None,
             read=points.points_of_scan,
-            on_parts=self._page.on_parts if self._writer is None else None,
+            on_parts=self._page.on_parts if kept else None,
         )
         self._jobs_begun += 1
         self._scans_begun += job.survey.scan_count
@@ -196,8 +192,8 @@ class Run:
 
     def _files_of(self, state: JobState) -> JobFiles:
         """Return what a job that is committed is written from."""
-        points, sweeps = self._made[state.number]
-        job = points.job
+        points = self._made[state.number]
+        job, sweeps = points.job, points.sweeps
         assert sweeps is not None, "of a data set"
         row = JobRow(
             number=job.number,
@@ -230,18 +226,19 @@ class Run:
         rows, self._rows = self._rows, []
         if not rows:
             return
-        left = [(row, *self._made.pop(row.number, (None, None))) for row in rows]
+        # A job that could not be made has no points.
+        left = [(row, self._made.pop(row.number)) for row in rows if row.number in self._made]
         self._store.name_sensors(
             (carried.name or "lidar", f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz")
-            for row, points, _ in left
-            if row.done and points is not None
+            for row, points in left
+            if row.done
             for carried in points.job.survey.carried
             for sensor in [carried.sensor]
         )
         self._store.end(rows)
         for row in rows:
             self._page.ended(row)
-        self._remover.submit(self._remove, [(row, points) for row, points, _ in left if points])
+        self._remover.submit(self._remove, left)
 
     def _remove(self, ended: Sequence[tuple[JobRow, JobPoints]]) -> None:
         for row, points in ended:
@@ -264,7 +261,7 @@ class Run:
                 seconds=0.0 if state is None else state.seconds,
                 writing=number in writing,
             )
-            for number, (points, _) in [*self._made.items()]
+            for number, points in [*self._made.items()]
             for state in [self._driver.jobs.get(number)]
         ]
         return sorted(jobs, key=lambda job: job.writing)
@@ -281,8 +278,6 @@ class Run:
                 stages = TaskBook()
                 for record in driver.finish():
                     stages.add(record)
-                if self._trials is not None:
-                    self._trials.finish()
         finally:
             if self._writer is not None:
                 self._writer.close()
@@ -359,16 +354,18 @@ class Run:
 
     def _stop(self, reason: str) -> None:
         """Stop everything, as far as the cluster can be reached."""
-        client = self._cluster.client
-        for pump in (self._driver, self._trials):
-            for step in (lambda pump=pump: pump.stop(reason), lambda pump=pump: pump.finish()):
-                # Dask would try for half a minute to reach a cluster that is gone.
-                if pump is None or client.status != "running":
-                    continue
-                try:
-                    # Report the first error.
-                    with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
-                        step()
-                except Exception:
-                    if client.status == "running":
-                        raise
+        client, driver, trials = self._cluster.client, self._driver, self._trials
+        steps: list[Callable[[], object]] = [lambda: driver.stop(reason), driver.finish]
+        if trials is not None:
+            steps.append(trials.tasks.cancel)
+        for step in steps:
+            # Dask would try for half a minute to reach a cluster that is gone.
+            if client.status != "running":
+                return
+            try:
+                # Report the first error.
+                with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                    step()
+            except Exception:
+                if client.status == "running":
+                    raise

@@ -51,5 +51,6 @@ class Tasks(Generic[T]):
         return look_for_tasks(self._client, self.partition.name, keys)
 
     def cancel(self) -> None:
-        """Start no more; running ones are not ended."""
+        """Drop all of them; those that have begun run to their end."""
         self._client.cancel([*self.running])
+        self.running.clear()

@@ -91,11 +91,3 @@ class TrialPump:
         # that wait have more workers started, where their number adapts.
         self._most = 2 * max(1, seen.most_slots)
         return seen
-
-    def stop(self, reason: str) -> None:
-        """Start no more trials; running ones end in a fraction of a second."""
-        self.tasks.cancel()
-
-    def finish(self) -> None:
-        """Release everything on the scheduler."""
-        self.tasks.running.clear()
