@@ -64,9 +64,9 @@ class Together:
         alike, mark = software("numpy"), self.db.meta["mark"]
         run = uuid.uuid4().hex[:8]
         self.driver = RunDriver(
-            CastingWorkers(client, Partition(GPU, client), run, "numpy", alike),
+            CastingWorkers(Partition(GPU, client), run, "numpy", alike),
             LongStages(
-                client, Partition(LIDAR, client), run, alike["lidarpool"], self.storage, mark,
+                Partition(LIDAR, client), run, alike["lidarpool"], self.storage, mark,
                 queue_capacity=10, collectors=2, patience_s=120.0,
             ),
             self.db,

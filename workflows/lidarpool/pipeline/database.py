@@ -47,6 +47,7 @@ CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEX
 _DONE, _FAILED = 1, 2  # what became of a job
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
 _FIRST = attrgetter("first")  # the order of parts
+PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
 
 
 class JobParts:
@@ -422,12 +423,6 @@ def _trial_of(data: dict[str, Any]) -> Trial:
 def parts_folder(mark: str) -> str:
     """Name of the folder of the parts in a place that runs share."""
     return f"run-{mark}"
-
-
-def mark_of_folder(name: str) -> str:
-    """Mark of the run whose `parts_folder` has a name; empty for any other name."""
-    found = re.fullmatch("run-([0-9a-f]{16})", name)
-    return found[1] if found else ""
 
 
 def _checked_place(meta: Mapping[str, str]) -> tuple[str, str]:

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
-from distributed import Client, Future, Lock
+from distributed import Future, Lock
 
 from poolpart import (
     Partition,
@@ -69,7 +69,6 @@ class LongStages:
 
     def __init__(
         self,
-        client: Client,
         partition: Partition,
         run: str,
         sources: str,
@@ -80,7 +79,7 @@ class LongStages:
         collectors: int,
         patience_s: float,
     ) -> None:
-        self.client, self.partition, self.run = client, partition, run
+        self.client, self.partition, self.run = partition.client, partition, run
         self.collector_count = collectors
         self._sources, self._storage = sources, storage
         self._lock_name = f"lidarpool-start-{partition.name}"
@@ -90,8 +89,8 @@ class LongStages:
         self._submitted = 0
         # A file in the storage, by which collectors find out whether they see it.
         self.probe = (probe_name(mark, run), secrets.token_bytes(16))
-        self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, client)
-        self._news = Pipe(f"lidarpool-{run}-news", 64, client)  # from stages 3 and 4
+        self._scans = Pipe(f"lidarpool-{run}-scans", queue_capacity, self.client)
+        self._news = Pipe(f"lidarpool-{run}-news", 64, self.client)  # from stages 3 and 4
         self.inbox: list[Message] = []  # what has come, for the driver to take
         self._outbox: dict[str, list[Order]] = {}  # by pipe
         self._looked_at = 0.0

@@ -83,7 +83,8 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
     try:
         name, actors, packed, backend = pickle.loads(plan)  # noqa: S301 - of the run's own driver
         survey: Survey = pickle.loads(packed)  # noqa: S301
-        _drop_unused(name)
+        now = time.monotonic()
+        drop([h for h, one in [*_kept.items()] if now - one.used_at > UNUSED_S and h != name])
         if (found := _kept.get(name)) is not None:
             rig = found.rig.with_survey(found.rig.scene.with_actors(actors), survey)
         elif scene is not None:
@@ -99,12 +100,6 @@ def _made(handle: str, plan: bytes | None, scene: bytes | None) -> _Kept:
     _kept[name] = _Kept(rig, name, time.monotonic())
     trace("intersect.built", run=handle, stage="intersect", scans=[])
     return _Kept(rig, name, time.monotonic())
-
-
-def _drop_unused(scene: str) -> None:
-    """Drop rigs and scenes that nobody has used for long, but for a scene."""
-    now = time.monotonic()
-    drop([h for h, one in [*_kept.items()] if now - one.used_at > UNUSED_S and h != scene])
 
 
 def drop(handles: Collection[str]) -> None:

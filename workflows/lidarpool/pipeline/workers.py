@@ -10,7 +10,7 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import cloudpickle
-from distributed import Client, Future
+from distributed import Future
 
 from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
@@ -54,14 +54,9 @@ class CastingWorkers:
     """
 
     def __init__(
-        self,
-        client: Client,
-        partition: Partition,
-        run: str,
-        backend: str,
-        software: Mapping[str, str],
+        self, partition: Partition, run: str, backend: str, software: Mapping[str, str]
     ) -> None:
-        self._client, self._partition, self.run = client, partition, run
+        self._client, self._partition, self.run = partition.client, partition, run
         self._backend, self._software = backend, dict(software)
         # {job: what its rig is made of: a plan, and the scene's still part, which others may share}
         self._jobs: dict[int, tuple[_Packed, _Packed]] = {}

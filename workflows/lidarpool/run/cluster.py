@@ -124,7 +124,7 @@ class Cluster:
 
     def tasks(self, name: str) -> Tasks[Any]:
         """Tasks for a partition, none yet."""
-        return Tasks(self.client, self.partitions[name], self.software["lidarpool"])
+        return Tasks(self.partitions[name], self.software["lidarpool"])
 
     def watch(self, names: Sequence[str], lasting: Sequence[str] = ()) -> Watch:
         """Watch workers of partitions from now on, see `Watch`."""

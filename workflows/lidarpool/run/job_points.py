@@ -36,8 +36,9 @@ class JobPoints:
     def __init__(self, store: RunStore, job: Job) -> None:
         self.job, self._store = job, store
         self.parts: JobParts = store.db.job(job.number, job.survey.scan_count)
-        self.parts.has_frames = isinstance(store.jobs, OneJob)  # whose frames are handed out
-        self.identified = False
+        only = isinstance(store.jobs, OneJob)
+        self.parts.has_frames = only
+        self.identified = only  # whether the database says what it is made of; of one job, the run
         self.sweeps: Sweeps | None = None  # of a job for a data set, once it was made
         self.resumed = self.parts.scans_done  # scans whose points are of an earlier run
 

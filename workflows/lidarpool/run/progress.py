@@ -157,10 +157,8 @@ class Screen:
         """Show the progress while the body runs; gives the function that does."""
         return bars_here() if self._on_progress is None else nullcontext(self._on_progress)
 
-    @contextmanager
     def starting(
         self, cluster: AbstractContextManager[Client], words: str, *, own: bool = False
-    ) -> Iterator[Client]:
+    ) -> AbstractContextManager[Client]:
         """Show that a cluster is being started; `own` if its workers share the terminal."""
-        with cluster as client:
-            yield client
+        return cluster

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 import uuid
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
@@ -37,7 +37,7 @@ from .progress import Progress, Show
 from .store import RunStore
 from .tasks import Tasks
 from .trials import TrialPump
-from .writer import JobFiles, JobWriter, Written
+from .writer import JobFiles, JobWriter
 
 PROGRESS_EVERY_S = 0.1
 SAVE_EVERY_S = 1.0  # stores the number of frames handed out
@@ -66,7 +66,6 @@ class Run:
         self._first, self._maker, self._on_frame = first, maker, on_frame
         options, run = cluster.options, uuid.uuid4().hex[:8]
         stages = LongStages(
-            cluster.client,
             cluster.partitions[LIDAR],
             run,
             cluster.software["lidarpool"],
@@ -76,9 +75,8 @@ class Run:
             collectors=options.collectors,
             patience_s=options.patience_s,
         )
-        workers = CastingWorkers(
-            cluster.client, cluster.partitions[GPU], run, cluster.backend, cluster.software
-        )
+        gpus = cluster.partitions[GPU]
+        workers = CastingWorkers(gpus, run, cluster.backend, cluster.software)
         self._driver = RunDriver(workers, stages, store.db, store.storage)
         self._writer: JobWriter | None = None
         if dataset is not None:
@@ -117,7 +115,9 @@ class Run:
             else:
                 self._writer.waiting.append(self._files_of(state))
         for_all: LidarpoolError | None = None
-        for files, made in self._written():
+        # A stage whose worker has died gets its slot first.
+        slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
+        for files, made in () if self._writer is None else self._writer.step(slots):
             moved = True
             if isinstance(made, JobError):
                 self._fail(files.row.number, made)
@@ -207,13 +207,6 @@ class Run:
             seconds=state.seconds,
         )
         return JobFiles(row, points.points(), sweeps, job.made_of)
-
-    def _written(self) -> Iterable[tuple[JobFiles, Written]]:
-        if self._writer is None:
-            return ()
-        # A stage whose worker has died comes first.
-        slots = 0 if self._driver.stages.lacks_slot else self._cluster.spare
-        return self._writer.step(slots)
 
     def _fail(self, number: int, error: LidarpoolError) -> None:
         """Note that a job has failed; if there is only one, so has the run."""

@@ -22,9 +22,9 @@ from ..columns.parts import mark_name, own_files, scans_of
 from ..export.jobs import JobRow
 from ..pipeline.database import (
     FILE,
+    PARTS_FOLDER,
     DamagedError,
     RunDatabase,
-    mark_of_folder,
     parts_folder,
     read_place,
 )
@@ -102,6 +102,7 @@ class RunStore:
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
         self._points: dict[int, JobPoints] = {}  # {number: of a job that is under way}
+        self.only: JobPoints | None = None  # of the only job, of a survey; None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
             self.db = self._open(parts, resume)
@@ -158,8 +159,7 @@ class RunStore:
         places = [self.place.below(PARTS)]
         if parts is not None:
             shared = Storage.at(parts)
-            names = [name for name in shared.entries() if mark_of_folder(name)]
-            places = [shared.below(name) for name in names]
+            places = [shared.below(one) for one in shared.entries() if PARTS_FOLDER.fullmatch(one)]
         for place in places:
             for name in place.sizes():
                 with suppress(ValueError, LookupError, TypeError, OSError):
@@ -178,7 +178,7 @@ class RunStore:
             if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if isinstance(self.jobs, OneJob):
-            self.points_of(self.jobs.only)
+            self.only = self._points[0] = JobPoints(self, self.jobs.only)
         if self.db.used:
             self._go_on(resume)
         if self._remote:
@@ -187,8 +187,8 @@ class RunStore:
             with storing(self.storage):
                 self.storage.prepare()
                 self._write_mark()
-        for points in self._points.values():
-            points.check(self._sizes, self._strays.pop(0, ()))
+        if self.only is not None:  # now that the run itself is known to be the same
+            self.only.check(self._sizes, self._strays.get(0, ()))
 
     def _write_mark(self) -> None:
         kept = ("mark", "identity", "parts", "backend", "casting")
@@ -252,11 +252,6 @@ class RunStore:
         return f"{self.db.ended_count:,} of {self.jobs.count:,} jobs" if self.db.used else ""
 
     @property
-    def only(self) -> JobPoints | None:
-        """What is kept of the only job, of a survey; None for a campaign."""
-        return self.points_of(self.jobs.only) if isinstance(self.jobs, OneJob) else None
-
-    @property
     def left(self) -> Iterator[int]:
         """Numbers of the jobs that have not ended."""
         return (number for number in range(self.jobs.count) if not self.db.ended(number))
@@ -289,8 +284,6 @@ class RunStore:
         if (found := self._points.get(job.number)) is not None:
             return found
         points = self._points[job.number] = JobPoints(self, job)
-        if isinstance(self.jobs, OneJob):
-            return points  # is checked once the run itself is known to be the same
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
             known = self.db.hash_of(job.number)
@@ -341,7 +334,7 @@ class RunStore:
         Where it is time or `now`, copy the database. LidarpoolError if that fails, or another run
         has taken over.
         """
-        for number, points in () if isinstance(self.jobs, OneJob) else self._points.items():
+        for number, points in self._points.items():
             if points.parts.scans_done and not points.complete and not points.identified:
                 points.identified = True
                 self.db.set_hash(number, _hash_of(points.job))

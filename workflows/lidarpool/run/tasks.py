@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Generic, TypeVar
 
-from distributed import Client, Future
+from distributed import Future
 
 from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
 
@@ -21,8 +21,8 @@ class Tasks(Generic[T]):
     Each returns its result and its record. `sources` is ``lidarpool`` of the run's `software`.
     """
 
-    def __init__(self, client: Client, partition: Partition, sources: str) -> None:
-        self._client, self.partition, self._sources = client, partition, sources
+    def __init__(self, partition: Partition, sources: str) -> None:
+        self._client, self.partition, self._sources = partition.client, partition, sources
         self.book = TaskBook()
         self.running: dict[Future, T] = {}  # {future: what it is for}
 
