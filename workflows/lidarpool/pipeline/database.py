@@ -216,7 +216,9 @@ class RunDatabase:
             rows, size, hits = counts
             job.enter(Receipt(number, first, stop, name, rows, size, hits, tuple(box), b""))
         query = "SELECT data FROM trials WHERE job = ? ORDER BY trial"
-        job.trials += [_trial_of(json.loads(data)) for (data,) in self._rows(query, number)]
+        for data in (json.loads(text) for (text,) in self._rows(query, number)):
+            waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
+            job.trials.append(Trial(waypoints=waypoints, **data))
         for (count,) in self._rows("SELECT count FROM frames WHERE job = ?", number):
             job.frames = job.frames_written = int(count)
 
@@ -413,11 +415,6 @@ class RunDatabase:
                 f"{self.path} cannot be written ({words}): make room on its disk, or give another "
                 "folder."
             ) from error
-
-
-def _trial_of(data: dict[str, Any]) -> Trial:
-    waypoints = np.array(data.pop("waypoints"), np.float64).reshape(-1, 2)
-    return Trial(waypoints=waypoints, **data)
 
 
 def parts_folder(mark: str) -> str:

@@ -49,12 +49,9 @@ class Dispatcher:
     @property
     def notes(self) -> list[str]:
         """Notes for the user."""
-        if not self._hidden:
-            return []
-        return [
-            f"{', '.join(sorted(self._hidden))} of partition {LIDAR} cannot see "
-            f"{self._storage.url}: the driver wrote their parts"
-        ]
+        workers = f"{', '.join(sorted(self._hidden))} of partition {LIDAR}"
+        note = f"{workers} cannot see {self._storage.url}: the driver wrote their parts"
+        return [note] if self._hidden else []
 
     def at(self, *places: Place) -> list[Batch]:
         """Batches in some states."""

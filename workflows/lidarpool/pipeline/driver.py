@@ -243,10 +243,8 @@ class RunDriver:
             left = self.later + sum(job.left for job in self.jobs.values())
             self.workers.want(self.dispatcher.slots_wanted(left))
             self.dispatcher.leave_workers(seen)
-            stalled = [
-                job for job in self.jobs.values() if time.monotonic() - job.sorted_at > STALL_S
-            ]
-            self._sort_again(stalled)
+            since = time.monotonic() - STALL_S
+            self._sort_again(job for job in self.jobs.values() if job.sorted_at < since)
         died, started = self.stages.look(self.progress)
         if died or started:
             self.dispatcher.leave_collectors(died, started)

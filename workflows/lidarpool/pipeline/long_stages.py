@@ -330,10 +330,9 @@ class LongStages:
     @property
     def ended(self) -> bool:
         """True once all stages have exited after `close`, or the shutdown timeout has elapsed."""
-        return self._closed_at is not None and self._have_ended(self._closed_at)
-
-    def _have_ended(self, since: float) -> bool:
-        late = time.monotonic() - since > LAST_WORDS_S
+        if self._closed_at is None:
+            return False
+        late = time.monotonic() - self._closed_at > LAST_WORDS_S
         return late or all(task.future.done() for task in self._tasks.values())
 
     def stop(self, reason: str) -> None:
@@ -349,8 +348,8 @@ class LongStages:
         """
         futures = [task.future for task in self._tasks.values()]
         try:
-            since = self._closed_at or time.monotonic()
-            while not self._have_ended(since):
+            self._closed_at = self._closed_at or time.monotonic()
+            while not self.ended:
                 time.sleep(0.01)
             ended = [future.key for future in futures if future.status == "finished"]
             found = fetch_available(self.client, ended)

@@ -149,8 +149,7 @@ class CastingWorkers:
         if worker in packed.there:
             return None
         packed.sent.add(worker)
-        data = packed.data
-        if isinstance(data, Future) and data.status in ("lost", "cancelled", "error"):
+        if isinstance(packed.data, Future) and packed.data.status in ("lost", "cancelled", "error"):
             packed.data = self._shared(packed.name, packed.pack())
         return packed.data
 

@@ -7,6 +7,7 @@ import os
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
+from operator import attrgetter
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 SAMPLE_RAYS = 400  # of the pictures
 CHECKERS = 4  # threads that check parts; each holds one in memory, twice
 NAMED = 3  # parts, scans or files that a message names
+_SAID = attrgetter("first", "stop", "rows")  # by a receipt, what the part must say as well
 
 
 class JobPoints:
@@ -82,10 +84,7 @@ class JobPoints:
         if sizes[part.name] != part.size:
             return "damaged"
         found = self._receipt(part.name)
-        as_said = found is not None and (found.first, found.stop, found.rows) == (
-            part.first, part.stop, part.rows,
-        )  # fmt: skip
-        return "" if as_said else "damaged"
+        return "" if found is not None and _SAID(found) == _SAID(part) else "damaged"
 
     def _receipt(self, name: str) -> Receipt | None:
         """Receipt of a part in storage; None if it is damaged."""

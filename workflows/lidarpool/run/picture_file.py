@@ -94,6 +94,8 @@ class Pictured:
         actors = tuple(_sampled(actor, survey.duration_ns, each) for actor in scene.actors)
         ways = sensor_ways(survey)
         drawn = Drawn.of(cut(scene), near=[way.positions for way in ways])
+        light = survey.carried[0].sensor.optics.wavelength_nm  # of the first sensor
+        materials = MaterialTable.of(survey.materials, scene.all_names, light, scene.has_voxels)
         pictured = cls(
             replace(drawn.scene, actors=actors),
             ways,
@@ -104,7 +106,7 @@ class Pictured:
             (),
             survey.duration_ns,
             [replace(c, source="") for c in survey.stored_columns if c.name not in TABLE],
-            reflectances_of(scene, survey),
+            materials.reflectance,
             survey.coordinates,
             scene.triangles,
         )
@@ -239,13 +241,6 @@ class Pictured:
         duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
         rest = arrays.get("reflectance"), names["coordinates"], names["triangles"]
         return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
-
-
-def reflectances_of(scene: Scene, survey: Survey) -> Floats:
-    """Share of light that each object reflects, at the wavelength of the first sensor."""
-    light = survey.carried[0].sensor.optics
-    names, voxels = scene.all_names, scene.has_voxels
-    return MaterialTable.of(survey.materials, names, light.wavelength_nm, voxels).reflectance
 
 
 def _colours(arrays: Mapping[str, Any], name: str) -> Colours | None:

@@ -35,7 +35,6 @@ from .jobs import JobMaker, Made, OneJob, failed_row
 from .page import JobNow, Page
 from .progress import Progress, Show
 from .store import RunStore
-from .tasks import Tasks
 from .trials import TrialPump
 from .writer import JobFiles, JobWriter
 
@@ -160,7 +159,9 @@ class Run:
     def _cast(self, job: Job, points: JobPoints) -> None:
         cluster, kept = self._cluster, self._writer is None
         if kept and job.planning is not None:
-            self._plan(job, points)
+            self._trials = TrialPump(cluster.tasks(OTHER), job.planning, points.parts.trials)
+            self._trials.step()  # first: no slot of OTHER waits for the survey
+            self._trials.tasks.partition.want(0)  # from now on its trials wait for workers
         # Of a campaign's job many follow, so that its batches need not be divided among all.
         left = self._store.jobs.count - self._store.db.ended_count
         self._driver.begin(
@@ -182,13 +183,6 @@ class Run:
         self._scans_begun += job.survey.scan_count
         to_come = max(0, left - len(self._made))
         self._driver.later = to_come * self._scans_begun // self._jobs_begun
-
-    def _plan(self, job: Job, points: JobPoints) -> None:
-        assert job.planning is not None
-        tasks: Tasks[int] = self._cluster.tasks(OTHER)
-        self._trials = TrialPump(tasks, job.planning, points.parts.trials)
-        self._trials.step()  # first: no slot of OTHER waits for the survey
-        tasks.partition.want(0)  # from now on its trials wait for workers
 
     def _files_of(self, state: JobState) -> JobFiles:
         """Return what a job that is committed is written from."""

@@ -56,8 +56,7 @@ def write_jobs(
     None in place of the rows if the worker does not see the data set, or the parts.
     """
     recorder = Recorder(EXPORT, LIDAR)
-    (place, *probe), (parts, *other) = probes
-    if not place.sees(*probe) or not parts.sees(*other):
+    if not all(place.sees(*probe) for place, *probe in probes):
         return None, recorder.done()
     written = [_written(dataset, job) for job in jobs]
     return written, recorder.done(sum(int(job.sweeps.scans[-1]) for job in jobs))
