@@ -17,13 +17,13 @@ from lidarpool import Scene, Sensor, Survey
 from lidarpool.base.storage import Storage
 from lidarpool.pipeline import (
     JobError,
-    RunDatabase,
     RunDriver,
     dispatch,
     driver,
     jobs,
     policies,
 )
+from lidarpool.pipeline.database import RunDatabase
 from lidarpool.pipeline.dispatch import PIECES
 from lidarpool.pipeline.driver import ANNOUNCED, STALL_S
 from lidarpool.pipeline.jobs import Outcome, Place

@@ -24,9 +24,9 @@ from lidarpool.pipeline import (
     CastingWorkers,
     LongStages,
     Receipt,
-    RunDatabase,
     RunDriver,
 )
+from lidarpool.pipeline.database import RunDatabase
 from lidarpool.scene.actors import box
 from poolpart import Partition, worker_identities
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import fields
 from pathlib import Path
 
 from distributed import Client
@@ -21,7 +20,7 @@ from ..run.conductor import Conductor, Kept
 from ..run.jobs import OneJob
 from ..run.options import RunOptions
 from ..run.progress import Progress, Screen
-from ..run.result import CampaignRun
+from ..run.result import CampaignRun, RunResult
 from ..run.store import RUN_FOLDER
 from ..scenario import campaign as described
 from ..scenario.build import Job
@@ -150,7 +149,7 @@ def simulate(
         check_backend_here(backend)
     with page_of(jobs, live) as page:
         result = Conductor(jobs, options, Kept(), Screen(on_progress), page, on_frame)()
-    return Result(**{field.name: getattr(result, field.name) for field in fields(result)})
+    return Result(**declared(result, RunResult))
 
 
 class Campaign(described.Campaign):  # noqa: D101 - as there

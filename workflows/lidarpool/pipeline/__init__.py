@@ -1,6 +1,5 @@
 """The survey pipeline: four stages on the partitions of a cluster, and their driver."""
 
-from .database import RunDatabase
 from .driver import RunDriver
 from .failures import JobError
 from .jobs import JobState
@@ -24,6 +23,5 @@ __all__ = [
     "JobState",
     "LongStages",
     "Receipt",
-    "RunDatabase",
     "RunDriver",
 ]

@@ -56,12 +56,12 @@ def was_killed(future: Future) -> bool:
     return isinstance(error_of(future), (KilledWorker, WorkerLeft))
 
 
-def raise_if_failed(future: Future, what: str) -> None:
-    """Raise LidarpoolError if a task has failed or was cancelled from outside."""
+def raise_if_failed(future: Future, what: str, kind: type[LidarpoolError] = LidarpoolError) -> None:
+    """Raise an error of a `kind` if a task has failed, LidarpoolError if others cancelled it."""
     if (error := error_of(future)) is not None:
         error.__traceback__ = future.traceback(timeout=ASK_S)
         words = str(error) or type(error).__name__  # some of Dask's have no message
-        raise LidarpoolError(f"{what} failed: {words}") from error
+        raise kind(f"{what} failed: {words}") from error
     if future.status == "cancelled":  # "lost" passes: a worker died and the task runs again
         raise LidarpoolError(f"{what} was cancelled from outside this run.")
 

@@ -199,12 +199,7 @@ class CastingWorkers:
         if status == "error" and len(jobs) > 1:
             return Outcome.DIVIDE
         what = PREPARING if isinstance(error, RigFailed) else f"stage {INTERSECT}"
-        try:  # the error names the scans
-            raise_if_failed(future, what)
-        except LidarpoolError as told:
-            if future.status != "error":  # cancelled, and so are those of the others
-                raise
-            raise JobError(str(told)) from told.__cause__
+        raise_if_failed(future, what, JobError)  # whose words name the scans
         return Outcome.PENDING
 
     def forget(self, key: str) -> None:
