@@ -82,8 +82,7 @@ class Conductor(Generic[R]):
         self.store: RunStore
         self.cluster: Cluster | None = None  # stays None if nothing is left to be cast
         self.run: Run | None = None
-        self._first: Made | None = None  # job, of which slots and scans are wanted
-        self._maker: JobMaker | None = None  # of the others
+        self._maker: JobMaker | None = None  # of all jobs but the first
 
     def __call__(self) -> R:
         """Do it."""
@@ -92,9 +91,8 @@ class Conductor(Generic[R]):
             if (result := self.output.begin(self)) is not None:
                 return result
             self._open_store()
-            self._make_first_job()
-            self._reach_cluster()
-            self._cast_what_is_left()
+            if (first := self._first_job()) is not None:
+                self._cast(first)
             return self.output.finish(self)
 
     @property
@@ -131,35 +129,31 @@ class Conductor(Generic[R]):
         self.output.look(self)
         self.stack.enter_context(self.cluster_stack)
 
-    def _make_first_job(self) -> None:
-        """Wait for a job that can be made."""
+    def _first_job(self) -> Made | None:
+        """Wait for a job that can be made; None if nothing is left to be cast."""
         if (only := self.store.only) is not None:
-            self._first = None if only.complete else Made(only.job)
-        if isinstance(self.jobs, OneJob) or self.output.dataset is None:
-            return
-        self._maker = JobMaker(self.jobs, self.store.left, self.output.dataset.columns)
+            return None if only.complete else Made(only.job)
+        jobs, dataset, db = self.jobs, self.output.dataset, self.store.db
+        assert not isinstance(jobs, OneJob) and dataset is not None, "it is a campaign"
+        left = (number for number in range(jobs.count) if not db.ended(number))
+        self._maker = JobMaker(jobs, left, dataset.columns)
         self.stack.callback(self._maker.close)
         while isinstance(found := self._maker.take(wait=True), JobRow):
             self.store.end([found])
             self.page.ended(found)
-        self._first = found
+        return found
 
-    def _reach_cluster(self) -> None:
-        if self._first is None:
-            return
-        if self.options.own:
-            check_backend_here(self.store.backend or self.options.backend, self.store.advice)
-        job, enter = self._first.job, self.cluster_stack.enter_context
-        self.cluster = Cluster(job, self.store, self.options, self.screen, enter)
+    def _cast(self, first: Made) -> None:
+        """Cast what is left, on a cluster with the slots that the first job needs."""
+        store, options, enter = self.store, self.options, self.cluster_stack.enter_context
+        if options.own:
+            check_backend_here(store.backend or options.backend, store.advice)
+        self.cluster = Cluster(first.job, store, options, self.screen, enter)
         self.page.follow(self.cluster.partitions)
-
-    def _cast_what_is_left(self) -> None:
-        if self.cluster is None or self._first is None:
-            return
-        jobs, dataset = (self._first, self._maker), self.output.dataset
-        self.run = Run(self.cluster, self.store, self.page, *jobs, dataset, self._frame)
+        dataset = self.output.dataset
+        self.run = Run(self.cluster, store, self.page, self._maker, dataset, self._frame)
         with self.screen.progress() as show:
-            self.run.cast(show)
+            self.run.cast(first, show)
 
     def _frame(self, frame: Frame) -> None:
         self.page.on_frame(frame)

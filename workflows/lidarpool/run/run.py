@@ -45,7 +45,7 @@ SPARE = 32  # jobs under way beside two for each GPU slot
 
 
 class Run:
-    """The jobs that are left of a run, on a cluster: the `first`, and those of `maker`.
+    """The jobs that are left of a run, on a cluster: the first one, and those of `maker`.
 
     They are written into a `dataset`; without one there is only one job, whose parts are kept, and
     whose frames `on_frame` is called with.
@@ -56,13 +56,12 @@ class Run:
         cluster: Cluster,
         store: RunStore,
         page: Page,
-        first: Made,
         maker: JobMaker | None,
         dataset: DataSet | None,
         on_frame: Callable[[Frame], None],
     ) -> None:
         self._cluster, self._store, self._page = cluster, store, page
-        self._first, self._maker, self._on_frame = first, maker, on_frame
+        self._maker, self._on_frame = maker, on_frame
         options, run = cluster.options, uuid.uuid4().hex[:8]
         stages = LongStages(
             cluster.partitions[LIDAR],
@@ -255,13 +254,13 @@ class Run:
 
     # -- to the end --------------------------------------------------------------------------
 
-    def cast(self, show: Show) -> None:
+    def cast(self, first: Made, show: Show) -> None:
         """Do all jobs; on any error, everything has been stopped."""
         cluster, driver = self._cluster, self._driver
         try:
             with cluster.partitions_page(), cluster.stopping(self._stop):
                 driver.open()
-                self._loop(show)
+                self._loop(first, show)
                 stages = TaskBook()
                 for record in driver.finish():
                     stages.add(record)
@@ -280,10 +279,10 @@ class Run:
             place = self._writer.dataset.place
             self.notes.append(f"no worker of {LIDAR} sees {place}: the driver wrote the data set")
 
-    def _loop(self, show: Show) -> None:
+    def _loop(self, first: Made, show: Show) -> None:
         """Step everything until all have finished."""
         driver, started, pause_s = self._driver, time.monotonic(), 0.0
-        self._begin(self._first)  # and its trials
+        self._begin(first)  # and its trials
         watch = self._cluster.watch([GPU, OTHER] if self._trials else [GPU], lasting=[LIDAR])
         told = saved = float("-inf")
         beside = [one.tasks for one in (self._writer, self._trials) if one is not None]

@@ -252,11 +252,6 @@ class RunStore:
         return f"{self.db.ended_count:,} of {self.jobs.count:,} jobs" if self.db.used else ""
 
     @property
-    def left(self) -> Iterator[int]:
-        """Numbers of the jobs that have not ended."""
-        return (number for number in range(self.jobs.count) if not self.db.ended(number))
-
-    @property
     def advice(self) -> str:
         """Advice if the backend is not available, for the end of a message."""
         if not self.kept:
