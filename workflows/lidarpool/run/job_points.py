@@ -40,7 +40,7 @@ class JobPoints:
         self.parts: JobParts = store.db.job(job.number, job.survey.scan_count)
         only = isinstance(store.jobs, OneJob)
         self.parts.has_frames = only
-        self.identified = only  # whether the database says what it is made of; of one job, the run
+        self.identified = only  # whether it is kept what the job is made of
         self.sweeps: Sweeps | None = None  # of a job for a data set, once it was made
         self.resumed = self.parts.scans_done  # scans whose points are of an earlier run
 
