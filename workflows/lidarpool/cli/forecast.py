@@ -411,8 +411,9 @@ def _worker_bytes(job: Job) -> int:
         patterns += RAY_BYTES * rays * (1 + own_starts)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
     images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
+    copies = COPY_BYTES * len(job.scene.instances or ())
     coloured = COLOURED_BYTES * sum(map(len, job.scene.coloured)) + 4 * sum(images.values())
-    return PROCESS_BYTES + triangles + coloured + COPY_BYTES * _copies(job.scene) + patterns
+    return PROCESS_BYTES + triangles + coloured + copies + patterns
 
 
 def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
@@ -424,13 +425,9 @@ def _rest_bytes(job: Job, points: int, slots: dict[str, dict[str, int]]) -> int:
     shown = scene.kept_triangles + DRAWN_TRIANGLES
     if not scene.masked:  # which is cut into more
         shown = min(scene.triangles, shown)
-    driver = 2 * SCENE_BYTES * shown + COPY_BYTES * _copies(scene) + piece
+    driver = 2 * SCENE_BYTES * shown + COPY_BYTES * len(scene.instances or ()) + piece
     driver += SCAN_BYTES * job.survey.scan_count
     return planning * slots.get(OTHER, {"there": 0})["there"] + driver + 2 * PROCESS_BYTES
-
-
-def _copies(scene: Scene) -> int:
-    return len(scene.instances) if scene.instances else 0
 
 
 def _point_bytes(job: Job) -> int:
@@ -481,7 +478,9 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
     if "job" in found:
         yield f"job         {_in_words(found['job'])}"
     turn = f"{sensor.channels:,} a firing"
-    if sensor.period is not None and sensor.cycle != "frame":
+    if len(job.survey.carried) > 1:
+        turn = f"{len(job.survey.carried)} sensors"
+    elif sensor.period is not None and sensor.cycle != "frame":
         turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
     yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
     for file, taken in found["sources"].items():
@@ -490,13 +489,11 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
     spans = ", ".join(f"{axis} {low:,.2f} to {high:,.2f}" for axis, low, high in sides)
     yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
     if masked := found["masked"]:
-        have = "object has masks" if len(masked) == 1 else "objects have masks"
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
-        yield f"masks       {len(masked):,} {have}: {shown}"
+        have = counted(len(masked), "object has masks", "objects have masks")
+        yield f"masks       {have}: {shown}"
     drive = found["drive"]
     where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
-    several = len(job.survey.carried) > 1
-    turn = f"{len(job.survey.carried)} sensors" if several else turn
     yield f"survey      {counted(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
     if drive:
         yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"

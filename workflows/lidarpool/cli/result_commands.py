@@ -48,13 +48,7 @@ def _size(text: str) -> tuple[int, int]:
     show_default=True,
     help="Column to colour the points of the cloud by; rgb for red, green and blue.",
 )
-def plot(
-    result: Path | Storage,
-    only: tuple[str, ...],
-    size: tuple[int, int],
-    out: Path | Storage | None,
-    colour: str,
-) -> None:
+def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> None:
     """Draw the pictures of a result again.
 
     \b
@@ -77,7 +71,7 @@ def plot(
         keep_freed_memory()
         shown, cloud = Pictured.load(made / PICTURE_FILE), made / "cloud.ply"
         with local_folder(place) as folder:
-            for path in draw_pictures(shown, cloud, folder, only, size, colour):
+            for path in draw_pictures(shown, cloud, folder, **given):
                 click.echo(click.format_filename(send(path, place)))
 
 

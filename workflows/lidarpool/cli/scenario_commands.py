@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import click
 
 from ..base.errors import LidarpoolError
-from ..base.storage import Storage
 from ..base.vocabulary import UNITS_M
 from ..base.words import counted
 from . import options
@@ -169,14 +168,12 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.as_json
 def check(
     scenario: Path,
-    out: Path | Storage,
     scheduler: str | None,
     files: TlsFiles,
     cluster: Path | None,
-    backend: str | None,
-    no_plan: bool,
     number: int | None,
     as_json: bool,
+    **given: Any,
 ) -> None:
     """Show what a run would do and need.
 
@@ -199,10 +196,7 @@ def check(
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
-            found, lines = look_at(
-                scenario, number, client, no_plan=no_plan, quiet=as_json,
-                backend=backend, out=out, cluster=file,
-            )  # fmt: skip
+            found, lines = look_at(scenario, number, client, quiet=as_json, cluster=file, **given)
     except LidarpoolError as error:
         if as_json:
             options.show({"can_run": False, "reasons": [str(error)], "notes": []}, (), True)
@@ -212,11 +206,11 @@ def check(
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        given: dict[str, Any] = {"out": out, "scheduler": scheduler, "cluster": cluster}
-        for name, value in (given | {"backend": backend, "job": number}).items():
-            wanted = value is not None and str(value) != "lidarpool-out"
-            words += [f"--{name}", str(value)] if wanted else []
-        click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
+        given |= {"scheduler": scheduler, "cluster": cluster, "job": number}
+        for name in ("out", "scheduler", "cluster", "backend", "job"):
+            wanted = given[name] is not None and str(given[name]) != "lidarpool-out"
+            words += [f"--{name}", str(given[name])] if wanted else []
+        click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * given['no_plan']])}")
 
 
 @click.command()
@@ -443,14 +437,19 @@ def _share(text: str) -> float:
     help="Choose until this share of what can be seen is covered, such as 95%; without --count "
     "and --coverage, for as long as each station adds 1%.",
 )
-@click.option("--height", default=1.7, metavar="M", help="Of the instrument above the floor.")
+@click.option(
+    "--height", "height_m", default=1.7, metavar="M", help="Of the instrument above the floor."
+)
 @click.option(
     "--spacing",
+    "spacing_m",
     type=float,
     metavar="M",
     help="Between the places that are tried.  [default: for about 600 places]",
 )
-@click.option("--slant", default=80.0, metavar="DEG", help="Largest angle of incidence.")
+@click.option(
+    "--slant", "slant_deg", default=80.0, metavar="DEG", help="Largest angle of incidence."
+)
 @click.option(
     "--out",
     type=click.Path(path_type=Path, file_okay=False),
@@ -460,16 +459,7 @@ def _share(text: str) -> float:
 @overwrite
 @options.as_json
 def stations(
-    scene: Path,
-    model: str,
-    count: int | None,
-    coverage: float | None,
-    height: float,
-    spacing: float | None,
-    slant: float,
-    out: Path | None,
-    overwrite: bool,
-    as_json: bool,
+    scene: Path, model: str, out: Path | None, overwrite: bool, as_json: bool, **given: Any
 ) -> None:
     """Choose stations for a terrestrial scan.
 
@@ -482,6 +472,7 @@ def stations(
       lidarpool stations hall.glb --sensor riegl-vz400 --coverage 95%
       lidarpool stations hall/scenario.yaml --sensor riegl-vz400 --count 6 --out hall/stations
     """  # noqa: D301 - click wants the character, not its name
+    count, coverage = given["count"], given["coverage"]
     if count is not None and coverage is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     from ..plan.stations import STATIONS_MOST, plan_stations
@@ -502,10 +493,7 @@ def stations(
     with terminal.status("reading the scene", logged=False):
         built = build(read, plans=False)
     with terminal.status("looking from all places", logged=False):
-        plan = plan_stations(
-            built.scene, sensor, count=count, coverage=coverage,
-            height_m=height, spacing_m=spacing, slant_deg=slant,
-        )  # fmt: skip
+        plan = plan_stations(built.scene, sensor, **given)
     with terminal.status("drawing the picture", logged=False):
         page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import AbstractContextManager, ExitStack, contextmanager
+from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -49,12 +49,10 @@ class Terminal(Screen):
     @contextmanager
     def status(self, words: str, *, logged: bool = True) -> Iterator[None]:
         """Show what is going on while the body runs; in a log, too, if it is `logged`."""
-        if (console := self._console) is not None:
-            with console.status(words):
-                yield
-        else:
-            if logged and self._stream:
-                _tell(self._stream, words)
+        console = self._console
+        if logged and console is None and self._stream:
+            _tell(self._stream, words)
+        with nullcontext() if console is None else console.status(words):
             yield
 
     @contextmanager
