@@ -95,8 +95,8 @@ class Campaign:
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
     ) -> None:
-        given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
-        self._begin(_Made(make, count, seed), _head(**given))
+        head = _head(keep=keep, splits=splits, seed=seed, license=license, title=title)
+        self._begin(_Made(make, count, seed), head)
 
     def _begin(self, jobs: _Jobs, head: CampaignSection) -> None:
         self.seed, self.keep, self.splits = head.seed, head.keep, head.splits
@@ -143,13 +143,10 @@ class Campaign:
         LidarpoolError
             If one of them cannot be used; or an argument cannot be meant.
         """
-        jobs = _Given([Path(path) for path in paths])
-        given = {"keep": keep, "splits": splits, "seed": seed, "license": license, "title": title}
-        self = cls.__new__(cls)
-        self._begin(jobs, _head(**given))
-        self.command = " ".join(Path(path).name for path in jobs.paths[:SHOWN_MOST])
-        if len(jobs.paths) > SHOWN_MOST:
-            self.command += " …"
+        jobs, self = _Given([Path(path) for path in paths]), cls.__new__(cls)
+        self._begin(jobs, _head(keep=keep, splits=splits, seed=seed, license=license, title=title))
+        self.command = " ".join(path.name for path in jobs.paths[:SHOWN_MOST])
+        self.command += " …" * (jobs.count > SHOWN_MOST)
         return self
 
     @property
@@ -246,11 +243,9 @@ def is_campaign(path: str | Path) -> bool:
 
 def _head(**given: Any) -> CampaignSection:
     """Check the fields that Python gives."""
-    keep = given.pop("keep")
-    keep = dict(keep) if isinstance(keep, Mapping) else keep
+    plain = {name: dict(v) if isinstance(v, Mapping) else v for name, v in given.items()}
     with sentences(CampaignSection):
-        data = {"base": "-", **given, "keep": keep, "splits": dict(given["splits"])}
-        return CampaignSection.model_validate(data)
+        return CampaignSection.model_validate({"base": "-", **plain})
 
 
 class _Jobs:
@@ -555,17 +550,18 @@ class _Base:
         """Return the scenario with other values, and with a seed of its noise if it has none."""
 
         def changed(text: str, there: Any) -> Any:
+            if text not in changes:  # the seed
+                return there or noise_seed
             added = self._vary[text].sample is not None
             return [*(there or ()), *changes[text]] if added else changes[text]
 
-        ways: list[tuple[Steps, Callable[[Any], Any]]]
-        ways = [(self._steps[text], partial(changed, text)) for text in changes]
-        if noise_seed and _NOISE not in changes:
-            ways.append((self._noise, lambda seed: seed or noise_seed))
+        ways = {text: self._steps[text] for text in changes}
+        if noise_seed:
+            ways.setdefault(_NOISE, self._noise)
         made: Any = self.scenario
-        for steps, change in ways:
-            made = put(made, steps, change)
-        sections = {str(name): made[name] for ((name, _), *_), _ in ways}
+        for text, steps in ways.items():
+            made = put(made, steps, partial(changed, text))
+        sections = {str(name): made[name] for (name, _), *_ in ways.values()}
         return self.scenario.with_sections(sections, source=source)
 
 
@@ -637,8 +633,8 @@ def find_field(scenario: Scenario, text: str) -> tuple[Steps, Any]:
             key, used = _named(list(node), rest, at)
             node = node[key]
         elif isinstance(node, (tuple, list)):
-            number, used = _entry(node, rest, at)
-            key, node = number, node[number]
+            key, used = _entry(node, rest, at)
+            node = node[key]
         else:
             what = f"the base has no {at}" if node is None else f"{at} has no fields of its own"
             raise LidarpoolError(f"{text} leads to no field: {what}.")

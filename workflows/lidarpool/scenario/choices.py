@@ -7,6 +7,7 @@ import hashlib
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from decimal import Context, Decimal
 from fractions import Fraction
@@ -28,7 +29,6 @@ from pydantic import (
     model_validator,
 )
 
-from ..base.allowance import check_fits
 from ..base.declared import (
     Seed,
     Several,
@@ -47,7 +47,7 @@ from ..base.validation import checked_fields, sections_in, sentences
 from ..base.yamlfile import load_yaml
 from ..export.jobs import Value
 from ..export.table import FORMATS, LAYOUTS
-from ..sensor.calibrations import said
+from ..sensor.calibrations import said, text_of
 from .sections import Section, may_be_empty
 
 SIGMAS = 6.0  # normal numbers are drawn again beyond, one of 500 million
@@ -510,8 +510,7 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
     if entry is None:
         raise LidarpoolError("sample adds entries to a list, such as actors, and this is none.")
     try:
-        check_fits(path)
-        lines = path.read_text("utf-8-sig").splitlines()
+        lines = text_of(path).splitlines()
         first = next((line for line in lines if line.strip() and line.lstrip()[0] != "#"), "")
         mark = max(_MARKS, key=first.count)
         reader = csv.reader(lines, delimiter=mark)
@@ -551,12 +550,9 @@ def _checked(adapter: TypeAdapter[Any], cells: dict[str, str]) -> Any:
         # A field that takes text may have a number: the name of a car is 7.
         wrong = {".".join(map(str, detail["loc"])) for detail in error.errors()}
         text = {name: cells[name] for name in wrong & values.keys()}
-        if not text:
-            raise
-        try:
+        with suppress(ValidationError):
             return adapter.validate_python(_nested(values | text))
-        except ValidationError:
-            raise error from None
+        raise
 
 
 def _value(cell: str) -> Any:
@@ -565,14 +561,10 @@ def _value(cell: str) -> Any:
     if _REAL.fullmatch(cell):
         return float(cell)
     if cell[0] in "[{":
-        try:
+        with suppress(ValueError):
             return json.loads(cell)  # a hundred times as fast, where it will do
-        except ValueError:
-            pass
-        try:
+        with suppress(yaml.YAMLError, ValueError, OverflowError, RecursionError):
             return load_yaml(cell)
-        except (yaml.YAMLError, ValueError, OverflowError, RecursionError):
-            return cell
     return _WORDS.get(cell.lower(), cell)
 
 

@@ -166,11 +166,8 @@ class TrajectorySection(Section):
         if self.file is not None:
             track = load_trajectory(
                 path(self.file),
-                format=self.format,
                 times=None if self.times is None else path(self.times),
-                columns=self.columns,
-                camera_axes=self.camera_axes,
-                offset_s=self.offset_s,
+                **self.model_dump(include={"format", "columns", "camera_axes", "offset_s"}),
                 **own,
             )
             return replace(track, positions=track.positions - origin)

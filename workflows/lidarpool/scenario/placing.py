@@ -15,7 +15,7 @@ from ..base.words import counted
 from ..scene.drawn import Drawn
 from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
-from ..scene.surroundings import Surroundings, Views, in_the_way, is_open
+from ..scene.surroundings import Surroundings, in_the_way, is_open
 from ..sensor import Mounted, Pose
 
 # Heights above a floor; and the least distance from the ceiling.
@@ -62,9 +62,7 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
     if looker is None or not looker.is_object(looker.views(_local(standing, scene))):
         if in_the_way(drawn, _local(standing, scene)):
             standing = _aside(drawn, middle) or standing
-        if looker is None:
-            return Placing(standing)
-        return Placing(standing, _inside(looker.views(_local(standing, scene)), scene, carried))
+        return Placing(standing, _inside(looker, _local(standing, scene), scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
     sides = " x ".join(f"{side:,.3g}" for side in high - low)
@@ -112,12 +110,13 @@ def _local(poses: Sequence[Pose], scene: Scene) -> Floats:
 
 def inside_note(scene: Scene, positions: ArrayLike, carried: Mounted) -> str:
     """Say that local positions (k, 3) are inside a closed body; else empty."""
-    looker = _looker(_simple(scene, positions))
-    return "" if looker is None else _inside(looker.views(positions), scene, carried)
+    return _inside(_looker(_simple(scene, positions)), positions, scene, carried)
 
 
-def _inside(seen: Views, scene: Scene, carried: Mounted) -> str:
-    if not seen.in_a_body:
+def _inside(
+    looker: Surroundings | None, positions: ArrayLike, scene: Scene, carried: Mounted
+) -> str:
+    if looker is None or not looker.views(positions).in_a_body:
         return ""
     return (
         "the sensor is inside a closed body, and hits only the backs of its surfaces; "

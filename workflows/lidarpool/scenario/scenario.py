@@ -195,8 +195,9 @@ class Scenario(Section):
             try:
                 made = Scenario.model_validate(data)
             except ValidationError as error:
-                told = validation_errors(error, Scenario)
-                mistakes.lines += [f"{source}: {line}" for line in told]
+                mistakes.lines += [
+                    f"{source}: {line}" for line in validation_errors(error, Scenario)
+                ]
                 # Validate again without the wrong sections, to find further errors.
                 wrong = {str(detail["loc"][0]) for detail in error.errors() if detail["loc"]}
                 if not wrong:

@@ -358,9 +358,9 @@ class SensorSection(Section):
     def _one_source(self) -> SensorSection:
         own = [name for name in ("model", "calibration") if getattr(self, name) is not None]
         # Defaults are allowed, because `lidarpool init` writes them.
-        grid = ["rays_per_revolution", "layers", "vertical_fov_deg"]
         known = SensorSection.model_fields
-        grid = [name for name in grid if getattr(self, name) != known[name].default]
+        names = ("rays_per_revolution", "layers", "vertical_fov_deg")
+        grid = [name for name in names if getattr(self, name) != known[name].default]
         if own and grid:
             raise ValueError(f"a {own[0]} defines the beams: leave out {grid[0]}.")
         if self.performance == "datasheet" and self.model is None:
@@ -383,11 +383,8 @@ class SensorSection(Section):
 
         Equal sections have the same one, unless their files have changed.
         """
-        limits = {
-            name: value
-            for name in ("rate_hz", "min_range_m", "max_range_m")
-            if (value := getattr(self, name)) is not None
-        }
+        own = {"rate_hz", "min_range_m", "max_range_m"}
+        limits = self.model_dump(include=own, exclude_none=True)
         if self.model is None and self.calibration is None:
             azimuths = self.columns or self.rays_per_revolution
             return _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
@@ -415,11 +412,9 @@ class SensorSection(Section):
         if self.performance == "ideal" or model is None:
             return carried
         sheet = datasheet(model)
-        own: dict[str, Any] = {"noise": sheet.noise, "returns": sheet.returns}
-        for part, section in {"noise": noise, "returns": returns}.items():
-            given = {field: getattr(section, field) for field in section.model_fields_set}
-            own[part] = replace(own[part], **given)
-        return replace(carried, **own)
+        own_noise = replace(sheet.noise, **noise.model_dump(exclude_unset=True))
+        own_returns = replace(sheet.returns, **returns.model_dump(exclude_unset=True))
+        return replace(carried, noise=own_noise, returns=own_returns)
 
 
 def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:

@@ -40,12 +40,9 @@ class Standing:
 
     def only(self, names: Sequence[str]) -> Standing:
         """Return the same of some objects; LidarpoolError if there is nothing to stand on."""
-        if (key := tuple(names)) not in self._parts:
-            self._parts[key] = self._of(key)
-        return self._parts[key]
-
-    def _of(self, names: tuple[str, ...]) -> Standing:
-        scene = self._scene
+        key, scene = tuple(names), self._scene
+        if key in self._parts:
+            return self._parts[key]
         if scene is None:
             raise LidarpoolError(
                 "there is nothing to stand on: add scene.files, or scene.ground and a rectangle "
@@ -62,6 +59,7 @@ class Standing:
         made = self if len(found) == len(scene.names) else Standing(scene, found)
         if not len(made._tops[0]):
             raise LidarpoolError(f"nothing of {', '.join(map(repr, names))} faces up.")
+        self._parts[key] = made
         return made
 
     @cached_property

@@ -10,7 +10,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.words import counted
@@ -21,7 +20,7 @@ from ..scene.meshfile import Objects, load_objects
 from ..scene.nodes import Raster
 from ..scene.scene import Scene
 from ..scene.shapes import seed_objects
-from ..sensor.calibrations import said
+from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
 from .scenario import Scenario
@@ -29,6 +28,7 @@ from .sections import (
     COPIES_MOST,
     CopiesSection,
     MeshFile,
+    PathOf,
     Scatter,
     SceneSection,
     ShapeSection,
@@ -143,13 +143,9 @@ class Shapes:
             assets = None if entry.assets is None else scenario.path(entry.assets)
         return load_objects(
             path,
-            unit=entry.unit,
-            up_axis=entry.up_axis,
+            **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window"}),
             transform=transform,
-            opacity=entry.opacity,
             colours=scenario.coloured,
-            step_m=entry.step_m,
-            window=entry.window,
             epsg=scenario.cloud.epsg,
             assets=assets,
             tell=found.notes.append,
@@ -172,8 +168,7 @@ def _copies(shapes: Shapes, base: list[Mesh | Instance]) -> list[Instance]:
         with mistakes.noted():
             mesh = shapes.of(entry)
             with prefixed(f"{scenario.source}: scene.copies[{number}]"):
-                table = scenario.path(entry.table.file) if entry.table else None
-                made = copies_of(entry, mesh, standing, table)
+                made = copies_of(entry, mesh, standing, scenario.path)
             if entry.file is not None:
                 words = f", {counted(len(made), 'copy', 'copies')}"
                 shapes.found.sources[entry.file.file] += words
@@ -213,10 +208,8 @@ _PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
 
 
-def copies_of(
-    entry: CopiesSection, mesh: Mesh, standing: Standing, table: Path | None
-) -> list[Instance]:
-    """Place the copies of an entry; `table` is where its table is.
+def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, path: PathOf) -> list[Instance]:
+    """Place the copies of an entry; `path` returns that of its table.
 
     Raises
     ------
@@ -226,8 +219,8 @@ def copies_of(
     if entry.scatter is not None:
         places, angles, scales = _scattered(entry.scatter, entry.name, standing)
     else:
-        if entry.table is not None and table is not None:
-            places, angles, scales = _of_table(table, entry.table.columns)
+        if entry.table is not None:
+            places, angles, scales = _of_table(path(entry.table.file), entry.table.columns)
         else:
             places = np.array([(*one.position, np.nan)[:3] for one in entry.at])
             angles = np.array([[getattr(one, name) for name in _ANGLES] for one in entry.at])
@@ -255,10 +248,7 @@ def copies_of(
 def _of_table(path: Path, columns: dict[str, str]) -> tuple[Floats, Floats, Floats]:
     """Places, z nan if there is none, angles in degrees, and scales of a table: (n, 3) each."""
     try:
-        check_fits(path)
-        text = path.read_text("utf-8-sig")
-        if not text.strip():
-            raise ValueError("it is empty")
+        text = text_of(path)
         short = [name.removesuffix("_deg") for name in _ANGLES]  # as people write them
         known = (*_PLACE, *_ANGLES, "scale", *_SCALES, *short)
         at = columns_of_table(text, columns, known, lambda found: ("x", "y"))
