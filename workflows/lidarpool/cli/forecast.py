@@ -17,7 +17,7 @@ from dask.utils import format_bytes
 from distributed import Client
 from distributed.system import MEMORY_LIMIT
 
-from poolpart import Pool, PoolError
+from poolpart import Pool
 from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
@@ -176,10 +176,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
         held = [worker.resources for worker in Pool.from_client(client)]
         there = {name: int(sum(slots.get(name, 0) for slots in held)) for name in required}
         with mistakes.noted():
-            try:
-                everybody, casting, backend, _ = find_workers(client, required, options.backend)
-            except PoolError as error:
-                raise LidarpoolError(str(error)) from error
+            everybody, casting, backend, _ = find_workers(client, required, options.backend)
             check_workers(job, options, backend, casting)
             memory = min((worker.memory for worker in casting if worker.memory), default=0)
             notes += filter(None, [gpu_note(everybody, casting, backend)])
@@ -390,12 +387,10 @@ def _look_at_folder(out: Path | Storage) -> list[str]:
     """Return notes on the place of the result; LidarpoolError if it cannot be written there."""
     if isinstance(out, Storage):
         out.claim()  # leaves nothing
-    else:
-        there = _existing(out)
-        if not there.is_dir():
-            raise LidarpoolError(f"{there} is a file: give a folder for the results with --out.")
-        if not os.access(there, os.W_OK | os.X_OK):
-            raise LidarpoolError(f"Cannot write to the folder {there}: give another with --out.")
+    elif not (there := _existing(out)).is_dir():
+        raise LidarpoolError(f"{there} is a file: give a folder for the results with --out.")
+    elif not os.access(there, os.W_OK | os.X_OK):
+        raise LidarpoolError(f"Cannot write to the folder {there}: give another with --out.")
     unfinished = FILE in Storage.at(out).below(RUN_FOLDER).sizes()
     note = f"{out} holds an unfinished run: --resume continues it, --fresh deletes it"
     return [note] if unfinished else []

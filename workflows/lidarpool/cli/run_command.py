@@ -30,7 +30,7 @@ from ..report.report import summary
 from ..run.conductor import Conductor
 from ..run.jobs import OneJob
 from ..run.options import RunOptions
-from ..run.result import CampaignRun, RunResult
+from ..run.result import RunResult
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
@@ -99,7 +99,17 @@ def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **
     with page_of(campaign, options.live) as page:
         output = DataSetOutput(options.out, campaign)
         run = Conductor(campaign, options, output, terminal, page)()
-        _tell_campaign(options.out, run, as_json=terminal.as_json)
+        names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
+        told = {"folder": str(options.out), "jobs": run.done}
+        told |= {"failed": [row.name for row in run.failed]}
+        told |= {name: getattr(run, name) for name in names}
+        lines = [
+            *(f"note: {note}" for note in run.notes),
+            f"{counted(run.done, 'job')}, {counted(run.rays, 'ray')}, "
+            f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
+            f"data set in {click.format_filename(str(options.out))}: see README.md there",
+        ]
+        show(told, lines, terminal.as_json)
         if options.live and options.stay:
             page.stay()
     if run.failed:
@@ -176,16 +186,3 @@ def _of_result(
             possible = f"the shortest possible is {plan.shortest_possible:.2f} m"
         yield f"{found}; {possible} ({plan.trials} trials, {result.planning_seconds:.1f} s)"
     yield f"results in {click.format_filename(str(out))}: {', '.join(report['files'])}"
-
-
-def _tell_campaign(out: Path | Storage, run: CampaignRun, *, as_json: bool) -> None:
-    names = ("points", "rays", "seconds", "casting_seconds", "resumed", "notes")
-    told = {"folder": str(out), "jobs": run.done, "failed": [row.name for row in run.failed]}
-    told |= {name: getattr(run, name) for name in names}
-    lines = [
-        *(f"note: {note}" for note in run.notes),
-        f"{counted(run.done, 'job')}, {counted(run.rays, 'ray')}, "
-        f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
-        f"data set in {click.format_filename(str(out))}: see README.md there",
-    ]
-    show(told, lines, as_json)

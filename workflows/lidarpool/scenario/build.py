@@ -224,18 +224,13 @@ class Built:
         given = self.scenario
         sections: Mapping[str, SensorSection] = given.sensors or {"": given.sensor}
         return [
-            section.mounted(
-                given.path,
-                self._mount(getattr(section, "mount", given.mount)),
-                given.noise,
-                given.returns,
-                name,
-            )
+            section.mounted(given.path, self._mount(section), given.noise, given.returns, name)
             for name, section in sections.items()
         ]
 
-    def _mount(self, mount: MountSection | None) -> Pose:
+    def _mount(self, section: SensorSection) -> Pose:
         """Pose of a sensor in the carrier's axes."""
+        mount: MountSection | None = getattr(section, "mount", self.scenario.mount)
         if mount is None or mount.link is None:
             return CENTRE if mount is None else mount.pose()
         carriers = [
@@ -319,14 +314,14 @@ class Built:
         for entry in self.scenario.placed:
             if entry.semantic_class is None:
                 continue
-            names, numbered = [escape(entry.name)], f"{escape(entry.name)}.[0-9]*"
+            named = {entry.name: [escape(entry.name)]}
+            numbered = f"{escape(entry.name)}.[0-9]*"
             if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
-                names.append(numbered)
-            if isinstance(entry, ActorSection) and entry.robot:
+                named[entry.name].append(numbered)
+            elif isinstance(entry, ActorSection) and entry.robot:
                 links = [a.name for a in scene.actors if a.name.startswith(f"{entry.name}/")]
-                own += [(link, [escape(link)], entry.semantic_class) for link in links]
-            else:
-                own.append((entry.name, names, entry.semantic_class))
+                named = {link: [escape(link)] for link in links}
+            own += [(name, names, entry.semantic_class) for name, names in named.items()]
         if own and not made:
             made = [every]
         for name, names, semantic_class in own:

@@ -416,9 +416,8 @@ class _Varied(_Jobs):
         self.count = section.count or grid
         self.choices = {text: choice.words for text, choice in section.vary.items()}
         if len(self._bases) > 1:
-            listed = ", ".join(base.name for base in self._bases[:8])
-            listed += ", …" * (len(self._bases) > 8)
-            self.choices = {"base": f"{listed}, each of {len(self._bases):,}", **self.choices}
+            bases = Choice(each=tuple(base.name for base in self._bases))
+            self.choices = {"base": bases.words, **self.choices}
         self.names = tuple(self.choices)
 
     @cached_property
@@ -683,14 +682,12 @@ def put(node: Any, steps: Steps, change: Callable[[Any], Any]) -> Any:
     if not steps:
         return change(node)
     (key, base), *rest = steps
-    own: Any = list(node) if isinstance(node, (tuple, list)) else _own_fields(node)
+    own: Any
+    if is_section(type(node)):
+        fields, given = fields_of(type(node)), getattr(node, "model_fields_set", vars(node))
+        own = {f.alias or n: getattr(node, n) for n, f in fields.items() if n in given}
+    else:
+        own = list(node) if isinstance(node, (tuple, list)) else dict(node)
     below = own[key] if isinstance(own, list) else own.get(key, base)  # type: ignore[index]
     own[key] = put(base if below is None else below, tuple(rest), change)
     return own
-
-
-def _own_fields(node: Any) -> dict[Any, Any]:
-    if is_section(type(node)):
-        fields, given = fields_of(type(node)), getattr(node, "model_fields_set", vars(node))
-        return {f.alias or n: getattr(node, n) for n, f in fields.items() if n in given}
-    return dict(node)

@@ -532,11 +532,12 @@ def read_rows(path: Path, kind: Any) -> list[Any]:
     adapter = TypeAdapter(entry)
     mistakes, rows = Mistakes(), []
     for line, row in cells:
-        if len(row) > len(head):
-            told = f"{path}, line {line}: it has {len(row)} cells, and the header {len(head)}."
-            mistakes.lines.append(told)
-            continue
-        with mistakes.noted(), sentences(model, f"{path}, line {line}"):
+        where = f"{path}, line {line}"
+        with mistakes.noted(), sentences(model, where):
+            if len(row) > len(head):
+                raise LidarpoolError(
+                    f"{where}: it has {len(row)} cells, and the header {len(head)}."
+                )
             rows.append(_checked(adapter, dict(zip(head, row, strict=False))))
     mistakes.tell()
     return rows

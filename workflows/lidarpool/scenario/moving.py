@@ -23,7 +23,7 @@ from ..base.xmlfile import refuse_entity
 from ..scene.actors import Actor
 from ..scene.mesh import Mesh
 from ..scene.urdf import SUFFIXES as ROBOTS
-from ..sensor import Mounted, Pose, Sensor, Track, load_trajectory
+from ..sensor import Mounted, Pose, Track, load_trajectory
 from ..sensor.calibrations import said
 from ..sensor.survey import Steps
 from ..sensor.trajectory import CLOCK_S, Beyond, InstrumentPose, quaternions_of, rotations_of
@@ -63,14 +63,11 @@ class CarriedSection(SensorSection):
         told("its time steps (scans), instead of the survey's", 120),
     ] = None
 
-    def sensor(self, path: PathOf) -> Sensor:
-        """Make the sensor, which starts at its own time; errors as of `SensorSection`."""
-        made = super().sensor(path)
-        return replace(made, start_ns=self.start_s * 1e9) if self.start_s else made
-
     def mounted(self, *given: Any) -> Mounted:
-        """Return it on its carrier, as `SensorSection` does, with its time steps."""
-        return replace(super().mounted(*given), steps=self.steps)
+        """Return it on its carrier, as `SensorSection` does, with its own start and time steps."""
+        made = super().mounted(*given)
+        sensor = replace(made.sensor, start_ns=self.start_s * 1e9) if self.start_s else made.sensor
+        return replace(made, sensor=sensor, steps=self.steps)
 
 
 class TimedPose(Section, Pose):

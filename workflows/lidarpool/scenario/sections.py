@@ -374,26 +374,6 @@ class SensorSection(Section):
         """Whether its model is a file of the user's."""
         return self.model is not None and self.model.endswith((".yaml", ".yml"))
 
-    def _found(self, path: PathOf) -> str | Path | None:
-        """Return its model, of a user's file its path."""
-        return self.model and (path(self.model) if self.has_own_model else self.model)
-
-    def sensor(self, path: PathOf) -> Sensor:
-        """Return the lidar; LidarpoolError if its files, whose paths are given, cannot be used.
-
-        Equal sections have the same one, unless their files have changed.
-        """
-        own = {"rate_hz", "min_range_m", "max_range_m"}
-        limits = self.model_dump(include=own, exclude_none=True)
-        if self.model is None and self.calibration is None:
-            azimuths = self.columns or self.rays_per_revolution
-            return _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
-        model = self._found(path)
-        unit = None if self.calibration is None else path(self.calibration)
-        states = file_states(file for file in (model, unit) if isinstance(file, Path))
-        given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}
-        return _loaded(states, model=model, **given, **limits)
-
     def mounted(
         self,
         path: PathOf,
@@ -402,19 +382,29 @@ class SensorSection(Section):
         returns: ReturnsSection,
         name: str = "",
     ) -> Mounted:
-        """Return it on its carrier; LidarpoolError if its files cannot be used.
+        """Return the lidar on its carrier; LidarpoolError if its files cannot be used.
 
-        With `performance: datasheet` it has noise and returns of its own: those of the data sheet,
-        but for the fields that the sections give.
+        `path` returns those of files. Equal sections have the same sensor, unless their files have
+        changed. With `performance: datasheet` it has noise and returns of its own: those of the
+        data sheet, but for the fields that the sections give.
         """
-        carried = Mounted(self.sensor(path), mount, name)
-        model = self._found(path)
+        own = {"rate_hz", "min_range_m", "max_range_m"}
+        limits = self.model_dump(include=own, exclude_none=True)
+        model = path(self.model) if self.model and self.has_own_model else self.model
+        unit = None if self.calibration is None else path(self.calibration)
+        if model is None and unit is None:
+            azimuths = self.columns or self.rays_per_revolution
+            sensor = _grid(azimuths, self.layers, self.vertical_fov_deg, self.step_deg, **limits)
+        else:
+            states = file_states(file for file in (model, unit) if isinstance(file, Path))
+            given = {"calibration": unit, "columns": self.columns, "step_deg": self.step_deg}
+            sensor = _loaded(states, model=model, **given, **limits)
         if self.performance == "ideal" or model is None:
-            return carried
+            return Mounted(sensor, mount, name)
         sheet = datasheet(model)
-        own_noise = replace(sheet.noise, **noise.model_dump(exclude_unset=True))
         own_returns = replace(sheet.returns, **returns.model_dump(exclude_unset=True))
-        return replace(carried, noise=own_noise, returns=own_returns)
+        own_noise = replace(sheet.noise, **noise.model_dump(exclude_unset=True))
+        return Mounted(sensor, mount, name, returns=own_returns, noise=own_noise)
 
 
 def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
