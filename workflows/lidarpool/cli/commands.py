@@ -35,7 +35,6 @@ if TYPE_CHECKING:
     from ..run.connection import TlsFiles
 
 PROGRAM = "lidarpool"
-_COMMANDS = [init, import_, check, schema, scene, sensors, stations, view, plot, export, compare]
 
 # What `demo` and `run` have in common; each is a field of RunOptions.
 _shown = options.together(
@@ -71,7 +70,7 @@ def _seconds(text: str) -> float:
 
 
 @click.group(
-    commands=_COMMANDS,
+    commands=[init, import_, check, schema, scene, sensors, stations, view, plot, export, compare],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
 )
 @click.version_option(__version__, prog_name=PROGRAM)

@@ -371,15 +371,14 @@ def sensors(model: str | None, out: Path | None) -> None:
     if target.suffix.lower() != ".png":
         raise click.UsageError(f"{target} is not a picture: give a name that ends in .png.")
     click.echo(described.name)
-    for figure, source in described.sources.items():
-        click.echo(f"{figure:<11}  {source}")
+    lines = [*described.sources.items()]
     if described.performance is not None:
         sheet = datasheet(model)
-        click.echo(f"{'noise':<11}  {shown_noise(sheet.noise)}")
-        returns = f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"
-        click.echo(f"{'returns':<11}  {returns}")
-        if sheet.missing:
-            click.echo(f"{'unknown':<11}  {', '.join(sheet.missing)}")
+        lines.append(("noise", shown_noise(sheet.noise)))
+        lines.append(("returns", f"mode: {sheet.returns.mode}, subrays: {sheet.returns.subrays}"))
+        lines += [("unknown", ", ".join(sheet.missing))] if sheet.missing else []
+    for figure, words in lines:
+        click.echo(f"{figure:<11}  {words}")
     draw_beams(target, load_sensor(model))
     click.echo(click.format_filename(target))
 

@@ -91,28 +91,23 @@ class Job:
     def __post_init__(self) -> None:
         scene, survey = self.scene, self.survey
         MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
+        # The cells of the cloud's precision that the scene spans have numbers of 32 bits.
+        reach = float(np.abs(scene.bounds).max(initial=0.0))
         for actor in scene.actors:
             actor.check(0.0, survey.duration_ns)
-        _check_precision(scene, survey)
+            ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
+            reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
+        if reach / survey.precision_m >= 2**31 - 1:
+            raise LidarpoolError(
+                f"precision_m {survey.precision_m} is too fine for a scene that reaches "
+                f"{reach:.0f} m from its origin: use at least {reach / 2**31:.2g}."
+            )
         warn_of_grey(scene, survey)
 
     @property
     def trials(self) -> int:
         """Number of planning trials."""
         return self.planning.trials if self.planning else 0
-
-
-def _check_precision(scene: Scene, survey: Survey) -> None:
-    """Check that the scene spans few enough cells of the cloud's precision to be numbered."""
-    reach = float(np.abs(scene.bounds).max(initial=0.0))
-    for actor in scene.actors:
-        ways, _ = actor.trajectory.poses(0, np.linspace(0, survey.duration_ns, 100))
-        reach = max(reach, float(np.abs(ways).max() + np.abs(actor.mesh.vertices).max()))
-    if reach / survey.precision_m >= 2**31 - 1:
-        raise LidarpoolError(
-            f"precision_m {survey.precision_m} is too fine for a scene that reaches {reach:.0f} m "
-            f"from its origin: use at least {reach / 2**31:.2g}."
-        )
 
 
 def build(

@@ -6,7 +6,7 @@ import gzip
 import math
 import zlib
 from array import array
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -304,67 +304,63 @@ def read_fcd(path: Path, first_s: float, last_s: float) -> tuple[list[Passage], 
     LidarpoolError
         If it cannot be read, or is no floating car data.
     """
-    reader = _Reader(first_s, last_s)
+    passages: list[Passage] = []
+    known: dict[tuple[str, str], tuple[int, Passage]] = {}  # {who: last step, passage}
+    step, time = -1, -math.inf
+    vehicle: tuple[str, str] | None = None  # place of the last one of the time step
     try:
-        with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rb") as file:
-            while not reader.done and (piece := file.read(_PIECE)):
-                reader.parser.Parse(piece)
-        if not reader.done:
-            reader.parser.Parse(b"", True)
-        if reader.step < 0:
+        for tag, at in _elements(path):
+            if tag == "timestep":
+                before, time = time, float(at["time"])
+                if not before < time < math.inf:
+                    raise ValueError(f"the time {time} does not come after the one before")
+                if before > last_s:  # the first time step after the last time is needed as well
+                    break
+                step, vehicle = step + 1, None
+            elif tag in _MOVING and step >= 0:
+                place = at["x"], at["y"]
+                if tag == "vehicle":
+                    vehicle = place
+                elif place == vehicle:  # SUMO writes who rides in a vehicle after it
+                    continue
+                who = tag, at["id"]
+                last, passage = known.get(who, (-2, None))
+                # SUMO takes vehicles out while it moves them.
+                if passage is None or last < step - 1:
+                    passage = Passage(at["id"], at.get("type") or tag)
+                    passages.append(passage)
+                known[who] = step, passage
+                if time <= first_s:  # of those before the first time the last is needed
+                    del passage.times_s[:], passage.rows[:]
+                row = [float(at[key]) for key in _ROW[:3]]
+                row += [float(at.get(key) or 0) for key in _ROW[3:]]
+                if not all(map(math.isfinite, row)):
+                    raise ValueError(f"{tag} {at['id']!r} has no finite position at {time:g} s")
+                passage.times_s.append(time)
+                passage.rows.extend(row)
+        if step < 0:
             raise ValueError("it has no time steps")
     except (OSError, EOFError, zlib.error, ValueError, KeyError, expat.ExpatError) as error:
         raise LidarpoolError(
             f"{path} is not usable as floating car data, which sumo --fcd-output writes: "
             f"{said(error)}"
         ) from error
-    there = [one for one in reader.passages if len(one.times_s) > 1 and one.times_s[-1] >= first_s]
-    return there, len(reader.open)
+    there = [one for one in passages if len(one.times_s) > 1 and one.times_s[-1] >= first_s]
+    return there, len(known)
 
 
-class _Reader:
-    """Handles the elements of a file."""
-
-    def __init__(self, first_s: float, last_s: float) -> None:
-        self.passages: list[Passage] = []
-        self.open: dict[tuple[str, str], tuple[int, Passage]] = {}  # {who: last step, passage}
-        self.step, self.done = -1, False
-        self._first, self._last, self._time = first_s, last_s, -math.inf
-        self._vehicle: tuple[str, str] | None = None  # place of the last one of the time step
-        self.parser = expat.ParserCreate()
-        self.parser.EntityDeclHandler = refuse_entity
-        self.parser.StartElementHandler = self._begin
-
-    def _begin(self, tag: str, at: Mapping[str, str]) -> None:
-        if tag == "timestep":
-            time = float(at["time"])
-            if not self._time < time < math.inf:
-                raise ValueError(f"the time {time} does not come after the one before")
-            # The first time step after the last time is needed as well.
-            self.done = self.done or self._time > self._last
-            self.step, self._time, self._vehicle = self.step + 1, time, None
-        elif tag in _MOVING and self.step >= 0 and not self.done:
-            place = at["x"], at["y"]
-            if tag == "vehicle":
-                self._vehicle = place
-            elif place == self._vehicle:  # SUMO writes who rides in a vehicle after it
-                return
-            self._add(tag, at)
-
-    def _add(self, tag: str, at: Mapping[str, str]) -> None:
-        who = tag, at["id"]
-        step, passage = self.open.get(who, (-2, None))
-        if passage is None or step < self.step - 1:  # SUMO takes vehicles out while it moves them
-            passage = Passage(at["id"], at.get("type") or tag)
-            self.passages.append(passage)
-        self.open[who] = self.step, passage
-        if self._time <= self._first:  # of those before the first time the last is needed
-            del passage.times_s[:], passage.rows[:]
-        row = [float(at[key]) for key in _ROW[:3]] + [float(at.get(key) or 0) for key in _ROW[3:]]
-        if not all(map(math.isfinite, row)):
-            raise ValueError(f"{tag} {at['id']!r} has no finite position at {self._time:g} s")
-        passage.times_s.append(self._time)
-        passage.rows.extend(row)
+def _elements(path: Path) -> Iterator[tuple[str, Mapping[str, str]]]:
+    """Yield tags and attributes of the elements of a file, of which it holds a piece at a time."""
+    begun: list[tuple[str, Mapping[str, str]]] = []
+    parser = expat.ParserCreate()
+    parser.EntityDeclHandler = refuse_entity
+    parser.StartElementHandler = lambda tag, at: begun.append((tag, at))
+    with (gzip.open if path.suffix.lower() == ".gz" else open)(path, "rb") as file:
+        while piece := file.read(_PIECE):
+            parser.Parse(piece)
+            yield from begun
+            begun.clear()
+    parser.Parse(b"", True)
 
 
 def actors_of(
