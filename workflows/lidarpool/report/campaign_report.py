@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from ..base.arrays import AnyArray, Bools, Floats, Ints
 from ..base.choice import one_of_each_part
@@ -113,9 +113,9 @@ class Figures:
 
     def __init__(self, names: Sequence[str], jobs: Iterable[JobRow] = ()) -> None:
         self.jobs = 0
-        self.splits: dict[str, Counter[str]] = {}  # {split: done jobs, and their counts}
-        self.classes: Counter[int] = Counter()  # {class: points}
-        self.classed: Counter[int] = Counter()  # {class: jobs that have it}
+        # {split: done jobs and their counts}, {class: points and the jobs that have it}
+        self.splits: dict[str, Counter[str]] = {}
+        self.classes: dict[int, Counter[str]] = {}
         self.failed: list[JobRow] = []  # the first of them
         self.slowest: list[JobRow] = []  # those that took longest to cast, the slowest first
         self._each = {name: array("d") for name in ("points", "rays", "hits", "seconds", "failed")}
@@ -149,24 +149,10 @@ class Figures:
         self._digest.update(f"{row.name} {row.sha256}\n".encode())
         counts = {name: getattr(row, name) for name in _COUNTS}
         self.splits.setdefault(row.split, Counter()).update(counts, jobs=1)
-        self.classes.update(row.classes)
-        self.classed.update(row.classes.keys())
+        for number, points in row.classes.items():
+            self.classes.setdefault(number, Counter()).update(points=points, jobs=1)
         insort(self.slowest, row, key=lambda row: (-row.seconds, row.number))
         del self.slowest[SLOWEST_MOST:]
-
-    def _varied(self, name: str) -> Varied:
-        values, labels = np.array(self._values[name]), dict(self._labels[name])
-        known = np.isfinite(values)
-        values[~known] = np.nan
-        if not labels:
-            return Varied(name, values, ())
-        numbers = known & (np.array(self._labelled[name]) == 0)
-        codes = values.copy()
-        for value in np.unique(values[numbers]).tolist():  # as «auto» beside 1 and 2
-            codes[numbers & (values == value)] = labels.setdefault(f"{value:g}", len(labels))
-        order = sorted(labels)
-        codes[known] = np.argsort([labels[text] for text in order])[codes[known].astype(np.intp)]
-        return Varied(name, codes, tuple(order))
 
     @property
     def done(self) -> int:
@@ -188,6 +174,20 @@ class Figures:
     def varied(self) -> list[Varied]:
         """What each varied quantity was in each job."""
         return [self._varied(name) for name in self._values]
+
+    def _varied(self, name: str) -> Varied:
+        values, labels = np.array(self._values[name]), dict(self._labels[name])
+        known = np.isfinite(values)
+        values[~known] = np.nan
+        if not labels:
+            return Varied(name, values, ())
+        numbers = known & (np.array(self._labelled[name]) == 0)
+        codes = values.copy()
+        for value in np.unique(values[numbers]).tolist():  # as «auto» beside 1 and 2
+            codes[numbers & (values == value)] = labels.setdefault(f"{value:g}", len(labels))
+        order = sorted(labels)
+        codes[known] = np.argsort([labels[text] for text in order])[codes[known].astype(np.intp)]
+        return Varied(name, codes, tuple(order))
 
     def each(self, name: str) -> Floats:
         """Return points, rays, hits or seconds of each job (n,)."""
@@ -229,10 +229,11 @@ class Figures:
 class Scale:
     """Where the values of a quantity are in a chart, and its bins."""
 
+    name: str
     places: Floats  # (n,): as drawn; NaN without a value
     edges: Floats  # (bins + 1,)
-    labels: tuple[str, ...] = ()  # of bins; none for numbers
-    is_log: bool = False
+    labels: tuple[str, ...]  # of bins; none for numbers
+    is_log: bool
 
     @classmethod
     def of(cls, varied: Varied) -> Scale:
@@ -245,20 +246,21 @@ class Scale:
             place[kept] = np.arange(len(kept))
             values = place[np.nan_to_num(values, nan=-1).astype(np.intp)]
             labels = (*(labels[k] for k in kept), f"{len(labels) - len(kept)} others")
-        if labels:
-            return cls(values, np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1), labels)
         low, high = (float(there.min()), float(there.max())) if len(there) else (0.0, 1.0)
-        if high - low <= 30 and (there == np.round(there)).all():
-            return cls(varied.values, np.arange(low - 0.5, high + 1))
-        bins = int(np.clip(2 * np.sqrt(len(there)), 6, _BINS))
-        if low == high:
-            return cls(varied.values, np.linspace(low - 0.5, high + 0.5, bins + 1))
-        # Half of a logarithmic distribution lies below the geometric mean of its limits.
-        median = float(np.median(there))
-        if low > 0 and high > 20 * low and median < (np.sqrt(low * high) * (low + high) / 2) ** 0.5:
-            edges = np.geomspace(low, high, bins + 1).astype(np.float64)
-            return cls(varied.values, edges, is_log=True)
-        return cls(varied.values, np.linspace(low, high, bins + 1))
+        bins, is_log = int(np.clip(2 * np.sqrt(len(there)), 6, _BINS)), False
+        if labels:
+            edges = np.linspace(-0.5, len(labels) - 0.5, len(labels) + 1)
+        elif high - low <= 30 and (there == np.round(there)).all():
+            edges = np.arange(low - 0.5, high + 1)
+        elif low == high:
+            edges = np.linspace(low - 0.5, high + 0.5, bins + 1)
+        else:
+            # Half of a logarithmic distribution lies below the geometric mean of its limits.
+            middle = (np.sqrt(max(low, 0.0) * high) * (low + high) / 2) ** 0.5
+            is_log = bool(low > 0 and high > 20 * low and np.median(there) < middle)
+            spaced = np.geomspace if is_log else np.linspace
+            edges = spaced(low, high, bins + 1).astype(np.float64)
+        return cls(varied.name, values, edges, labels, is_log)
 
     @cached_property
     def bin_of(self) -> Ints:
@@ -267,6 +269,16 @@ class Scale:
         found = found.clip(0, len(self.edges) - 2)
         return np.where(np.isfinite(self.places), found, -1)
 
+    @cached_property
+    def short_labels(self) -> list[str]:
+        """Labels without what all have in common, and not too long."""
+        return [shortened(label, 15) for label in without_common_prefix(self.labels)]
+
+    def slanted(self, wide: float) -> bool:
+        """Whether labels are too long to stand side by side."""
+        longest = max(map(len, self.short_labels), default=0)
+        return longest * _LETTER > wide / max(1, len(self.labels))
+
 
 def draw_varied(figures: Figures) -> Page | None:
     """Draw a histogram of each varied quantity above the points of each job against it.
@@ -274,14 +286,14 @@ def draw_varied(figures: Figures) -> Page | None:
     Jobs have the colours of the quantity of few labels that tells most about their points. None
     where nothing was varied or no job has run.
     """
-    shown = [varied for varied in figures.varied if len(varied.there)][:MOST_VARIED]
-    if not shown:
+    there = [varied for varied in figures.varied if len(varied.there)]
+    if not there:
         return None
-    scales = [Scale.of(varied) for varied in shown]
-    rows = -(-len(shown) // ACROSS)
-    across = -(-len(shown) // rows)
+    scales = [Scale.of(varied) for varied in there[:MOST_VARIED]]
+    rows = -(-len(scales) // ACROSS)
+    across = -(-len(scales) // rows)
     wide = (WIDTH - LEFT - RIGHT - BETWEEN * (across - 1)) / across
-    below = BELOW + SLANTED * any(_slanted(scale, wide) for scale in scales)
+    below = BELOW + SLANTED * any(scale.slanted(wide) for scale in scales)
     high = COUNTS + GAP + AGAINST + below
     page = Page((WIDTH, TOP + rows * high + (rows - 1) * ABOVE))
     points, failures = figures.each("points"), figures.failures
@@ -289,41 +301,38 @@ def draw_varied(figures: Figures) -> Page | None:
     telling = _most_telling(scales, points, ~failures)
     colours = np.tile(theme.rgb(DOT), (len(points), 1))
     if telling is not None:
-        some = theme.object_colours(len(scales[telling].labels))
-        known = scales[telling].bin_of >= 0
-        colours[known] = some[scales[telling].bin_of[known]]
-    for number, (varied, scale) in enumerate(zip(shown, scales, strict=True)):
+        some = theme.object_colours(len(telling.labels))
+        known = telling.bin_of >= 0
+        colours[known] = some[telling.bin_of[known]]
+    for number, scale in enumerate(scales):
         row, column = divmod(number, across)
         left, top = LEFT + column * (wide + BETWEEN), TOP + row * (high + ABOVE)
         upper = _chart(page, left, top, wide, COUNTS)
         lower = _chart(page, left, top + COUNTS + GAP, wide, AGAINST)
-        bars = some if number == telling else theme.rgb(BAR)
+        bars = some if scale is telling else theme.rgb(BAR)
         _draw_counts(upper, scale, failures, bars)
         _draw_points(page, lower, scale, points, failures, colours)
         lower.set_ylim(limits)
-        for axes in (upper, lower):
+        for axes, quantity in ((upper, "jobs"), (lower, "points of a job")):
             _set_labels(page, axes, scale, wide)
-        upper.tick_params(which="both", labelbottom=False, bottom=False)
-        name = shortened(varied.name, int(wide / 13.8))
-        page.heading(upper, name, weight="bold", pad=4 * page.unit)
-        if column == 0:
-            upper.set_ylabel("jobs")
-            lower.set_ylabel("points of a job")
-            for axes in (upper, lower):
+            if column == 0:
+                axes.set_ylabel(quantity)
                 axes.yaxis.set_label_coords(-78 / wide, 0.5)
-        else:
-            lower.tick_params(labelleft=False)
+        upper.tick_params(which="both", labelbottom=False, bottom=False)
+        lower.tick_params(labelleft=column == 0)
+        name = shortened(scale.name, int(wide / 13.8))
+        page.heading(upper, name, weight="bold", pad=4 * page.unit)
     page.title(
         "What was varied, and the points that came of it",
         "Above, the jobs by value. Below, a dot for each job; the median of jobs with near values, "
         "and the range of their middle 80%.",
-        _remarks(figures, shown, None if telling is None else shown[telling]),
+        _remarks(figures, telling, len(there) - len(scales)),
     )
     return page
 
 
-def _remarks(figures: Figures, shown: Sequence[Varied], telling: Varied | None) -> str:
-    """Sentence about colours, failures and what is not drawn."""
+def _remarks(figures: Figures, telling: Scale | None, more: int) -> str:
+    """Sentence about colours, failures and `more` quantities that are not drawn."""
     told = []
     if telling is not None:
         told.append(f"coloured by {shortened(telling.name, 40)}")
@@ -331,22 +340,22 @@ def _remarks(figures: Figures, shown: Sequence[Varied], telling: Varied | None) 
         told.append(f"red: {counted(failed, 'failed job')}")
     if figures.done > MOST_DOTS:
         told.append(f"{MOST_DOTS:,} of {figures.done:,} jobs have dots")
-    if more := sum(len(varied.there) > 0 for varied in figures.varied) - len(shown):
+    if more:
         told.append(f"{counted(more, 'more quantity', 'more quantities')} in jobs.csv")
     text = "; ".join(told)
     return f"{text[:1].upper()}{text[1:]}." if text else ""
 
 
-def _most_telling(scales: Sequence[Scale], points: Floats, done: Bools) -> int | None:
-    """Which quantity of few labels has groups whose points differ most; None without any."""
-    between = {}  # {number of a quantity: variance of the means of its groups}
-    for number, scale in enumerate(scales):
+def _most_telling(scales: Sequence[Scale], points: Floats, done: Bools) -> Scale | None:
+    """Quantity of few labels whose groups have the most different points; None without any."""
+    between = {}  # {quantity: variance of the means of its groups}
+    for scale in scales:
         known = done & (scale.bin_of >= 0)
         if 2 <= len(scale.labels) <= MOST_COLOURS and known.any():
             groups = scale.bin_of[known]
             means = np.bincount(groups, points[known]) / np.bincount(groups).clip(1)
-            between[number] = float(np.var(means[groups]))
-    return max(between, key=lambda number: between[number], default=None)
+            between[scale] = float(np.var(means[groups]))
+    return max(between, key=lambda scale: between[scale], default=None)
 
 
 def draw_results(figures: Figures) -> Page | None:
@@ -384,7 +393,7 @@ def _chart(page: Page, left: float, top: float, wide: float, high: float) -> Axe
     width, height = page.size
     axes = page.chart((left / width, 1 - (top + high) / height, wide / width, high / height))
     axes.yaxis.set_major_locator(MaxNLocator(4 if high > COUNTS else 2, integer=True))
-    axes.yaxis.set_major_formatter(FuncFormatter(_tick))
+    axes.yaxis.set_major_formatter(_tick)
     axes.xaxis.grid(visible=False)
     axes.tick_params(which="both", color=theme.LINE)
     return axes
@@ -469,11 +478,11 @@ def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
     axis, (low, high) = axes.xaxis, scale.edges[[0, -1]].tolist()
     if scale.labels:
         axes.set_xlim(low, high)
-        axis.set_ticks(range(len(scale.labels)), list(_short(scale.labels)))
+        axis.set_ticks(range(len(scale.labels)), scale.short_labels)
         slant = {"rotation": 28, "ha": "right", "rotation_mode": "anchor"}
         for text in axes.get_xticklabels():
             text.set(parse_math=False, fontsize=6.8 * page.unit, family=FONT)
-            text.set(**slant if _slanted(scale, wide) else {})
+            text.set(**slant if scale.slanted(wide) else {})
         return
     if scale.is_log:
         axes.set_xscale("log")
@@ -485,17 +494,7 @@ def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
         whole = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
         few = max(2, min(6, int(wide / 90)))
         axis.set_major_locator(MaxNLocator(few, integer=whole, min_n_ticks=1))
-    axis.set_major_formatter(FuncFormatter(_tick))
-
-
-def _short(labels: Sequence[str]) -> Iterator[str]:
-    return (shortened(label, 15) for label in without_common_prefix(labels))
-
-
-def _slanted(scale: Scale, wide: float) -> bool:
-    """Whether labels are too long to stand side by side."""
-    longest = max((len(label) for label in _short(scale.labels)), default=0)
-    return longest * _LETTER > wide / max(1, len(scale.labels))
+    axis.set_major_formatter(_tick)
 
 
 def draw_sweep(sweep: Sweep) -> Page:
@@ -654,10 +653,7 @@ def campaign_report(
             name: {key: counts[key] for key in ("jobs", "sweeps", "points")}
             for name, counts in figures.splits.items()
         },
-        "classes": {
-            str(number): {"points": points, "jobs": figures.classed[number]}
-            for number, points in sorted(figures.classes.items())
-        },
+        "classes": {str(number): {**counts} for number, counts in sorted(figures.classes.items())},
         "varied": list(figures.described()),
         "failed": [_told(row, "error") for row in figures.failed],
         "slowest": [_told(row, "seconds") for row in figures.slowest],
