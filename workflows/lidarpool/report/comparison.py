@@ -61,7 +61,7 @@ class Comparison:
     residuals: Floats  # of all cells with a return in both, or of a choice
     distances: tuple[Floats, Floats]  # of A's points to B, and of B's to A
     lights: tuple[Floats, Floats]  # intensities of A and B that are compared
-    above: tuple[Above, Above]  # of one pair of sweeps, or of all
+    above: Sequence[Above]  # of A and of B: of one pair of sweeps, or of all
 
     def __repr__(self) -> str:
         return rendered("comparison.txt", report=self.figures).rstrip("\n")
@@ -84,12 +84,11 @@ class Comparison:
             images = {name: page.svg() for name, page in drawn.items()}
             text = json.dumps(self.figures, indent=1, allow_nan=False) + "\n"
             page = rendered("comparison.html", report=self.figures, pictures=images)
-            (staged / "compare.json").write_text(text, encoding="utf-8")
-            (staged / "compare.html").write_text(page, encoding="utf-8")
-            for name, drawing in drawn.items():
-                (staged / f"compare-{name}.png").write_bytes(drawing.png())
-            names = ["compare.json", "compare.html", *(f"compare-{name}.png" for name in drawn)]
-            return [(staged / name).replace(place / name) for name in names]
+            files = {"compare.json": text.encode(), "compare.html": page.encode()}
+            files |= {f"compare-{name}.png": drawing.png() for name, drawing in drawn.items()}
+            for name, content in files.items():
+                (staged / name).write_bytes(content)
+            return [(staged / name).replace(place / name) for name in files]
 
 
 @checked
@@ -198,17 +197,16 @@ def _pairs(a: Recording, b: Recording, match: str, notes: list[str]) -> list[tup
     return pairs
 
 
+@dataclass(eq=False)
 class _Comparing:
     """What has been compared so far."""
 
-    def __init__(
-        self,
-        recordings: tuple[Recording, Recording],
-        within: tuple[float, ...],
-        azimuth_deg: float | None,
-    ) -> None:
-        self.recordings, self.within, self.azimuth_deg = recordings, within, azimuth_deg
-        self.notes = [text for one in recordings for text in one.notes]
+    recordings: tuple[Recording, Recording]
+    within: tuple[float, ...]
+    azimuth_deg: float | None
+
+    def __post_init__(self) -> None:
+        self.notes = [text for one in self.recordings for text in one.notes]
         self.points = np.zeros(2, np.int64)
         self.images: RangeImages | None = None
         self.above: list[Above] = []
@@ -329,8 +327,7 @@ class _Comparing:
                 ],
             },
         }
-        above = self.above[0], self.above[1]
-        return Comparison(figures, self.images, residuals, (to_b, to_a), lights, above)
+        return Comparison(figures, self.images, residuals, (to_b, to_a), lights, self.above)
 
     def _of_images(self, residuals: Floats, rings: Ints) -> dict[str, Any]:
         images = self.images

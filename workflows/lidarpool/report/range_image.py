@@ -14,9 +14,7 @@ from ..export.recordings import Turn
 _TILT_DEG = 1.0  # width of the middle half of a ring's elevations, of rings near each other
 _SAME = 0.15  # by how much single steps may differ from their mean
 _ALIKE = 0.01  # by how much steps of azimuth may differ that are meant to be the same
-_SECTOR_DEG = (
-    90.0  # a gap as wide as this in all rings is none of returns, but of the field of view
-)
+_SECTOR_DEG = 90.0  # a gap as wide as this in all rings is outside the field of view
 _BLOCKS = 36  # of a turn, in each of which the pulses of a ring are evenly spaced
 _AGREE = 0.7  # share of rings from whose numbers the others' follow
 _FINEST_DEG = 1e-3  # points nearer in azimuth are of one pulse
