@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, nullcontext
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -182,14 +182,17 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             report = make_report(result, files, cloud)
             report["notes"] += [note for one in formats for note in one.notes(points)]
             if pictures:
-                pictures.write_page(report, result, cloud, self.scenario)
+                from .page.page import write_page  # as slow to import as the pictures
+
+                images = pictures.finish()
+                write_page(staged / PAGE, report, result, cloud, images, self.scenario)
             text = json.dumps(report, indent=1, allow_nan=False) + "\n"
             (staged / REPORT).write_text(text, encoding="utf-8")
             if storage is None:
                 _move(staged, folder, files, earlier, then)
             else:
                 clear(storage)
-                for name in (*_FURTHER, *FILES):
+                for name in files:  # the report is last; those of workers are there
                     if (staged / name).exists():
                         storage.put(staged / name, name)
                 with deferred_interrupts():
@@ -238,9 +241,8 @@ def _move(
         # A path of an earlier run would look like this one's; folders are not replaced.
         for name in _stale(earlier, files):
             Storage.at(folder).discard(name)
-        for name in (*_FURTHER, *FILES):
-            if name in files:
-                (staged / name).replace(folder / name)
+        for name in files:  # the report is last
+            (staged / name).replace(folder / name)
         flush(folder)
         then()
 
@@ -255,8 +257,8 @@ def _stale(earlier: Collection[str], files: Collection[str]) -> list[str]:
     return further + [name for name in FILES if name not in files]
 
 
-class _Pictures:
-    """Pictures of a result, drawn in a thread while the cloud is written, and their page.
+class _Pictures(AbstractContextManager["_Pictures"]):
+    """Pictures of a result, drawn in a thread while the cloud is written.
 
     They are drawn from the file of the cloud, as by `lidarpool plot`, so that both draw the same.
     """
@@ -269,33 +271,22 @@ class _Pictures:
         columns = [column.name for column in result.survey.stored_columns]
         self._makers = picture_makers(self._pictured, staged / CLOUD, columns)
         self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
-        self._drawn = {n: self._begun(n) for n in self._makers if n not in _OF_CLOUD}
-
-    def __enter__(self) -> _Pictures:
-        return self
+        self._drawn: dict[str, Future[str]] = {}
+        self._begin(name for name in self._makers if name not in _OF_CLOUD)
 
     def __exit__(self, *_: object) -> None:
         self._thread.shutdown(cancel_futures=True)
 
-    def _begun(self, name: str) -> Future[str]:
-        def draw() -> str:
-            page = self._makers[name]()
-            page.save(self._staged / f"{name}.png")
-            return page.svg()
+    def _begin(self, names: Iterable[str]) -> None:
+        self._drawn |= {name: self._thread.submit(self._draw, name) for name in names}
 
-        return self._thread.submit(draw)
+    def _draw(self, name: str) -> str:
+        page = self._makers[name]()
+        page.save(self._staged / f"{name}.png")
+        return page.svg()
 
-    def write_page(
-        self,
-        report: dict[str, Any],
-        result: RunResult,
-        cloud: CountedCloud,
-        scenario: Scenario | None,
-    ) -> None:
-        """Draw the pictures of the cloud, whose file is there by now, and write the page."""
-        from .page.page import write_page
-
-        self._drawn |= {n: self._begun(n) for n in _OF_CLOUD if n in self._makers}
+    def finish(self) -> dict[str, str]:
+        """Draw those of the cloud, whose file is there by now; returns all as SVG, by name."""
+        self._begin(name for name in _OF_CLOUD if name in self._makers)
         self._pictured.save(self._staged / PICTURE_FILE)
-        images = {name: self._drawn[name].result() for name in self._makers}
-        write_page(self._staged / PAGE, report, result, cloud, images, scenario)
+        return {name: self._drawn[name].result() for name in self._makers}
