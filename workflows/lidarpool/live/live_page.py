@@ -416,16 +416,12 @@ class LiveJob:
         """What its page shows, made when it is first asked for."""
         with self._making:
             if self._view is None:
-                self._view = self._made()
+                job, (pictured, drawn) = self._job, Pictured.before(self._job)
+                sweeps = Sweeps.of(job.survey, job.scene) if self._whole else None
+                title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
+                self._view = View(HeldPoints(self.cloud), pictured, sweeps, title=title)
+                self._view.hits = lambda: drawn.hits(self.hit_counts())
             return self._view
-
-    def _made(self) -> View:
-        job, (pictured, drawn) = self._job, Pictured.before(self._job)
-        sweeps = Sweeps.of(job.survey, job.scene) if self._whole else None
-        title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
-        view = View(HeldPoints(self.cloud), pictured, sweeps, title=title)
-        view.hits = lambda: drawn.hits(self.hit_counts())
-        return view
 
     def _show(self) -> None:
         with self._making:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +12,8 @@ from numpy.typing import NDArray
 from ..base.arrays import AnyArray, Bools, Floats, Ints
 from ..base.choice import one_of_each_part
 from ..columns.cloud import Cloud
+from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
-from ..columns.table import Column
 
 AnyFloats = NDArray[np.floating]
 Scans = tuple[tuple[int, int], ...]  # first and last scan of each range
@@ -24,22 +23,6 @@ _FIRST_LOOK = 200_000  # points that tell how many are where in the picture
 _ACROSS, _DOWN = 48, 27
 TILES = _ACROSS * _DOWN  # parts of a picture
 _KEPT = 0.8  # of the points, as often as they are too many
-
-
-class Points(Protocol):
-    """Points in rows, in a file or in memory."""
-
-    @property
-    def table(self) -> Sequence[Column]:
-        """Columns beside the positions."""
-
-    def __len__(self) -> int: ...
-
-    def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Values of a column, or of x, y or z in world coordinates, in some rows."""
-
-    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """First row of these scans and the first after them."""
 
 
 class HeldPoints:
@@ -60,6 +43,9 @@ class HeldPoints:
     def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
         """Return all rows."""
         return 0, len(self)
+
+
+Points = CloudFile | HeldPoints
 
 
 @dataclass(frozen=True)
@@ -94,17 +80,16 @@ class Filter:
         return kept
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Eye:
     """Camera of a browser: the matrix (4, 4) from local coordinates to clip coordinates."""
 
-    matrix: tuple[tuple[float, ...], ...]
+    matrix: Floats
 
     @classmethod
     def read(cls, text: str) -> Eye:
         """Read 16 numbers, column by column, as WebGL has them; ValueError if they are not."""
-        numbers = np.array([float(number) for number in text.split(",")]).reshape(4, 4).T
-        return cls(tuple(map(tuple, numbers.tolist())))
+        return cls(np.array([float(number) for number in text.split(",")]).reshape(4, 4).T.copy())
 
     def seen(self, places: AnyFloats) -> tuple[AnyFloats, Bools]:
         """Project points (n, 3) to the picture, (n, 2) in -1 to 1, and whether they are in it."""
@@ -114,8 +99,7 @@ class Eye:
 
     def _clip(self, places: AnyFloats) -> AnyFloats:
         """Points (n, 3) in clip coordinates, (4, n)."""
-        matrix = np.array(self.matrix)
-        return np.asarray(matrix[:, :3] @ places.T + matrix[:, 3:])
+        return np.asarray(self.matrix[:, :3] @ places.T + self.matrix[:, 3:])
 
     def tiles(self, places: AnyFloats) -> Ints:
         """Part of the picture of each point (n, 3): (n,); -1 outside."""
@@ -205,13 +189,13 @@ class PointFinder:
             rows = numbers + (np.array([low for low, _ in ranges], np.int64) - before)[part]
             return rows[wanted.keeps(self.points, rows)], whole
         if eye is None:
-            return self._search(ranges, most, wanted, None, None, abandoned)
+            return self._search(ranges, most, wanted, abandoned)
         some, count = self.find(_FIRST_LOOK, wanted, scans, None, abandoned)
         tiles = eye.tiles(self._local(some))
         counts = np.bincount(tiles[tiles >= 0], minlength=TILES) * (count / max(len(some), 1))
         if counts.sum() == 0:  # the sample may have missed a few
             counts += 1
-        rows, _ = self._search(ranges, most, wanted, eye, even_shares(counts, most), abandoned)
+        rows, _ = self._search(ranges, most, wanted, abandoned, eye, even_shares(counts, most))
         return rows, count
 
     def _local(self, rows: Ints | slice) -> Floats:
@@ -222,9 +206,9 @@ class PointFinder:
         ranges: Sequence[tuple[int, int]],
         most: int,
         wanted: Filter,
-        eye: Eye | None,
-        shares: Floats | None,
         abandoned: Callable[[], bool],
+        eye: Eye | None = None,
+        shares: Floats | None = None,
     ) -> tuple[Ints, int]:
         """Read blocks one after the other; the points that are kept become fewer on the way."""
         random, thin, found, kept = np.random.default_rng(0), 1.0, 0, [np.empty(0, np.int64)]
