@@ -21,7 +21,6 @@ from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field
-from functools import partial
 from hmac import compare_digest
 from html import escape
 from importlib.resources import files
@@ -112,17 +111,14 @@ class _File(_Guarded, StaticFileHandler):
 class _Question(_Guarded):
     """Answers one question. `source` may take long: it is asked in a thread of its own."""
 
-    def initialize(
-        self, source: Source, stop: Callable[[], None] | None, threads: ThreadPoolExecutor
-    ) -> None:
-        self._source, self._stop, self._threads = source, stop, threads
+    def initialize(self, source: Source, stop: Callable[[], None] | None) -> None:
+        self._source, self._stop = source, stop
         self._gone = threading.Event()
 
     async def get(self, what: str) -> None:
         asked = {name: self.get_query_argument(name) for name in self.request.query_arguments}
-        ask = partial(self._source, what, asked, self._gone.is_set)
         try:
-            answer = await asyncio.get_running_loop().run_in_executor(self._threads, ask)
+            answer = await asyncio.to_thread(self._source, what, asked, self._gone.is_set)
         except (KeyError, ValueError) as error:
             raise HTTPError(404, "%s", repr(error)) from error
         except Abandoned:
@@ -180,10 +176,9 @@ def page_server(
     A `port` of 0 is for any; `stop` is called when a user of the page orders to stop. `index` is
     the page's file; the viewer of a job is at ``job/NUMBER/``, and asks what begins with that.
     """
-    bound, threads = _bound(port), ThreadPoolExecutor(2, "lidarpool-page")
+    bound = _bound(port)
     folder = str(files(__package__) / "page")
     page, viewer = ({"path": folder, "default_filename": name} for name in (index, VIEWER))
-    asked = {"source": source, "stop": stop, "threads": threads}
     bound.setblocking(False)
     made = PageServer(bound.getsockname()[1])
     running: Future[asyncio.AbstractEventLoop] = Future()
@@ -193,13 +188,15 @@ def page_server(
         handlers: list[Any] = [
             (r"/[^/]+/(|\w[\w.]*\.(?:css|js))", _File, page),
             (r"/[^/]+/job/\d+/(|\w[\w.]*\.(?:css|js))", _File, viewer),
-            (r"/[^/]+/(.*)", _Question, asked),
+            (r"/[^/]+/(.*)", _Question, {"source": source, "stop": stop}),
         ]
         application = Application(handlers, log_function=lambda _: None)
         application.settings |= {"page": made, "in_notebook": cell_display() is not None}
         server = HTTPServer(application)
         server.add_socket(bound)
-        running.set_result(asyncio.get_running_loop())
+        loop = asyncio.get_running_loop()
+        loop.set_default_executor(ThreadPoolExecutor(2, "lidarpool-page"))
+        running.set_result(loop)
         await ended.wait()
         server.stop()
         await server.close_all_connections()
@@ -212,7 +209,6 @@ def page_server(
     finally:
         loop.call_soon_threadsafe(ended.set)
         thread.join()
-        threads.shutdown(cancel_futures=True)
 
 
 def _bound(port: int) -> socket.socket:
