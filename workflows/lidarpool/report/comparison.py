@@ -48,7 +48,7 @@ ONLY_A, ONLY_B = theme.rgb("#2ca25f"), theme.rgb("#101418")  # no colours of res
 NONE = theme.rgb("#c8cbd0")  # within images, whatever the page's colours
 RANGES, DIFFERENCES, FAR = "viridis", "RdBu_r", "plasma"
 SCALE = 6.0  # end of the scale of residuals, in median absolute deviations: about four sigma
-CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")
+CELLS = ("in_both", "in_a_only", "in_b_only", "returns_in_both")  # without a return, or with
 CLOSEST_M = 0.001  # end of the scale of distances
 
 
@@ -214,7 +214,7 @@ class _Comparing:
         self.cells: list[tuple[AnyArray, ...]] = []
         # Of points of A, and of B: distance to the other, own intensity, that of the nearest.
         self.pairs: tuple[list[Any], list[Any]] = ([], [])
-        # {ring: its elevation, cells with a return in both, in none, only in B, only in A}
+        # {ring: its elevation, and how many of its cells are of each of `CELLS`}
         self.rings: dict[int, tuple[float, Ints]] = {}
 
     def note(self, text: str) -> None:
@@ -272,8 +272,8 @@ class _Comparing:
         self.images = self.images or images
         row, values = images.row, images.compared
         in_a, in_b = np.isfinite(values[:, 0])
-        states = [row[state] for state in (in_a & in_b, ~in_a & in_b, in_a & ~in_b)]
-        states.insert(1, np.nonzero(~images.there[0] & ~images.there[1])[0])
+        neither, _ = np.nonzero(~images.there[0] & ~images.there[1])
+        states = [neither, row[~in_a & in_b], row[in_a & ~in_b], row[in_a & in_b]]
         counts = np.stack([np.bincount(s, minlength=len(images.rings)) for s in states], axis=1)
         for ring, elevation, count in zip(
             images.rings.tolist(), images.elevation_deg.tolist(), counts, strict=True
@@ -383,10 +383,10 @@ def _residuals(values: Floats) -> dict[str, Any]:
 
 def _no_return(counts: Any) -> dict[str, Any]:
     """Figures of cells without a return in A, with those in B as the truth."""
-    returns, both, of_a, of_b = counts.tolist()
-    names = {"in_both": both, "in_a_only": of_a, "in_b_only": of_b, "returns_in_both": returns}
+    both, of_a, of_b, _ = counts.tolist()
     precision = both / (both + of_a) if both + of_a else None
-    return names | _scores(precision, both / (both + of_b) if both + of_b else None)
+    recall = both / (both + of_b) if both + of_b else None
+    return dict(zip(CELLS, counts.tolist(), strict=True)) | _scores(precision, recall)
 
 
 def _scores(precision: float | None, recall: float | None) -> dict[str, float | None]:
@@ -452,9 +452,10 @@ def draw_ranges(found: Comparison) -> Page:
     page.colour_bar(theme.mapped(RANGES, ramp), norm, "range, m", frame)
     frame = (0.862, below / height, 0.014, share)
     page.colour_bar(theme.mapped(DIFFERENCES, ramp), scale, "A − B, mm", frame)
-    named = (("only A has a return", ONLY_A), ("only B has a return", ONLY_B),
-             ("no return", NONE))  # fmt: skip
-    handles = [_dot(text, colour) for text, colour in named]
+    handles = [
+        _dot("only A has a return", ONLY_A), _dot("only B has a return", ONLY_B),
+        _dot("no return", NONE),
+    ]  # fmt: skip
     _key(page, page.figure, handles, loc="upper right", bbox_to_anchor=(RIGHT, 1 - 40 / height))
     return page
 
