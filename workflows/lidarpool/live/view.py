@@ -453,8 +453,7 @@ class Surface:
         reflectance: Floats | None = None,
         most: int = MOST_TRIANGLES,
     ) -> None:
-        self._scene, self._reflectance = scene, reflectance
-        self.coarse = scene
+        self.coarse, self._reflectance = scene, reflectance
         self._stands: Ints | None = None  # for each triangle of the scene
         if len(scene.faces) > most:
             self.coarse, self._stands = simplified(scene, most)
@@ -487,7 +486,7 @@ class Surface:
             marks = [f"{n:.2g}" if n < 10 else f"{n:,.0f}" for n in named]
             return arrays, scale_legend(HITS_TITLE, marks) if hits.any() else None
         if by == "object":
-            colouring = colours_of(self._objects, OBJECT, self._scene.names)
+            colouring = colours_of(self._objects, OBJECT, self.coarse.names)
             colours, legend = colouring.paint(self._objects), legend_of(colouring)
         elif by == "reflectance" and self._reflectance is not None:
             colours = mapped("gray", 0.1 + 0.9 * self._reflectance[self._objects])

@@ -478,11 +478,10 @@ def _set_labels(page: Page, axes: Axes, scale: Scale, wide: float) -> None:
     axis, (low, high) = axes.xaxis, scale.edges[[0, -1]].tolist()
     if scale.labels:
         axes.set_xlim(low, high)
-        axis.set_ticks(range(len(scale.labels)), scale.short_labels)
-        slant = {"rotation": 28, "ha": "right", "rotation_mode": "anchor"}
-        for text in axes.get_xticklabels():
-            text.set(parse_math=False, fontsize=6.8 * page.unit, family=FONT)
-            text.set(**slant if scale.slanted(wide) else {})
+        style: dict[str, Any] = {"parse_math": False, "fontsize": 6.8 * page.unit, "family": FONT}
+        if scale.slanted(wide):
+            style |= {"rotation": 28, "ha": "right", "rotation_mode": "anchor"}
+        axis.set_ticks(range(len(scale.labels)), scale.short_labels, **style)
         return
     if scale.is_log:
         axes.set_xscale("log")

@@ -35,6 +35,7 @@ ROWS_MOST = 24  # rows of a partition; the busiest are drawn
 _THIN = 1.2  # least width of a bar, in units
 _GAP = 0.6  # bars nearer than this are drawn as one
 Span = tuple[float, float]
+Tasks = dict[tuple[str, str], list[TaskRecord]]  # {(worker, stage): their tasks}
 MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
 _SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
 
@@ -159,10 +160,8 @@ def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
         {"title": "Stages", "detail": "while at least one task ran", "rows": overview}
     ]
     ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
-    # {partition: {(worker, stage): tasks}}
-    drawn: dict[str, dict[tuple[str, str], list[TaskRecord]]] = defaultdict(
-        lambda: defaultdict(list)
-    )
+    # {partition: its tasks}
+    drawn: dict[str, Tasks] = defaultdict(lambda: defaultdict(list))
     for record in (record for stage in stages for record in stage.records):
         where = record.partition if not record.misplaced else " + ".join(record.resources)
         drawn[where or "no partition"][record.worker, record.stage].append(record)
