@@ -450,6 +450,5 @@ class LiveJob:
 
 def _rays_of(frames: list[Frame]) -> Floats32:
     """Return some rays (n, 2, 3) of frames, local."""
-    starts = [np.full_like(frame.samples, frame.pose.position) for frame in frames]
-    ends = np.concatenate([frame.samples for frame in frames])
-    return np.stack([np.concatenate(starts), ends], axis=1).astype(np.float32)
+    pairs = ((np.full_like(one.samples, one.pose.position), one.samples) for one in frames)
+    return np.concatenate([np.stack(pair, axis=1) for pair in pairs]).astype(np.float32)

@@ -247,11 +247,11 @@ class View:
     @property
     def planned(self) -> dict[str, Any] | None:
         """The planned path and its obstacles, if there is one."""
-        if self.path is None or self.pictured is None:
+        planning = None if self.pictured is None else self.pictured.planning
+        if self.path is None or planning is None:
             return None
-        planning = self.pictured.planning
-        discs = [] if planning is None else [*np.column_stack([planning.centres, planning.radii])]
-        return {"corners": self.path.tolist(), "discs": [disc.tolist() for disc in discs]}
+        discs = np.column_stack([planning.centres, planning.radii])
+        return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
@@ -370,20 +370,19 @@ class View:
         first, last = (int(scan) for scan in sweeps.scans[sweep : sweep + 2])
         rows, _ = finder.find(MOST_POINTS, scans=((first, last - 1),))
         image, limits = np.zeros((1, 1, 4), np.uint8), (0.0, 1.0)
+        number = int(sweeps.sensor[sweep])
         if len(rows):
             places = sweeps.in_sensor(sweep, positions(finder.points, rows))
             channels = None
             if "channel" in self.columns:
                 channels = finder.points.values("channel", rows).astype(np.int64)
-            number = int(sweeps.sensor[sweep])
             ranges = np.linalg.norm(places, axis=1)
             if number not in self._range_limits:  # one scale for all sweeps of a sensor
                 low, high = np.percentile(ranges, [1, 99])
                 self._range_limits[number] = float(low), float(high)
             limits = self._range_limits[number]
             image = range_image(places, ranges, channels, limits)
-        header = {"low": limits[0], "high": limits[1], "sensor": int(sweeps.sensor[sweep])}
-        return header, {"image": image}
+        return {"low": limits[0], "high": limits[1], "sensor": number}, {"image": image}
 
 
 def range_image(
@@ -454,7 +453,8 @@ class Surface:
         most: int = MOST_TRIANGLES,
     ) -> None:
         self.coarse, self._reflectance = scene, reflectance
-        self._stands: Ints | None = None  # for each triangle of the scene
+        # (f,): which triangle stands for each of the scene; -1 where nothing is left.
+        self._stands = np.arange(len(scene.faces))
         if len(scene.faces) > most:
             self.coarse, self._stands = simplified(scene, most)
         self._objects = self.coarse.face_object
@@ -473,13 +473,10 @@ class Surface:
         arrays: dict[str, AnyArray] = {"corners": self.corners, "objects": self._objects}
         legend: Legend | None = None
         if by == "hits":
-            hits = hit_counts.astype(np.float64)
-            if self._stands is not None:
-                left = self._stands >= 0
-                sums = np.bincount(self._stands[left], hits[left], len(self.corners))
-                hits = sums.astype(np.float64)
+            left = self._stands >= 0
+            hits = np.bincount(self._stands[left], hit_counts[left], len(self.corners))
             most = len(self.corners) + MOST_PIECES
-            made = hit_colours(self.coarse, self.corners, hits, points, most)
+            made = hit_colours(self.coarse, self.corners, hits.astype(float), points, most)
             arrays["corners"], owner, colours, (low, high) = made
             arrays |= {"objects": self._objects[owner], "colours": as_bytes(colours)}
             named = (low, (low * high) ** 0.5, high)
@@ -540,11 +537,10 @@ def as_bytes(colours: Floats) -> Bytes:
 @contextmanager
 def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
     """Serve the page of a result while the body runs; see `announced`."""
-    count = counted(len(view.points), "point")
-    with page_server(view.answer, port) as page:
-        ends = "" if cell_display() else "; Ctrl-C ends it"
-        with announced(page, f"{page.url} shows {count}{ends}", browser):
-            yield page
+    shows = f"shows {counted(len(view.points), 'point')}"
+    shows += "" if cell_display() else "; Ctrl-C ends it"
+    with page_server(view.answer, port) as page, announced(page, f"{page.url} {shows}", browser):
+        yield page
 
 
 def wait_for_interrupt(stopped: Event | None = None) -> None:

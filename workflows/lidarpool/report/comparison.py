@@ -163,8 +163,7 @@ def compare(
         raise LidarpoolError(f"{one.name} has no sweeps: leave out --sweep and --match.")
     if not first.whole or not second.whole:
         found.notes.append(f"{one.name} has no sweeps: all points of both are compared at once")
-    clouds = [found.cloud(one, most_points) for one in recordings]
-    found.add(clouds[0], clouds[1], MOST_VALUES)
+    found.add(found.cloud(first, most_points), found.cloud(second, most_points), MOST_VALUES)
     return found.result(0)
 
 

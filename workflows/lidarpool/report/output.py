@@ -143,7 +143,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         """
         place, folder, formats = self.place, self._folder, self.formats
         storage = place if isinstance(place, Storage) else None
-        _, earlier = _earlier(Storage.at(storage or folder))
+        target = Storage.at(storage or folder)
+        _, earlier = _earlier(target)
         points, sweeps = result.points, Sweeps.of(result.survey, result.scene)
         cloud = CountedCloud(points, len(result.scene.all_names))
         advice = "make room or give another folder with --out"
@@ -153,25 +154,24 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             nullcontext() if self.only_cloud else _Pictures(result, staged) as pictures,
         ):
             drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
-            instruments = sweeps.instruments
             further = _further_files(result.survey, formats)
             files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
-            refuse_strangers(Storage.at(storage or folder), {*further, *earlier})
+            refuse_strangers(target, {*further, *earlier})
 
             @cache
-            def clear(storage: Storage) -> None:
+            def clear() -> None:
                 """Remove once what an earlier result has there and this one would not replace."""
                 for name in (REPORT, PAGE, *_stale(earlier, files)):
-                    storage.discard(name)
+                    target.discard(name)
 
             sweeps.save(staged / SWEEPS_FILE)
-            if instruments is not None:
+            if (instruments := sweeps.instruments) is not None:
                 write_instruments(staged, result.survey, result.scene.origin)
                 sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
             Format("ply").write(staged / CLOUD, cloud, sweeps)
             for one in sorted(formats, key=lambda one: one.in_pieces):
                 if storage and workers and one.in_pieces:
-                    clear(storage)
+                    clear()
                     one.put(storage, points, sweeps, workers)
                 else:
                     one.write(
@@ -191,7 +191,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             if storage is None:
                 _move(staged, folder, files, earlier, then)
             else:
-                clear(storage)
+                clear()
                 for name in files:  # the report is last; those of workers are there
                     if (staged / name).exists():
                         storage.put(staged / name, name)

@@ -67,11 +67,11 @@ def draw_pictures(
             there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
             raise LidarpoolError(f"There is no picture {name!r}.{there}")
         if name not in makers:
-            why = "its run planned no path"
-            if name != "path":
+            why = f"the cloud has no column {' or '.join(_LIGHT)}"
+            if name == "path":
+                why = "its run planned no path"
+            elif shown.coordinates == "sensor":
                 why = "points are in the axes of their sensors"
-                if shown.coordinates != "sensor":
-                    why = f"the cloud has no column {' or '.join(_LIGHT)}"
             raise LidarpoolError(f"There is no picture {name!r}: {why}.")
     with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
@@ -301,10 +301,7 @@ def _seen(sight: Sight, places: Floats, samples: Samples, which: Ints) -> Bools:
     """Whether any of places (p, 3) sees the side of the samples that the camera sees: (k,)."""
     points = samples.position[which].astype(np.float64)
     normals = samples.normal[which].astype(np.float64)
-    seen = np.zeros(len(which), np.bool_)
-    left = np.arange(len(which))
+    hidden = np.arange(len(which))
     for place in places:
-        sides = sight.sides(place, points[left], normals[left])
-        seen[left[sides > 0]] = True
-        left = left[sides <= 0]
-    return seen
+        hidden = hidden[sight.sides(place, points[hidden], normals[hidden]) <= 0]
+    return ~np.isin(np.arange(len(which)), hidden)
