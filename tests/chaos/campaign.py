@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from collections import Counter
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -147,6 +148,7 @@ class Arena:
                 tally.done.update(self._harm(self.folder / out))
             else:
                 tally.errors.append(err)
+                print(f"a driver ended: {err.strip()}", flush=True)
             if len(tally.errors) > 10:
                 return
             driver = self.start(out)
@@ -180,8 +182,9 @@ def files_of(dataset: Path) -> dict[str, bytes]:
 
 def judge(dataset: Path, reference: dict[str, bytes], tally: Tally) -> None:
     """Compare a data set with an undisturbed one."""
-    with (dataset / "jobs.csv").open(newline="") as file:
-        rows = Counter(row["number"] for row in csv.DictReader(file))
+    rows: Counter[str] = Counter()
+    with suppress(FileNotFoundError), (dataset / "jobs.csv").open(newline="") as file:
+        rows.update(row["number"] for row in csv.DictReader(file))
     count = sum(1 for name in reference if name.startswith(".jobs/"))
     tally.datasets += 1
     tally.lost += count - len(rows)
@@ -218,8 +221,6 @@ def main(arguments: list[str] | None = None) -> int:
                 print(f"{time.monotonic() - started:5.0f} s: {tally}", flush=True)
         finally:
             arena.cluster.close()
-    for error in dict.fromkeys(tally.errors):
-        print(f"a driver ended: {error.strip()}")
     if tally.differing:
         print("differ:", ", ".join(sorted({*tally.differing})[:20]))
     print(tally)

@@ -464,6 +464,27 @@ def test_a_job_under_way_is_gone_on_with_if_its_content_is_the_same(change, fold
     assert any(name.endswith(".npz") for name in again.storage.sizes()) == same
 
 
+def test_a_lost_database_is_made_again_though_drivers_end_meanwhile(folder):
+    store, _ = campaign(folder)
+    store.end([JobRow(0, "0000")])
+    store.db.close()
+    (folder / "run.db").unlink()
+    for end in ("killed", "interrupted", "alive"):
+        store, job = campaign(folder, resume=True)
+        assert store.begun and not store.kept  # nothing is taken over yet
+        if end != "alive":
+            store.close() if end == "interrupted" else store.db.close()
+    store.points_of(job)
+    add(store, 0, 2, job)
+    store.close()
+    store, _ = campaign(folder, resume=True)
+    assert store.kept == "0 of 2 jobs"
+    store.db.close()
+    remove_run(folder)
+    campaign(folder)[0].db.close()
+    assert not opened(folder, resume=True).begun, "the other campaign has kept nothing"
+
+
 def test_a_link_with_the_name_of_a_part_is_no_part(unfinished, tmp_path):
     part, victim = part_of(unfinished, 0), tmp_path / "victim"
     part.rename(victim)

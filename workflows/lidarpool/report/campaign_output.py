@@ -99,7 +99,7 @@ class DataSetOutput(Output[CampaignRun]):
             store.adopt(rows, sensors=json.dumps(self._made["sensors"]))
         elif conductor.resume:
             self._take_over(store)
-        _own_files(out, begun=bool(store.kept or store.notes))  # perhaps without its database
+        _own_files(out, begun=store.begun or bool(store.kept))  # some were perhaps taken over
         if self._made is None:
             _, self._wrong = _look(self.dataset, store.rows(), options.verify, self.campaign)
         if not store.kept:

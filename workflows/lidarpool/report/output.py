@@ -192,7 +192,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 _move(staged, folder, files, earlier, then)
             else:
                 clear()
-                for name in files:  # the report is last; those of workers are there
+                for name in (*_FURTHER, *FILES):
                     if (staged / name).exists():
                         storage.put(staged / name, name)
                 with deferred_interrupts():
@@ -241,8 +241,9 @@ def _move(
         # A path of an earlier run would look like this one's; folders are not replaced.
         for name in _stale(earlier, files):
             Storage.at(folder).discard(name)
-        for name in files:  # the report is last
-            (staged / name).replace(folder / name)
+        for name in (*_FURTHER, *FILES):
+            if name in files:
+                (staged / name).replace(folder / name)
         flush(folder)
         then()
 

@@ -87,6 +87,7 @@ class RunStore:
         self.jobs, self._wanted = jobs, backend
         self.lasting = place is not None
         self.notes: list[str] = []  # remarks for the user
+        self.begun = False  # whether it goes on with an earlier run
         self._gone = False
         self.identity = software() | dict(jobs.identity)
         self._remote = None
@@ -123,6 +124,7 @@ class RunStore:
             if path.exists():
                 db = RunDatabase(path, durable=durable)
                 if db.used:
+                    self.begun = True
                     return db
                 db.close()
                 mark, earlier = db.meta["mark"], db.meta.get("parts", "")
@@ -130,11 +132,15 @@ class RunStore:
             damage = error
         except LidarpoolError as error:  # the copy of a database is nobody's business
             raise LidarpoolError(str(error).replace(self._folder.url, self.place.url)) from error
-        new = self._marked(parts) if resume and not mark else None
+        new = self._marked(parts) if resume else None
+        if new is not None and mark and self._other(new["identity"]):
+            new = None  # it has kept nothing
         if new is not None:
             read_place(path)  # an error if it is another program's
             self._check_same(new["identity"])
-            self.notes.append(f"{FILE} was missing or damaged, and is made again from the parts")
+            self.begun = True
+            lost = f"{FILE} was missing or damaged, and is made again from the parts"
+            self.notes += [lost] * (not mark)
         elif damage is not None:
             told = str(damage).replace(self._folder.url, self.place.url)
             raise LidarpoolError(told) from damage
@@ -210,9 +216,12 @@ class RunStore:
                 f"cast with {self.backend!r}: continue with that, or drop them with {_DROP}."
             )
 
+    def _other(self, identity: str) -> str:
+        return _difference(self.identity, json.loads(identity))
+
     def _check_same(self, identity: str) -> None:
         """Check that the run that is there is the same."""
-        if other := _difference(self.identity, json.loads(identity)):
+        if other := self._other(identity):
             raise LidarpoolError(
                 f"The run in {self.place} cannot be continued, {other}. Drop it with {_DROP}, or "
                 "give another folder."
@@ -373,8 +382,8 @@ class RunStore:
             raise
 
     def close(self) -> None:
-        """Close the database of an unfinished run; remove one that has committed nothing."""
-        used = self.db.used
+        """Close the database of an unfinished run; remove one that has kept nothing."""
+        used = self.db.used or self.begun
         self.db.close()
         if not used:
             with suppress(OSError, LidarpoolError):
