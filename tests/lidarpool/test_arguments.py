@@ -45,6 +45,8 @@ from lidarpool import (
     simulate,
     sweeps,
 )
+from lidarpool.run.options import RunOptions
+from lidarpool.scenario.sections import PoolSection
 
 POINTS, FACES, OWNERS = np.eye(3), np.array([[0, 1, 2]]), np.zeros(1, int)
 AT = [(0, 0, 1)]
@@ -228,6 +230,14 @@ def test_options_of_a_survey_are_checked_too():
         with pytest.raises(LidarpoolError) as raised:
             Survey(poses=AT, **options)
         assert says in str(raised.value)
+
+
+def test_a_scenario_says_how_it_is_run_unless_python_does():
+    pool = PoolSection(gpu=3, batch_mb=64, backend="numpy")
+    said = RunOptions.of(pool, gpu_workers=None, backend=None, live=True)
+    assert (said.gpu_workers, said.batch_mb, said.backend, said.live) == (3, 64, "numpy", True)
+    given = RunOptions.of(pool, gpu_workers=2, backend="embree")
+    assert (given.gpu_workers, given.batch_mb, given.backend) == (2, 64, "embree")
 
 
 def test_nothing_public_is_left_out():

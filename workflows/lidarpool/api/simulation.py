@@ -24,7 +24,6 @@ from ..run.result import CampaignRun, RunResult
 from ..run.store import RUN_FOLDER
 from ..scenario import campaign as described
 from ..scenario.build import Job
-from ..scenario.sections import TaskOptions
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..simulator.world import check_backend_here
@@ -190,7 +189,7 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             Called some ten times a second. Without it there are bars in a notebook and at a
             terminal.
         gpu_workers
-            Workers of a local cluster that cast.
+            Workers of a local cluster that cast; by default as many as the scenario says.
         parts
             Place of the points during the run, as for `simulate`.
         resume
@@ -223,12 +222,13 @@ class Campaign(described.Campaign):  # noqa: D101 - as there
             another campaign or version; one or two lines say which and what to do.
         """
         place = output_place(out)
-        options = RunOptions(
+        options = RunOptions.of(
+            self.pool,
             out=place,
             folder=Storage.at(place).below(RUN_FOLDER),
             client=client,
             gpu_workers=gpu_workers,
-            **declared(self.pool, TaskOptions) | ({"backend": backend} if backend else {}),
+            backend=backend,
             parts=parts,
             resume=resume,
             fresh=fresh,

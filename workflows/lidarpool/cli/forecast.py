@@ -49,7 +49,7 @@ from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import Rig
 from ..simulator.world import check_backend_here
-from .run_command import no_hits, options_of
+from .run_command import no_hits
 from .terminal import Terminal
 
 # Measured on Linux: a process of ours with Dask loaded, and the most that a triangle takes while a
@@ -106,7 +106,7 @@ def look_at(
             built = build(read, plans=campaign is None and not no_plan)
             job = built.job()
         with terminal.status("casting some rays"):
-            found = forecast(job, options_of(read.pool, **given), client)
+            found = forecast(job, RunOptions.of(read.pool, **given), client)
         found["notes"] += advice(built)
         found["sources"] = dict(built.found.sources)
         if campaign is not None:

@@ -10,7 +10,6 @@ from typing import Any
 
 import click
 
-from ..base.declared import declared
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.words import counted
@@ -37,16 +36,9 @@ from ..scenario.build import Built, Job, build
 from ..scenario.campaign import Campaign
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
-from ..scenario.sections import PoolSection, TaskOptions
 from ..simulator.world import check_backend_here
 from .options import show
 from .terminal import Terminal
-
-
-def options_of(pool: PoolSection, backend: str | None = None, **given: Any) -> RunOptions:
-    """Options of a scenario's section `pool`, and those that were given."""
-    tasks = declared(pool, TaskOptions) | ({"backend": backend} if backend else {})
-    return RunOptions(gpu_workers=pool.gpu, other_workers=pool.other, **tasks, **given)
 
 
 def run_scenario(
@@ -56,7 +48,7 @@ def run_scenario(
 
     LidarpoolError if the run fails; notes of the error say what was kept.
     """
-    options = options_of(scenario.pool, **given)
+    options = RunOptions.of(scenario.pool, **given)
     if options.own:  # before reading the scene, which may take long
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
@@ -94,7 +86,7 @@ def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
     if only:
         raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
-    options = options_of(campaign.pool, **given)
+    options = RunOptions.of(campaign.pool, **given)
     assert options.out is not None, "commands write"
     with page_of(campaign, options.live) as page:
         output = DataSetOutput(options.out, campaign)
@@ -149,7 +141,7 @@ def run_job(
             )
         return f"the points are those of job {name} in {place}, bit for bit"
 
-    options = options_of(scenario.pool, **given)
+    options = RunOptions.of(scenario.pool, **given)
     _run_survey(built, replace(job, number=0), options, terminal, only, compare)
 
 

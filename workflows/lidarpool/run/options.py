@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from distributed import Client
 from pydantic import Field
 
+from ..base.declared import declared
 from ..base.storage import Storage
 from ..base.validation import checked_fields
 from ..base.vocabulary import PATIENCE_S, WAIT_S
-from ..scenario.sections import TaskOptions
+from ..scenario.sections import PoolSection, TaskOptions
 from .cluster_file import ClusterFile
 from .connection import TlsFiles
 
@@ -46,6 +47,13 @@ class RunOptions(TaskOptions):
     patience_s: Annotated[float, Field(ge=0)] = PATIENCE_S
     live: bool = False
     stay: bool = True  # of the live page, at the end
+
+    @classmethod
+    def of(cls, pool: PoolSection, **given: Any) -> RunOptions:
+        """Options of a scenario's section `pool`, unless others are given that are not None."""
+        own = declared(pool, TaskOptions)
+        own |= {"gpu_workers": pool.gpu, "other_workers": pool.other}
+        return cls(**own | {name: one for name, one in given.items() if one is not None})
 
     @property
     def own(self) -> bool:
