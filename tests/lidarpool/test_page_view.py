@@ -304,6 +304,7 @@ def test_points_in_the_axes_of_their_sensor_are_shown_without_the_scene(cloud, p
     state, arrays = told(view, "state")
     assert (state["scene"], "axes of their sensor" in state["note"]) == (None, True)
     assert not arrays["sensor0_places"].any()  # each sensor is at its own origin
+    assert len(pictured.sample_rays) and not len(arrays["rays"]), "which are in the scene's axes"
     assert ["Wall", 0] in told(view, "column", name="object")[0]["labels"]
 
 

@@ -287,7 +287,9 @@ class Charts:
 
     def version(self, over: bool) -> int:
         """Return how many jobs `drawn` draws, or has drawn if it is not yet time to do it again."""
-        jobs, is_due = self._figures.jobs, self._share.due and self._figures.done
+        with self._lock:
+            jobs, done = self._figures.jobs, self._figures.done
+        is_due = self._share.due and done
         return jobs if over or (is_due and jobs < self._count) else self._drawn
 
     def drawn(self, over: bool) -> str:
