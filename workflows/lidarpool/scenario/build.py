@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
+from functools import partial
 from glob import escape
 from pathlib import Path
 from typing import Any
@@ -32,11 +33,19 @@ from ..sensor.survey import CloudOptions
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
 from ..simulator.surfaces import warn_of_grey
-from .moving import ActorSection, MountSection, VehicleSection, actors_of, read_fcd
+from .moving import (
+    ActorSection,
+    MountSection,
+    TrafficSection,
+    VehicleSection,
+    actors_of,
+    read_fcd,
+)
 from .placing import Placing, place
 from .scenario import Scenario
 from .sections import CopiesSection, MeshFile, SensorSection
-from .static_scene import SceneCache, Shapes, StaticScene, read_static_scene
+from .standing import Standing
+from .static_scene import Findings, SceneCache, Shapes, read_static_scene
 
 # Objects lower than this are floors and markings, which a path may cross.
 FLAT_M = 0.2
@@ -47,6 +56,8 @@ SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
 # Of the hits in a scene with the default objects, every so many are kept.
 SEED_KEPT = 5
+
+Robots = Mapping[MeshFile, Robot]  # by the file that each is read from
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,9 +145,39 @@ def build(
         If a file cannot be read, or fields do not fit together or the scene.
     """
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
-    return Built(scenario, static, plans, columns)
+    found, scene, standing = static.found.copy(), static.scene, static.standing
+    shapes, robots = Shapes(scenario, found), _read_robots(scenario, found)
+    epsg, way = _common_epsg(scenario, found), scenario.trajectory
+    with prefixed(scenario.source):
+        track = None if way is None else way.track(scenario.path, standing)
+        sensors = _mounted(scenario, robots)
+    placing: Placing | None = None
+    if scenario.poses is None and track is None and not scenario.scene.has_seed:
+        placing = place(scene, sensors[0], landscape=bool(found.rasters))
+    poses = SEED_POSES if placing is None else placing.poses
+    survey_of = partial(_survey, scenario, sensors, track or poses, scene.origin, epsg)
+    actors = _actors(scenario, standing, track, shapes, robots)
+    vehicles: list[tuple[Actor, VehicleSection]] = []
+    if scenario.traffic is not None:
+        with prefixed(scenario.source):
+            duration_s = survey_of([]).duration_ns / 1e9
+            start_s = 0.0 if track is None else track.start_s or 0.0
+            vehicles = _vehicles(scenario.traffic, shapes, standing, start_s, duration_s)
+    if actors or vehicles:
+        scene = scene.with_actors([*scene.actors, *actors, *(actor for actor, _ in vehicles)])
+    mistakes, planning = Mistakes(), None
+    with mistakes.noted():
+        with prefixed(scenario.source):
+            classes = [entry.semantic_class for _, entry in vehicles]
+            survey = survey_of(_materials(scenario, scene, classes), columns)
+        MaterialTable.of(survey.materials, scene.all_names, voxels=scene.has_voxels)
+    with mistakes.noted(), prefixed(scenario.source):
+        planning = _planning(scenario, scene) if plans else None
+    mistakes.tell()
+    return Built(scenario, scene, survey, planning, placing, found)
 
 
+@dataclass(frozen=True, eq=False)
 class Built:
     """What a scenario describes; `build` makes it.
 
@@ -152,260 +193,252 @@ class Built:
         What was noted meanwhile, and what each file gave.
     """
 
-    def __init__(
-        self, scenario: Scenario, static: StaticScene, plans: bool, columns: Sequence[str]
-    ) -> None:
-        self.scenario, self.found = scenario, static.found.copy()
-        self.scene, self._standing = static.scene, static.standing
-        self._shapes, self._robots = Shapes(scenario, self.found), self._read_robots()
-        self._epsg = self._common_epsg()
-        way = scenario.trajectory
-        with prefixed(scenario.source):
-            self._track = None if way is None else way.track(scenario.path, self._standing)
-            self._sensors = self._mounted()
-        self.placing: Placing | None = None
-        if scenario.poses is None and self._track is None and not scenario.scene.has_seed:
-            rasters = bool(self.found.rasters)
-            self.placing = place(self.scene, self._sensors[0], landscape=rasters)
-        actors, vehicles = self._actors(), self._vehicles()
-        if actors or vehicles:
-            traffic = (actor for actor, _ in vehicles)
-            self.scene = self.scene.with_actors([*self.scene.actors, *actors, *traffic])
-        mistakes = Mistakes()
-        with mistakes.noted():
-            with prefixed(scenario.source):
-                materials = self._materials([entry.semantic_class for _, entry in vehicles])
-                self.survey = self._survey(materials, columns)
-            names, voxels = self.scene.all_names, self.scene.has_voxels
-            MaterialTable.of(self.survey.materials, names, voxels=voxels)
-        with mistakes.noted(), prefixed(scenario.source):
-            self.planning = self._planning() if plans else None
-        mistakes.tell()
+    scenario: Scenario
+    scene: Scene
+    survey: Survey
+    planning: Planning | None
+    placing: Placing | None
+    found: Findings
 
     def job(self, **own: Any) -> Job:
         """Return it as a job; `own` are further fields, such as `name`."""
         outputs = tuple(one for one in self.scenario.output.write if one.format != "ply")
         return Job(self.scene, self.survey, self.planning, outputs=outputs, **own)
 
-    def _read_robots(self) -> dict[MeshFile, Robot]:
-        """Read the robots, each file once."""
-        robots: dict[MeshFile, Robot] = {}
-        for file in dict.fromkeys(entry.robot for entry in self.scenario.actors if entry.robot):
-            with prefixed(self.scenario.source):
-                path = self.scenario.path(file.file)
-            robots[file] = load_robot(
-                path,
-                opacity=file.opacity,
-                colours=self.scenario.coloured,
-                tell=self.found.notes.append,
-            )
-            self.found.sources[file.file] = robots[file].summary
-        return robots
 
-    def _common_epsg(self) -> int | None:
-        """EPSG code of the rasters that stay where they are; they must be of one system."""
-        stay = [(e.file, raster) for e, raster in self.found.rasters if e.transform().keeps_xy]
-        systems = {raster.crs: file for file, raster in stay if raster.crs}
-        if len(systems) > 1:
-            listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
-            raise LidarpoolError(
-                f"{self.scenario.source}: rasters of one scene have several coordinate systems: "
-                f"{listed}. Give cloud.epsg, the code of the one that all of them are brought to."
-            )
-        return next((raster.epsg for _, raster in stay if raster.crs), None)
-
-    def _mounted(self) -> list[Mounted]:
-        """Return the sensors on their carrier."""
-        given = self.scenario
-        sections: Mapping[str, SensorSection] = given.sensors or {"": given.sensor}
-        return [
-            section.mounted(given.path, self._mount(section), given.noise, given.returns, name)
-            for name, section in sections.items()
-        ]
-
-    def _mount(self, section: SensorSection) -> Pose:
-        """Pose of a sensor in the carrier's axes."""
-        mount: MountSection | None = getattr(section, "mount", self.scenario.mount)
-        if mount is None or mount.link is None:
-            return CENTRE if mount is None else mount.pose()
-        carriers = [
-            (entry, self._robots[entry.robot])
-            for entry in self.scenario.actors
-            if entry.trajectory is None and entry.robot
-        ]
-        on = [(entry, robot) for entry, robot in carriers if mount.link in robot.links]
-        if len(on) != 1:
-            links = [link for _, robot in carriers for link in robot.links]
-            raise LidarpoolError(
-                f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
-                f"have; one must.{did_you_mean(mount.link, links)}"
-            )
-        ((entry, robot),) = on
-        with prefixed(f"actor {entry.name!r}"):
-            path = robot.path(mount.link, joints=self._joints(entry))
-        if path.moves:
-            raise LidarpoolError(
-                f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "
-                "mount the sensor on a link that does not move, or leave out those joints' columns."
-            )
-        return path.pose(0).then(mount.pose())
-
-    def _joints(self, entry: ActorSection) -> Path | None:
-        return None if entry.joints is None else self.scenario.path(entry.joints)
-
-    def _actors(self) -> list[Actor]:
-        """Build the actors; their trajectories begin with that of the survey."""
-        scenario, out = self.scenario, list[Actor]()
+def _read_robots(scenario: Scenario, found: Findings) -> dict[MeshFile, Robot]:
+    """Read the robots, each file once."""
+    robots: dict[MeshFile, Robot] = {}
+    for file in dict.fromkeys(entry.robot for entry in scenario.actors if entry.robot):
         with prefixed(scenario.source):
-            ways = [e.way(scenario.path, self._standing, self._track) for e in scenario.actors]
-        for entry, way in zip(scenario.actors, ways, strict=True):
-            if entry.robot:
-                with prefixed(f"{scenario.source}: actor {entry.name!r}"):
-                    out += self._links(entry, self._robots[entry.robot], way)
-            else:
-                out.append(Actor(replace(self._shapes.of(entry), name=entry.name), way))
-        return out
+            path = scenario.path(file.file)
+        robots[file] = load_robot(
+            path,
+            opacity=file.opacity,
+            colours=scenario.coloured,
+            tell=found.notes.append,
+        )
+        found.sources[file.file] = robots[file].summary
+    return robots
 
-    def _links(self, entry: ActorSection, robot: Robot, way: Track) -> Sequence[Actor]:
-        """Actors of a robot, without the links that sensors are mounted on."""
-        tell, links = self.found.notes.append, self.scenario.links
-        without = links.intersection(robot.meshes) if entry.trajectory is None else ()
-        for link in sorted(without):
-            tell(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
-        joints = self._joints(entry)
-        return robot.actors(way, joints, name=entry.name, without=without, tell=tell)
 
-    def _vehicles(self) -> list[tuple[Actor, VehicleSection]]:
-        """Vehicles and persons that are there during the survey, each with its entry."""
-        section = self.scenario.traffic
-        if section is None:
-            return []
-        start_s = 0.0 if self._track is None else self._track.start_s or 0.0
-        with prefixed(self.scenario.source):
-            duration = self._survey([]).duration_ns / 1e9
-            begin = start_s - section.offset_s
-            path = self.scenario.path(section.file)
-            passages, count = read_fcd(path, begin, begin + duration)
-            made = actors_of(section, passages, self._shapes.of, self._standing, start_s)
-        if not made:
-            self.found.notes.append(
-                f"{section.file}: no vehicle or person is in the scene from {begin:g} to "
-                f"{begin + duration:g} s of the file: check offset_s, translation and surfaces"
+def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
+    """EPSG code of the rasters that stay where they are; they must be of one system."""
+    stay = [(e.file, raster) for e, raster in found.rasters if e.transform().keeps_xy]
+    systems = {raster.crs: file for file, raster in stay if raster.crs}
+    if len(systems) > 1:
+        listed = ", ".join(f"{file} in {crs[:60]}" for crs, file in systems.items())
+        raise LidarpoolError(
+            f"{scenario.source}: rasters of one scene have several coordinate systems: "
+            f"{listed}. Give cloud.epsg, the code of the one that all of them are brought to."
+        )
+    return next((raster.epsg for _, raster in stay if raster.crs), None)
+
+
+def _mounted(scenario: Scenario, robots: Robots) -> list[Mounted]:
+    """Return the sensors on their carrier."""
+    given = scenario
+    sections: Mapping[str, SensorSection] = given.sensors or {"": given.sensor}
+    return [
+        section.mounted(
+            given.path, _mount(section, given, robots), given.noise, given.returns, name
+        )
+        for name, section in sections.items()
+    ]
+
+
+def _mount(section: SensorSection, scenario: Scenario, robots: Robots) -> Pose:
+    """Pose of a sensor in the carrier's axes."""
+    mount: MountSection | None = getattr(section, "mount", scenario.mount)
+    if mount is None or mount.link is None:
+        return CENTRE if mount is None else mount.pose()
+    carriers = [
+        (entry, robots[entry.robot])
+        for entry in scenario.actors
+        if entry.trajectory is None and entry.robot
+    ]
+    on = [(entry, robot) for entry, robot in carriers if mount.link in robot.links]
+    if len(on) != 1:
+        links = [link for _, robot in carriers for link in robot.links]
+        raise LidarpoolError(
+            f"mount.link is {mount.link!r}, which {len(on) or 'no'} robots on the carrier "
+            f"have; one must.{did_you_mean(mount.link, links)}"
+        )
+    ((entry, robot),) = on
+    with prefixed(f"actor {entry.name!r}"):
+        path = robot.path(mount.link, joints=_joints(entry, scenario))
+    if path.moves:
+        raise LidarpoolError(
+            f"mount.link is {mount.link!r}, which {entry.joints} moves, and a mount is rigid: "
+            "mount the sensor on a link that does not move, or leave out those joints' columns."
+        )
+    return path.pose(0).then(mount.pose())
+
+
+def _joints(entry: ActorSection, scenario: Scenario) -> Path | None:
+    return None if entry.joints is None else scenario.path(entry.joints)
+
+
+def _actors(
+    scenario: Scenario, standing: Standing, track: Track | None, shapes: Shapes, robots: Robots
+) -> list[Actor]:
+    """Build the actors; their trajectories begin with that of the survey."""
+    out: list[Actor] = []
+    with prefixed(scenario.source):
+        ways = [e.way(scenario.path, standing, track) for e in scenario.actors]
+    for entry, way in zip(scenario.actors, ways, strict=True):
+        if entry.robot:
+            with prefixed(f"{scenario.source}: actor {entry.name!r}"):
+                out += _links(entry, robots[entry.robot], way, shapes)
+        else:
+            out.append(Actor(replace(shapes.of(entry), name=entry.name), way))
+    return out
+
+
+def _links(entry: ActorSection, robot: Robot, way: Track, shapes: Shapes) -> Sequence[Actor]:
+    """Actors of a robot, without the links that sensors are mounted on."""
+    tell, links = shapes.found.notes.append, shapes.scenario.links
+    without = links.intersection(robot.meshes) if entry.trajectory is None else ()
+    for link in sorted(without):
+        tell(f"{entry.name}: link {link} is left out: a sensor is mounted on it")
+    joints = _joints(entry, shapes.scenario)
+    return robot.actors(way, joints, name=entry.name, without=without, tell=tell)
+
+
+def _vehicles(
+    section: TrafficSection, shapes: Shapes, standing: Standing, start_s: float, duration_s: float
+) -> list[tuple[Actor, VehicleSection]]:
+    """Vehicles and persons that are there during the survey, each with its entry."""
+    begin, found = start_s - section.offset_s, shapes.found
+    passages, count = read_fcd(shapes.scenario.path(section.file), begin, begin + duration_s)
+    made = actors_of(section, passages, shapes.of, standing, start_s)
+    if not made:
+        found.notes.append(
+            f"{section.file}: no vehicle or person is in the scene from {begin:g} to "
+            f"{begin + duration_s:g} s of the file: check offset_s, translation and surfaces"
+        )
+    found.sources[section.file] = (
+        f"{counted(len(made), 'actor')} during the survey, of {counted(count, 'vehicle')} "
+        "and persons until its end"
+    )
+    return made
+
+
+def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None]) -> list[Material]:
+    """Materials by name, with the classes of actors and copies, and of city objects.
+
+    `vehicles` are the classes of the last actors of the scene.
+    """
+    every, made = Material("*"), [*scenario.materials]
+    own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
+    for entry in scenario.placed:
+        if entry.semantic_class is None:
+            continue
+        named = {entry.name: [escape(entry.name)]}
+        numbered = f"{escape(entry.name)}.[0-9]*"
+        if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
+            named[entry.name].append(numbered)
+        elif isinstance(entry, ActorSection) and entry.robot:
+            links = [a.name for a in scene.actors if a.name.startswith(f"{entry.name}/")]
+            named = {link: [escape(link)] for link in links}
+        own += [(name, names, entry.semantic_class) for name, names in named.items()]
+    if own and not made:
+        made = [every]
+    for name, names, semantic_class in own:
+        # After the last that is for it: a later one, for a single copy, counts there.
+        after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
+        of = made[after] if after >= 0 else every
+        made.insert(after + 1, replace(of, objects=names, semantic_class=semantic_class))
+    first = len(scene.all_names) - len(vehicles)
+    for semantic_class in sorted({one for one in vehicles if one is not None}):
+        rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
+        made = with_class(made or [every], semantic_class, rows, scene.all_names)
+    if any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files):
+        made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
+    return made
+
+
+def _survey(
+    given: Scenario,
+    carried: Sequence[Mounted],
+    way: Track | Sequence[Pose],
+    origin: Floats,
+    epsg: int | None,
+    materials: Sequence[Material],
+    columns: Sequence[str] = (),
+) -> Survey:
+    """Build the survey along a track, or at poses if the scenario gives none; local coordinates."""
+    needs, cloud = given.output.needs, declared(given.cloud, CloudOptions)
+    cloud["columns"] = (*given.cloud.columns, *needs, *columns)
+    cloud["epsg"] = given.cloud.epsg or epsg
+    if given.scene.has_seed and cloud["keep_every"] is None:
+        cloud["keep_every"] = 1 if "ray" in needs else SEED_KEPT
+    check_whole((*needs, *columns), cloud["keep_every"] or 1)
+    track = way if isinstance(way, Track) else None
+    poses = () if isinstance(way, Track) else given.poses or way
+    own_noise = all(one.noise is not None for one in carried)
+    alone = not given.sensors and given.mount is None and carried[0].noise is None
+    return Survey(
+        poses=[replace(p, position=tuple(np.subtract(p.position, origin))) for p in poses],
+        trajectory=track,
+        **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
+        steps=given.steps,
+        materials=materials,
+        returns=Returns(**dict(given.returns)),
+        noise=Noise() if own_noise else Noise(**dict(given.noise)),
+        navigation=given.navigation,
+        **declared(given.weather, Weather),
+        **cloud,
+    )
+
+
+def _planning(scenario: Scenario, scene: Scene) -> Planning | None:
+    """Build the planning in local coordinates; None if the scenario asks for none."""
+    section, (x0, y0, _) = scenario.planning, scene.origin
+    start, target = section.start, section.target
+    if scenario.scene.has_seed:
+        start, target = start or SEED_START, target or SEED_TARGET
+    if section.enabled is False or start is None or target is None:
+        return None
+    discs, labels = _discs(scenario, scene)
+    discs[:, 2] += section.clearance_m
+    wide = np.flatnonzero(discs[:, 2])  # upright lines have no area
+    discs, labels = discs[wide], [labels[i] for i in wide]
+    begin, last = [(x - x0, y - y0) for x, y in (start, target)]
+    for end, point in (("start", begin), ("target", last)):
+        inside = np.hypot(*(discs[:, :2] - point).T) < discs[:, 2]
+        if inside.any():
+            first = int(inside.argmax())
+            raise LidarpoolError(
+                f"planning.{end} lies {discs[first, 2]:.2f} m or less from the middle of "
+                f"{labels[first]}, within its circle: move it, or list other "
+                "planning.obstacles."
             )
-        self.found.sources[section.file] = (
-            f"{counted(len(made), 'actor')} during the survey, of {counted(count, 'vehicle')} "
-            "and persons until its end"
-        )
-        return made
+    own = declared(section, Search)
+    return Planning(begin, last, centres=discs[:, :2], radii=discs[:, 2], **own)
 
-    def _materials(self, vehicles: Sequence[int | None]) -> list[Material]:
-        """Materials by name, with the classes of actors and copies, and of city objects.
 
-        `vehicles` are the classes of the last actors of the scene.
-        """
-        scene, every = self.scene, Material("*")
-        made = [*self.scenario.materials]
-        own: list[tuple[str, list[str], int]] = []  # an object, names of all, their class
-        for entry in self.scenario.placed:
-            if entry.semantic_class is None:
-                continue
-            named = {entry.name: [escape(entry.name)]}
-            numbered = f"{escape(entry.name)}.[0-9]*"
-            if isinstance(entry, CopiesSection) and len(rows_named(numbered, scene.names)):
-                named[entry.name].append(numbered)
-            elif isinstance(entry, ActorSection) and entry.robot:
-                links = [a.name for a in scene.actors if a.name.startswith(f"{entry.name}/")]
-                named = {link: [escape(link)] for link in links}
-            own += [(name, names, entry.semantic_class) for name, names in named.items()]
-        if own and not made:
-            made = [every]
-        for name, names, semantic_class in own:
-            # After the last that is for it: a later one, for a single copy, counts there.
-            after = max((k for k, m in enumerate(made) if m.named(name)), default=-1)
-            of = made[after] if after >= 0 else every
-            made.insert(after + 1, replace(of, objects=names, semantic_class=semantic_class))
-        first = len(scene.all_names) - len(vehicles)
-        for semantic_class in sorted({one for one in vehicles if one is not None}):
-            rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
-            made = with_class(made or [every], semantic_class, rows, scene.all_names)
-        if any(entry.file.lower().endswith(CITYJSON) for entry in self.scenario.scene.files):
-            made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
-        return made
-
-    def _survey(self, materials: list[Material], columns: Sequence[str] = ()) -> Survey:
-        """Build the survey, its poses in local coordinates."""
-        given, carried = self.scenario, self._sensors
-        needs, cloud = given.output.needs, declared(given.cloud, CloudOptions)
-        cloud["columns"] = (*given.cloud.columns, *needs, *columns)
-        cloud["epsg"] = given.cloud.epsg or self._epsg
-        if given.scene.has_seed and cloud["keep_every"] is None:
-            cloud["keep_every"] = 1 if "ray" in needs else SEED_KEPT
-        check_whole((*needs, *columns), cloud["keep_every"] or 1)
-        placed = SEED_POSES if self.placing is None else self.placing.poses
-        poses = (given.poses or placed) if self._track is None else ()
-        origin = self.scene.origin
-        own_noise = all(one.noise is not None for one in carried)
-        alone = not given.sensors and given.mount is None and carried[0].noise is None
-        return Survey(
-            poses=[replace(p, position=tuple(np.subtract(p.position, origin))) for p in poses],
-            trajectory=self._track,
-            **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
-            steps=given.steps,
-            materials=materials,
-            returns=Returns(**dict(given.returns)),
-            noise=Noise() if own_noise else Noise(**dict(given.noise)),
-            navigation=given.navigation,
-            **declared(given.weather, Weather),
-            **cloud,
-        )
-
-    def _planning(self) -> Planning | None:
-        """Build the planning in local coordinates; None if the scenario asks for none."""
-        section, (x0, y0, _) = self.scenario.planning, self.scene.origin
-        start, target = section.start, section.target
-        if self.scenario.scene.has_seed:
-            start, target = start or SEED_START, target or SEED_TARGET
-        if section.enabled is False or start is None or target is None:
-            return None
-        discs, labels = self._discs()
-        discs[:, 2] += section.clearance_m
-        wide = np.flatnonzero(discs[:, 2])  # upright lines have no area
-        discs, labels = discs[wide], [labels[i] for i in wide]
-        begin, last = [(x - x0, y - y0) for x, y in (start, target)]
-        for end, point in (("start", begin), ("target", last)):
-            inside = np.hypot(*(discs[:, :2] - point).T) < discs[:, 2]
-            if inside.any():
-                first = int(inside.argmax())
-                raise LidarpoolError(
-                    f"planning.{end} lies {discs[first, 2]:.2f} m or less from the middle of "
-                    f"{labels[first]}, within its circle: move it, or list other "
-                    "planning.obstacles."
-                )
-        own = declared(section, Search)
-        return Planning(begin, last, centres=discs[:, :2], radii=discs[:, 2], **own)
-
-    def _discs(self) -> tuple[Floats, list[str]]:
-        """Obstacles as local x, y, radius (m, 3), and a label for each."""
-        scene = self.scene
-        if self.scenario.planning.obstacles is None:
-            tall = np.flatnonzero(np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M)
-            return scene.footprints[tall], [scene.names[i] for i in tall]
-        rows: dict[str, list[float]] = {}  # {label: x, y, radius}
-        for number, entry in enumerate(self.scenario.planning.obstacles):
-            if entry.object is None:
-                assert entry.centre and entry.radius_m, "either of the two kinds is given"
-                centre = np.subtract(entry.centre, scene.origin[:2])
-                rows[f"planning.obstacles[{number}]"] = [*centre, entry.radius_m]
-                continue
-            # An exact name comes first, even with brackets; else it is a pattern.
-            found = [i for i, name in enumerate(scene.names) if name == entry.object] or [
-                i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
-            ]
-            if not found:
-                hint = did_you_mean(entry.object, scene.names)
-                raise LidarpoolError(
-                    f"planning.obstacles names {entry.object!r}, but no object has that name."
-                    + (hint or f" The scene has {', '.join(scene.names[:5])}, …")
-                )
-            rows |= {scene.names[i]: list(scene.footprints[i]) for i in found}
-        return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
+def _discs(scenario: Scenario, scene: Scene) -> tuple[Floats, list[str]]:
+    """Obstacles as local x, y, radius (m, 3), and a label for each."""
+    if scenario.planning.obstacles is None:
+        tall = np.flatnonzero(np.ptp(scene.object_bounds[..., 2], axis=1) >= FLAT_M)
+        return scene.footprints[tall], [scene.names[i] for i in tall]
+    rows: dict[str, list[float]] = {}  # {label: x, y, radius}
+    for number, entry in enumerate(scenario.planning.obstacles):
+        if entry.object is None:
+            assert entry.centre and entry.radius_m, "either of the two kinds is given"
+            centre = np.subtract(entry.centre, scene.origin[:2])
+            rows[f"planning.obstacles[{number}]"] = [*centre, entry.radius_m]
+            continue
+        # An exact name comes first, even with brackets; else it is a pattern.
+        found = [i for i, name in enumerate(scene.names) if name == entry.object] or [
+            i for i, name in enumerate(scene.names) if fnmatchcase(name, entry.object)
+        ]
+        if not found:
+            hint = did_you_mean(entry.object, scene.names)
+            raise LidarpoolError(
+                f"planning.obstacles names {entry.object!r}, but no object has that name."
+                + (hint or f" The scene has {', '.join(scene.names[:5])}, …")
+            )
+        rows |= {scene.names[i]: list(scene.footprints[i]) for i in found}
+    return np.array(list(rows.values()), dtype=np.float64).reshape(-1, 3), list(rows)
