@@ -237,12 +237,10 @@ def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
 
 def _mounted(scenario: Scenario, robots: Robots) -> list[Mounted]:
     """Return the sensors on their carrier."""
-    given = scenario
-    sections: Mapping[str, SensorSection] = given.sensors or {"": given.sensor}
+    sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
+    path, noise, returns = scenario.path, scenario.noise, scenario.returns
     return [
-        section.mounted(
-            given.path, _mount(section, given, robots), given.noise, given.returns, name
-        )
+        section.mounted(path, _mount(section, scenario, robots), noise, returns, name)
         for name, section in sections.items()
     ]
 
