@@ -24,7 +24,7 @@ from matplotlib.ticker import MaxNLocator
 from tests.daemons import LOOPBACK, Slurm, slurm
 
 from lidarpool.render import theme
-from lidarpool.render.page import FONT, Page
+from lidarpool.render.picture_page import FONT, Page
 from poolpart import Partition, start_partitions
 
 NAMES = ("GPU", "IO")

@@ -21,6 +21,7 @@ import open3d  # noqa: F401 - counted among the libraries
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, StoredCloud, pack
 from lidarpool.columns.table import ALWAYS
+from lidarpool.export.formats import save_cloud
 
 PER_SCAN = 20_000
 PER_PART = 10  # scans
@@ -70,7 +71,7 @@ def main() -> None:
         limit_memory(given.mebibytes << 20)
         began = time.perf_counter()
         path = Path(folder) / "cloud.ply"
-        cloud.save(path, precision_m=0.01)
+        save_cloud(cloud, path, precision_m=0.01)
         seconds = time.perf_counter() - began
         size = path.stat().st_size
     print(

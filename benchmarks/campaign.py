@@ -20,7 +20,7 @@ import numpy as np
 import psutil
 
 from lidarpool import Campaign
-from lidarpool.pipeline import GPU
+from lidarpool.pipeline.names import GPU
 from lidarpool.run.connection import local_client
 from lidarpool.run.progress import Progress
 

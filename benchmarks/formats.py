@@ -22,7 +22,7 @@ from pypcd4.pypcd4 import Encoding, PointCloud
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 
-from lidarpool import Cloud, Scene, Sensor, Survey, Track
+from lidarpool import Cloud, Scene, Sensor, Survey, Track, save_cloud
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import layout
 from lidarpool.export.formats import Format
@@ -43,7 +43,7 @@ def make(folder, points):
     columns = {"scan": scan, "channel": rng.integers(0, 64, points), "object": scan // 9 % 7}
     columns |= {"time": scan * 2_777_777, "class": scan // 9 % 5}
     columns |= {name: rng.random(points, np.float32) for name in COLUMNS[2:]}
-    Cloud(np.round(places, 3), columns).save(folder / "cloud.ply")
+    save_cloud(Cloud(np.round(places, 3), columns), folder / "cloud.ply")
 
 
 def export(name, folder, out):

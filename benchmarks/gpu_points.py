@@ -24,7 +24,7 @@ from lidarpool import Scene, Survey, Track, load_sensor
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, pack
 from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 from raybeam import Outbox

@@ -24,10 +24,10 @@ from lidarpool import Planning, Scene, Sensor, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.connection import local_cluster
-from lidarpool.run.jobs import OneJob
+from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
-from lidarpool.run.page import Page
 from lidarpool.run.progress import Screen
+from lidarpool.run.run_page import RunPage
 from lidarpool.scenario.build import Job
 
 NEWS_S = 0.5  # as the page asks
@@ -41,10 +41,10 @@ def job(poses: int) -> Job:
     return Job(Scene.seed(), survey, Planning((25, 25), (-30, -20), trials=4))
 
 
-def plain(client: Client, work: Job, page: Page | None = None) -> float:
+def plain(client: Client, work: Job, page: RunPage | None = None) -> float:
     """Seconds of a survey, without a page by default."""
     screen, options = Screen(lambda progress: None), RunOptions(client=client)
-    return Conductor(OneJob(work), options, Kept(), screen, page or Page())().survey_seconds
+    return Conductor(OneJob(work), options, Kept(), screen, page or RunPage())().survey_seconds
 
 
 def watched(client: Client, work: Job) -> tuple[float, int]:

@@ -23,7 +23,7 @@ from distributed import Client
 
 from lidarpool import Result, Scene, Sensor, Survey, simulate
 from lidarpool.run.connection import local_cluster
-from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene_mesh import SceneMesh
 
 STAGES = ("generate", "intersect", "sort", "collect")
 COST_RAYS = 64  # a scan, where the time for a million rays is measured
@@ -34,7 +34,7 @@ def cube() -> Scene:
     corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)], float)
     quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return Scene.from_meshes([Mesh("cube", corners, np.array(faces))])
+    return Scene.from_meshes([SceneMesh("cube", corners, np.array(faces))])
 
 
 def measure(client: Client, scans: int, rays: int, **options: Any) -> Result:

@@ -31,7 +31,7 @@ import numpy as np
 
 from lidarpool import Beams, Noise, Returns, Scene, Sensor, Spin, Survey, Track, load_sensor
 from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.simulator.returns import BatchReturns
 from lidarpool.simulator.rig import Rig
 from raybeam import available_backends

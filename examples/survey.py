@@ -1,6 +1,6 @@
 """The default survey from Python: a local cluster, a cloud on disk, a planned path."""
 
-from lidarpool import Planning, Scene, Survey, simulate
+from lidarpool import Planning, Scene, Survey, save_cloud, simulate
 
 scene = Scene.seed()
 survey = Survey(poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)
@@ -8,5 +8,5 @@ centres, radii = scene.footprints[:, :2], scene.footprints[:, 2]
 planning = Planning((25, 25), (-30, -20), centres, radii, trials=100)
 
 result = simulate(scene, survey, planning)
-result.points.save("cloud.ply")
+save_cloud(result.points, "cloud.ply")
 print(f"{len(result.points)} points, a path of {result.plan.length:.2f} m")

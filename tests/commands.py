@@ -19,27 +19,18 @@ class RunningCommand:
 
     def __init__(self, folder: Path, scenario: str, *options: str, prelude: str = "") -> None:
         (folder / "s.yaml").write_text(scenario)
+        code = prelude + "from lidarpool.__main__ import main; main()"
+        arguments = ["run", "s.yaml", "--out", "out", "--overwrite", *options]
         self.tag = uuid.uuid4().hex
         self.log = folder / f"{self.tag}.log"
         with self.log.open("wb") as log:
             self.process = subprocess.Popen(
-                [
-                    *(
-                        sys.executable,
-                        "-c",
-                        prelude + "from lidarpool.__main__ import main; main()",
-                    ),
-                    *("run", "s.yaml", "--out", "out", "--overwrite", *options),
-                ],
+                [sys.executable, "-c", code, *arguments],
                 cwd=folder,
                 stdout=log,
                 stderr=log,
                 start_new_session=True,
-                env={
-                    **os.environ,
-                    "PYTHONPATH": os.pathsep.join(filter(None, sys.path)),
-                    "TEST_RUN_TAG": self.tag,
-                },
+                env={**os.environ, "TEST_RUN_TAG": self.tag},
             )
 
     def wait_for(self, pattern: str) -> RunningCommand:

@@ -3,6 +3,7 @@
 import logging
 import os
 import signal
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -12,6 +13,9 @@ import pytest
 # that: programs that tests interrupt would not notice.
 if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
     signal.signal(signal.SIGINT, signal.default_int_handler)
+
+# What tests start imports what they do.
+os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, sys.path))
 
 # Tests keep dozens of Dask processes, most of them idle; each watches itself for 4 % of a core.
 # And a worker that is forked costs a tenth of one that imports Dask anew. Set before Dask is

@@ -215,9 +215,9 @@ SetEnv PYTHONPATH={os.pathsep.join(filter(None, sys.path))}
         server.wait(120)
 
 
-def wait_until(condition: Callable[[], bool]) -> None:
+def wait_until(condition: Callable[[], object]) -> None:
     """Wait for something that will be so."""
     stop = time.monotonic() + 300
     while not condition():
         assert time.monotonic() < stop, "waited in vain"
-        time.sleep(0.1)
+        time.sleep(0.02)

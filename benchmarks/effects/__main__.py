@@ -22,7 +22,7 @@ from typing import Any
 
 from benchmarks import effects
 from lidarpool import Survey, load_sensor
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 

@@ -13,9 +13,9 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.effects.__main__ import survey_without
-from lidarpool import Mesh, Noise, Returns, Scene, Survey
+from lidarpool import Noise, Returns, Scene, SceneMesh, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS, SENSOR
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.sensor.noise import THRESHOLD_SIGMAS
 from lidarpool.sensor.weather import FAINTEST
 from lidarpool.simulator.rig import Rig
@@ -72,7 +72,7 @@ def page(title: str, weather: dict[str, Any], around_m: float) -> tuple[Figure, 
 def sky() -> Scene:
     """Nothing but a small triangle far away."""
     corner = np.array([[0, 0, -900], [1, 0, -900], [0, 1, -900.0]])
-    return Scene.from_meshes([Mesh("Nothing", corner, np.array([[0, 1, 2]]))])
+    return Scene.from_meshes([SceneMesh("Nothing", corner, np.array([[0, 1, 2]]))])
 
 
 def counts(axes: Any, weather: dict[str, Any], farthest_m: float) -> None:

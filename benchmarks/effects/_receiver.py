@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from lidarpool import Beams, Mesh, Noise, Optics, Scene, Sensor, Spin, Survey
+from lidarpool import Beams, Noise, Optics, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.simulator.rig import Rig
 
 BLUE, RED, GREY = "#1f5fa8", "#c8502b", "#8a8a8a"
@@ -16,19 +16,19 @@ WIDE_RAD = 0.01  # beam of the sensors that hear each other
 
 def wall(
     name: str, x: float, y: tuple[float, float] = (-50, 50), z: tuple[float, float] = (-50, 50)
-) -> Mesh:
+) -> SceneMesh:
     """Return a rectangle across the x axis."""
     corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
-    return Mesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
+    return SceneMesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
-def room(x: float, y: float, z: float = 6.0) -> list[Mesh]:
+def room(x: float, y: float, z: float = 6.0) -> list[SceneMesh]:
     """Return the four walls of a room around the origin."""
     corners = np.array([[-x, -y], [x, -y], [x, y], [-x, y]])
     made = []
     for number, (one, other) in enumerate(zip(corners, np.roll(corners, -1, 0), strict=True)):
         low = np.array([[*one, -z], [*other, -z], [*other, z], [*one, z]])
-        made.append(Mesh(f"W{number}", low, np.array([[0, 1, 2], [0, 2, 3]])))
+        made.append(SceneMesh(f"W{number}", low, np.array([[0, 1, 2], [0, 2, 3]])))
     return made
 
 
@@ -44,7 +44,7 @@ def turning(firings: int, rate_hz: float = 10.0, clockwise: bool = False) -> Sen
     return Sensor(Beams(np.zeros(1)), head, 0.5, 150.0, optics=optics)
 
 
-def points(meshes: list[Mesh], survey: Survey) -> dict[str, NDArray[Any]]:
+def points(meshes: list[SceneMesh], survey: Survey) -> dict[str, NDArray[Any]]:
     """Cast all scans of a survey: {column: values}."""
     rig = Rig(Scene.from_meshes(meshes), survey, "numpy")
     batches = list(rig.cast(0, survey.scan_count))
@@ -54,7 +54,7 @@ def points(meshes: list[Mesh], survey: Survey) -> dict[str, NDArray[Any]]:
     }
 
 
-def shot(meshes: list[Mesh], sensor: Sensor, noise: Noise, **options: Any) -> dict[str, Any]:
+def shot(meshes: list[SceneMesh], sensor: Sensor, noise: Noise, **options: Any) -> dict[str, Any]:
     """Cast one scan of a sensor at the origin."""
     common = {"columns": ("ray", "range", "intensity", "cause"), "keep_every": 1}
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, noise=noise, **{**common, **options})

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from numpy.typing import NDArray
 
-from lidarpool import Beams, Mesh, Returns, Scene, Sensor, Spin, Survey
+from lidarpool import Beams, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarpool.sensor.disc import Beam
 from lidarpool.simulator.rig import Rig
@@ -33,10 +33,10 @@ def on(survey: Survey) -> Survey:
     return replace(survey, returns=beam)
 
 
-def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> Mesh:
+def wall(name: str, x: float, y: tuple[float, float] = (-50.0, 50.0)) -> SceneMesh:
     """Make a rectangle across the x axis."""
     corners = [[x, y[0], -50], [x, y[1], -50], [x, y[1], 50], [x, y[0], 50.0]]
-    return Mesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+    return SceneMesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:

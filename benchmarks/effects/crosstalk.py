@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.effects._receiver import BLUE, GREY, RED, WIDE_RAD, points, room, turning
-from lidarpool import Material, Mesh, Mounted, Noise, Pose, Returns, Survey
+from lidarpool import Material, Mounted, Noise, Pose, Returns, SceneMesh, Survey
 from lidarpool.sensor.optics import Mode
 
 DRAWS = "effect-crosstalk.png"
@@ -31,7 +31,7 @@ def on(survey: Survey) -> Survey:
 
 
 def heard(
-    meshes: list[Mesh], away: float, wide_mrad: float, mode: Mode = "strongest"
+    meshes: list[SceneMesh], away: float, wide_mrad: float, mode: Mode = "strongest"
 ) -> dict[str, NDArray[Any]]:
     """Cast a sensor that hears another, so many metres away, in a field of view so wide."""
     one, other = turning(FIRINGS), turning(FIRINGS - 300, OTHER_HZ, clockwise=True)

@@ -10,8 +10,8 @@ import numpy as np
 from lidarpool import Actor, Mounted, Noise, Pose, Survey, Track, load_sensor
 from lidarpool.render import theme
 from lidarpool.render.colouring import DIVERGING
-from lidarpool.scene.cars import MODELS, car
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.cars import MODELS, car
+from lidarpool.scene.generated.city import city
 from lidarpool.simulator.rig import Rig
 
 DRAWS = "effect-doppler.png"

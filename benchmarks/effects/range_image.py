@@ -16,7 +16,7 @@ from lidarpool import Material, Noise, Survey, load_sensor
 from lidarpool.columns.table import SCAN
 from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene import Scene
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig

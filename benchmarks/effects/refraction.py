@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from lidarpool import Beams, Material, Mesh, Scene, Sensor, Spin, Survey
+from lidarpool import Beams, Material, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarpool.render.theme import SENSOR as RED
 from lidarpool.sensor.materials import fresnel
@@ -30,15 +30,15 @@ def on(survey: Survey) -> Survey:
     return replace(survey, materials=[Material("*"), glass])
 
 
-def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> Mesh:
+def box(name: str, low: tuple[float, float, float], high: tuple[float, float, float]) -> SceneMesh:
     """Make a box whose triangles face outwards."""
     corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
     squares = ([0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3])
     faces = [[a, b, c] for a, b, c, _ in squares] + [[a, c, d] for a, _, c, d in squares]
-    return Mesh(name, np.array(low) + corners * np.subtract(high, low), np.array(faces))
+    return SceneMesh(name, np.array(low) + corners * np.subtract(high, low), np.array(faces))
 
 
-def pool() -> list[Mesh]:
+def pool() -> list[SceneMesh]:
     """Make a pool with a step, in the ground."""
     return [
         # Into the walls, which light that goes straight on would miss otherwise.
@@ -50,7 +50,7 @@ def pool() -> list[Mesh]:
     ]
 
 
-def cast(meshes: list[Mesh], water: Material) -> tuple[Real, Real, Real, Real]:
+def cast(meshes: list[SceneMesh], water: Material) -> tuple[Real, Real, Real, Real]:
     """Places x and z of points, their beams' angles and energies."""
     survey = Survey(
         SCANNER, poses=[(0, 0, HEIGHT)], steps=1, columns=["intensity", "ray"],

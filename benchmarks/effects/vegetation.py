@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
 from benchmarks.effects.refraction import box
-from lidarpool import Beams, Material, Mesh, Noise, Scene, Sensor, Spin, Survey
+from lidarpool import Beams, Material, Noise, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.render.theme import INK, LINE, MUTED, OBJECT_COLOURS
 from lidarpool.sensor.leaves import projection
 from lidarpool.simulator.rig import Rig
@@ -34,7 +34,7 @@ def on(survey: Survey) -> Survey:
 
 
 def cast(
-    meshes: list[Mesh], sensor: Sensor, at: Any, materials: list[Material], seed: int = 0
+    meshes: list[SceneMesh], sensor: Sensor, at: Any, materials: list[Material], seed: int = 0
 ) -> Any:
     """Cast a scan."""
     survey = Survey(sensor, poses=[at], steps=1, materials=materials, noise=Noise(seed=seed))
@@ -42,14 +42,14 @@ def cast(
     return batch
 
 
-def tree() -> list[Mesh]:
+def tree() -> list[SceneMesh]:
     """Make a crown, a trunk in it, and the ground."""
     crown = trimesh.creation.icosphere(4, 1.0)
     shaped = np.asarray(crown.vertices) * (2.4, 2.4, 3.0) + (0, 0, 5.5)
     trunk = trimesh.creation.cylinder(0.2, 7.0, sections=16)
     return [
-        Mesh("Crown", shaped, np.asarray(crown.faces)),
-        Mesh("Trunk", np.add(trunk.vertices, (0, 0, 3.5)), np.asarray(trunk.faces)),
+        SceneMesh("Crown", shaped, np.asarray(crown.faces)),
+        SceneMesh("Trunk", np.add(trunk.vertices, (0, 0, 3.5)), np.asarray(trunk.faces)),
         box("Ground", (-60, -60, -1), (60, 60, 0)),
     ]
 

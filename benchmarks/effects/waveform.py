@@ -9,11 +9,11 @@ from typing import Any
 import matplotlib.pyplot as plt
 import numpy as np
 
-from lidarpool import Beams, Material, Mesh, Optics, Pose, Returns, Scene, Sensor, Spin, Survey
+from lidarpool import Beams, Material, Optics, Pose, Returns, Scene, SceneMesh, Sensor, Spin, Survey
 from lidarpool.columns.cloud import Cloud
 from lidarpool.columns.table import AXES, SCAN
 from lidarpool.columns.waveforms import WAVEFORM
-from lidarpool.scene.plants import SPECIES, tree
+from lidarpool.scene.generated.plants import SPECIES, tree
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
@@ -55,9 +55,9 @@ def _seen(scene: Scene, at: tuple[float, float], samples: int = 0, **returns: An
     return part.cloud(table, survey.precision_m, np.zeros(3))
 
 
-def _flat(name: str, height: float, x: tuple[float, float]) -> Mesh:
+def _flat(name: str, height: float, x: tuple[float, float]) -> SceneMesh:
     corners = [[x[0], -9, height], [x[1], -9, height], [x[1], 9, height], [x[0], 9, height]]
-    return Mesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
+    return SceneMesh(name, np.array(corners, float), np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 def _panel(axes: Any, scene: Scene, at: tuple[float, float], span: tuple[float, float]) -> None:

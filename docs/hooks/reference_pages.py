@@ -64,7 +64,7 @@ _FIRST = {
     "lidarpool": (
         "Scanner",
         *("simulate", "remove_run", "Scene", "Sensor", "Beams", "Spin", "Pose", "Survey"),
-        *("Planning", "Result", "Frame", "Cloud", "Column", "read_cloud"),
+        *("Planning", "Result", "ScanFrame", "Cloud", "Column", "read_cloud", "save_cloud"),
     ),
     "poolpart": (
         *("Pool", "Partition", "Rule", "per_gpu", "per_host", "n_workers", "named", "rest"),
@@ -98,7 +98,7 @@ def _declared(member: Any) -> Iterator[str]:
             if any(getattr(note, "description", "") for note in getattr(hint, "__metadata__", ()))
         }
     if fields:
-        yield _table(fields)
+        yield _table(fields).replace("](#", "](scenario.md#")  # where sections have their tables
 
 
 def command_page() -> str:

@@ -197,6 +197,7 @@ class CudaBackend(Backend):
             pose, skip = divmod(start, poses.rays)
             span = slice(pose, -(-stop // poses.rays))
             matrices = unused if poses.rotations is None else poses.rotations[span]
+            # `asarray` keeps the order of memory, and poses are stored by component.
             places = [
                 cp.asarray(np.ascontiguousarray(a)) for a in (poses.positions[span], matrices)
             ]

@@ -25,7 +25,10 @@ from .scan import Scan
 _Room = tuple[Floats, Ints32, Ints32]
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
-_COHERENCE = 0.94  # cosine of 20 degrees: wider packets are slower than single rays
+# Cosine of 20 degrees. Packets of 16 rays within that are cast four to six times as fast as single
+# rays, wider ones more slowly. Packets are made along a ring (`Pattern.step`): along a firing, they
+# are slower than single rays in fine terrain.
+_COHERENCE = 0.94
 
 
 class EmbreeBackend(Backend):

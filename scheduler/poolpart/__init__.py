@@ -13,7 +13,7 @@ from .pool import Pool
 from .rules import Rule, n_workers, named, per_gpu, per_host, rest
 from .stats import PartitionStats, StageStats
 from .task_context import WorkerLeft, own_client, telling_departure
-from .task_locations import TaskPlace, Whereabouts, look_for_tasks
+from .task_locations import TaskLocations, TaskPlace, look_for_tasks
 from .workers import WorkerInfo, ask_workers, worker_identities
 
 __all__ = [
@@ -28,9 +28,9 @@ __all__ = [
     "Results",
     "Rule",
     "StageStats",
+    "TaskLocations",
     "TaskPlace",
     "TaskRecord",
-    "Whereabouts",
     "WorkerInfo",
     "WorkerLeft",
     "ask_workers",

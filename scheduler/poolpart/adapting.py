@@ -17,14 +17,12 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from distributed import Client
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
 from .fetch import holds_for_driver
-from .internals import (
+from .internals.scheduler import (
     call,
-    has_running_tasks,
     is_bound,
     is_idle,
     reopen,
@@ -34,8 +32,8 @@ from .internals import (
     turn_away,
     waiting_for_workers,
 )
+from .internals.worker import has_running_tasks
 from .rules import check_count
-from .workers import on_scheduler
 
 NAME = "poolpart-adapting"
 IDLE_S = 60.0  # a job that is not needed for so long ends
@@ -64,7 +62,7 @@ class Bounds:
 
 
 @dataclass(frozen=True)
-class Kind:
+class JobKind:
     """What the jobs of a partition are like."""
 
     slots: int  # of a worker
@@ -84,7 +82,7 @@ class Advice:
 class _Record:
     """One partition."""
 
-    kind: Kind
+    kind: JobKind
     coming: int = 0  # jobs whose workers are not here
     heard: float = 0.0  # when the process that starts jobs said so
     lacked: float = 0.0  # slots that were missing at the last look
@@ -250,7 +248,7 @@ def _is_busy(dask_worker: Any = None) -> bool:
 # -- requests of the process that starts jobs ----------------------------------------------
 
 
-def begin(kinds: Mapping[str, Kind], dask_scheduler: Any = None) -> None:
+def begin(kinds: Mapping[str, JobKind], dask_scheduler: Any = None) -> None:
     """Make the record of partitions that are started."""
     record = _of(dask_scheduler) or Adaptation(dask_scheduler)
     if NAME not in dask_scheduler.plugins:
@@ -288,44 +286,19 @@ async def look(
     return advice
 
 
-# -- requests of clients -----------------------------------------------------------------
+# -- requests of clients, by `on_scheduler` ----------------------------------------------------
 
 
-def adapt(client: Client, name: str, bounds: Bounds) -> None:
-    """Let a partition have another number of jobs; see `Partition.adapt`."""
-    if not on_scheduler(client, _adapt, name=name, bounds=bounds):
-        raise PoolError(
-            f"Partition {name!r} has no jobs that can be started: only partitions of "
-            "start_partitions adapt. Those of a divided pool grow by Partition.grow."
-        )
-
-
-def want(client: Client, name: str, slots: int) -> bool:
-    """Want slots of a partition; see `Partition.want`."""
-    found: bool = on_scheduler(client, _want, name=name, slots=slots, asking=client.id)
-    return found
-
-
-def running_most(client: Client, name: str, slots: int = 1) -> int:
-    """Tasks of so many slots that a partition runs at a time, or will with all its jobs."""
-    most: int = on_scheduler(client, _running_most, name=name, slots=slots)
-    return most
-
-
-def adaptive_names(client: Client) -> set[str]:
-    """Names of the partitions that grow with their work; they may be empty."""
-    names: set[str] = on_scheduler(client, _adaptive_names)
-    return names
-
-
-def _adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
+def adapt(name: str, bounds: Bounds, dask_scheduler: Any = None) -> bool:
+    """Let a partition have another number of jobs; False if nobody starts any for it."""
     record = _record(dask_scheduler, name)
     if record is not None:
         record.kind = replace(record.kind, bounds=bounds)
     return record is not None
 
 
-def _want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
+def want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> bool:
+    """Want slots of a partition, for a client; see `Partition.want`."""
     adaptation = _of(dask_scheduler)
     # The last request of a client that was killed may come after it has left.
     if adaptation is None or asking not in dask_scheduler.clients:
@@ -336,15 +309,16 @@ def _want(name: str, slots: int, asking: str, dask_scheduler: Any = None) -> boo
     return slots_of_new(dask_scheduler, name) > 0
 
 
-def _running_most(name: str, slots: int, dask_scheduler: Any = None) -> int:
+def running_most(name: str, slots: int, dask_scheduler: Any = None) -> int:
+    """Tasks of so many slots that a partition runs at a time, or will with all its jobs."""
     members = dask_scheduler.workers.values()
     here = sum(int(worker.resources.get(name, 0)) // slots for worker in members)
-    return max(
-        here, _most_workers(dask_scheduler, name) * (slots_of_new(dask_scheduler, name) // slots)
-    )
+    workers, each = _at_most(dask_scheduler, name)
+    return max(here, workers * (each // slots))
 
 
-def _adaptive_names(dask_scheduler: Any = None) -> set[str]:
+def adaptive_names(dask_scheduler: Any = None) -> set[str]:
+    """Names of the partitions that grow with their work; they may be empty."""
     adaptation = _of(dask_scheduler)
     records = adaptation.records if adaptation else {}
     return {name for name, record in records.items() if record.kind.bounds is not None}
@@ -355,13 +329,12 @@ def _adaptive_names(dask_scheduler: Any = None) -> set[str]:
 
 def slots_of_new(scheduler: Any, name: str) -> int:
     """Slots of a worker that a partition may get; 0 if it has a fixed number of them."""
-    record = _record(scheduler, name)
-    return record.kind.slots if record is not None and record.kind.bounds is not None else 0
+    return _at_most(scheduler, name)[1]
 
 
 def slots_at_most(scheduler: Any, name: str) -> int:
     """Slots that a partition may come to have; 0 if it has a fixed number of workers."""
-    return _most_workers(scheduler, name) * slots_of_new(scheduler, name)
+    return math.prod(_at_most(scheduler, name))
 
 
 def jobs_coming(scheduler: Any, name: str) -> int:
@@ -372,11 +345,12 @@ def jobs_coming(scheduler: Any, name: str) -> int:
     return record.coming
 
 
-def _most_workers(scheduler: Any, name: str) -> int:
+def _at_most(scheduler: Any, name: str) -> tuple[int, int]:
+    """Workers that an adaptive partition may have, and slots of each; 0 if it has others."""
     record = _record(scheduler, name)
     if record is None or record.kind.bounds is None:
-        return 0
-    return record.kind.bounds.maximum * record.kind.workers
+        return 0, 0
+    return record.kind.bounds.maximum * record.kind.workers, record.kind.slots
 
 
 def _of(scheduler: Any) -> Adaptation | None:

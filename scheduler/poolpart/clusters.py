@@ -21,9 +21,9 @@ from distributed import SpecCluster, Status
 from distributed.deploy import ssh
 from tornado.ioloop import PeriodicCallback
 
-from .adapting import IDLE_S, Bounds, Kind, begin, look
+from .adapting import IDLE_S, Bounds, JobKind, begin, look
 from .errors import PoolError
-from .internals import ask_of_cluster
+from .internals.scheduler import ask_of_cluster
 from .rules import check_count, check_name
 
 logger = logging.getLogger(__name__)
@@ -100,21 +100,23 @@ def start_partitions(
             f"The cluster has {len(cluster.worker_spec)} workers, or jobs for some, already: make "
             "one without (no n_workers; of an SSHCluster's hosts only the scheduler's)."
         )
-    parts = {name: _Part.of(cluster, describe, name, own) for name, own in partitions.items()}
-    cluster.sync(_Jobs(cluster, parts, tell).begin)
+    parts = {
+        name: _PartitionJobs.of(cluster, describe, name, own) for name, own in partitions.items()
+    }
+    cluster.sync(_JobStarter(cluster, parts, tell).begin)
 
 
 Describe = Callable[[Any, str, str, int, int, Mapping[str, Any]], dict[str, Any]]
 
 
 @dataclass
-class _Part:
+class _PartitionJobs:
     """The jobs of one partition."""
 
     name: str
     own: Mapping[str, Any]  # options of the cluster's class
     count: int  # of jobs at first
-    kind: Kind
+    kind: JobKind
     describe: Describe
     made: int = 0  # jobs so far
     places: dict[str, int] = field(default_factory=dict)  # {job: its place, that of a host}
@@ -122,7 +124,7 @@ class _Part:
     @classmethod
     def of(
         cls, cluster: SpecCluster, describe: Describe, name: str, options: Mapping[str, Any]
-    ) -> _Part:
+    ) -> _PartitionJobs:
         """Read the options of a partition; PoolError if one is wrong. Nothing is started."""
         check_name(name)
         own = dict(options)
@@ -145,7 +147,7 @@ class _Part:
             sample = describe(cluster, f"{name}-0", name, slots, 0, own)  # that it can be done
         except (TypeError, ValueError) as error:
             raise PoolError(f"Partition {name!r} cannot be started: {error}") from error
-        kind = Kind(slots, len(sample.get("group", ".")), bounds)
+        kind = JobKind(slots, len(sample.get("group", ".")), bounds)
         return cls(name, own, count, kind, describe)
 
     def add(self, cluster: SpecCluster, count: int) -> None:
@@ -169,11 +171,14 @@ class _Part:
         }
 
 
-class _Jobs:
+class _JobStarter:
     """Starts the jobs of partitions: all that are to be there, and again those that are lost."""
 
     def __init__(
-        self, cluster: SpecCluster, parts: Mapping[str, _Part], tell: Callable[[str], object]
+        self,
+        cluster: SpecCluster,
+        parts: Mapping[str, _PartitionJobs],
+        tell: Callable[[str], object],
     ) -> None:
         self._cluster, self._parts, self._tell = cluster, parts, tell
         samples = (p.describe(cluster, "", p.name, 1, 0, p.own) for p in parts.values())
@@ -232,7 +237,7 @@ class _Jobs:
             part.add(self._cluster, one.more - len(again))
         return any(one.more for one in advice.values())
 
-    async def _end(self, part: _Part, job: str) -> None:
+    async def _end(self, part: _PartitionJobs, job: str) -> None:
         """Let go of a job: its workers have been closed, or will be if they join."""
         self._cluster.worker_spec.pop(job, None)
         part.places.pop(job, None)

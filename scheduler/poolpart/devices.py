@@ -7,7 +7,6 @@ finds the device of its predecessor free; and nothing has to be cleaned up.
 
 from __future__ import annotations
 
-import threading
 from collections import Counter
 from collections.abc import Sequence
 from typing import Any
@@ -15,12 +14,11 @@ from typing import Any
 from distributed import get_worker
 
 from . import probe
-from .task_context import WorkerLeft, in_event_loop, own_client, telling_departure
+from .task_context import WorkerLeft, own_client, telling_departure
 from .workers import on_scheduler
 
 _HELD = "poolpart-gpu"  # key in the scheduler's state of a worker: UUID of its device
 
-_lock = threading.Lock()
 _own: dict[str, int | None] = {}  # {address of a worker of this process: its device}
 
 
@@ -52,14 +50,9 @@ def own_device() -> int | None:
     ...         return cupy.asnumpy(work(cupy.asarray(block)))
     """
     address = get_worker().address
-    if address in _own:
-        return _own[address]
-    if in_event_loop():  # a thread that holds the lock needs the loop
-        return _ask(address)
-    with _lock:  # of several tasks that start at once, one asks
-        if address not in _own:
-            _own[address] = _ask(address)
-        return _own[address]
+    if address not in _own:
+        _own[address] = _ask(address)
+    return _own[address]
 
 
 def _ask(address: str) -> int | None:

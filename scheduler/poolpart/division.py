@@ -14,11 +14,11 @@ from typing import Any
 
 from distributed import Client
 
+from .dashboard_page import close_page
 from .errors import PoolError
 from .fence import enclose, lower
 from .inherit import begin_inheritance, end_inheritance, workers_told
-from .internals import asks_for, lift_restrictions
-from .page import close_page
+from .internals.scheduler import asks_for, lift_restrictions
 from .rules import Rule, check_count, divide
 from .stats import forget_statistics, statistics_of
 from .steward import Seat, Steward, names_of, steward_of

@@ -32,7 +32,8 @@ from typing import Any
 
 from distributed.diagnostics.plugin import SchedulerPlugin
 
-from .internals import Rules, could_take, open_to_all, rule_for_fences, take_back_fences
+from .internals.method_rules import Rules, could_take, rule_for_fences, take_back_fences
+from .internals.scheduler import open_to_all
 
 logger = logging.getLogger(__name__)
 

@@ -11,7 +11,8 @@ from typing import Any, TypeVar
 
 from distributed import Client, get_worker
 
-from .internals import answer_to, as_bytes, ask, take_from_worker
+from .internals.client import as_bytes, ask, take_from_worker
+from .internals.worker import answer_to
 
 T = TypeVar("T")
 

@@ -25,7 +25,8 @@ from typing import Any
 from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
-from .internals import Resources, Rules, rule_for_graphs, rule_for_shuffles, tell_of_plugin
+from .internals.method_rules import Rules, rule_for_graphs, rule_for_shuffles
+from .internals.scheduler import Resources, tell_of_plugin
 from .lending import lending_plugin
 
 logger = logging.getLogger(__name__)

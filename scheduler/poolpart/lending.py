@@ -27,15 +27,9 @@ from distributed import Status, rejoin, secede
 from distributed.diagnostics.plugin import WorkerPlugin
 from distributed.protocol.pickle import dumps
 
-from .internals import (
-    Resources,
-    free_slots,
-    let_waits_lend,
-    resources_of,
-    slots_here,
-    take_slots,
-    task_of_thread,
-)
+from .internals.client import let_waits_lend
+from .internals.scheduler import Resources
+from .internals.worker import free_slots, resources_of, slots_here, take_slots, task_of_thread
 
 _LOOK_S = 1.0  # between looks whether the worker is still there
 
@@ -142,7 +136,10 @@ def end_lending(worker: Any, name: str) -> None:
 
 
 def lending_plugin(name: str) -> bytes:
-    """Plugin by which workers begin, and end; those without this package ignore it."""
+    """Plugin by which workers begin, and end; those without this package ignore it.
+
+    A worker that joins gets tasks before any request can reach it. A plugin comes first.
+    """
 
     class Lending(WorkerPlugin):
         # A class within a function is sent by value.

@@ -10,7 +10,7 @@ import dask
 from distributed import Scheduler, Security, SpecCluster
 
 from .errors import PoolError
-from .internals import FixedCluster, OwnNanny
+from .internals.local_cluster import FixedCluster, OwnNanny
 from .rules import check_count, check_name
 
 LOOPBACK = "127.0.0.1"

@@ -26,9 +26,10 @@ from distributed import CancelledError, Client, Future, Reschedule
 from distributed.protocol.pickle import dumps, loads
 
 from .adapting import running_most
-from .internals import when_done
+from .internals.client import when_done
 from .lending import slots_lent
 from .membership import check_slots
+from .workers import on_scheduler
 
 logger = logging.getLogger(__name__)
 
@@ -55,7 +56,7 @@ class Chunk:
 
 
 @dataclass(frozen=True)
-class Answer:
+class ChunkResult:
     """Result of a chunk."""
 
     results: list[Any]  # of its first items, at least one; of all, unless one failed or time was up
@@ -71,8 +72,8 @@ def run_chunk(
     first: int,
     calls: Sequence[Call],
     keywords: dict[str, Any],
-    before: Answer | None = None,
-) -> Answer:
+    before: ChunkResult | None = None,
+) -> ChunkResult:
     """Call a function for the items of a chunk, one after the other; runs on a worker.
 
     It stops early after `patience_s` seconds, so that items which take longer than earlier ones do
@@ -103,7 +104,7 @@ def run_chunk(
     seconds = time.perf_counter() - start
     if before is not None:
         seconds += before.seconds
-    return Answer(results, seconds, sizeof(calls) + sizeof(results))
+    return ChunkResult(results, seconds, sizeof(calls) + sizeof(results))
 
 
 def _call(function: Callable[..., Any], call: Call, keywords: dict[str, Any]) -> Any:
@@ -190,7 +191,9 @@ class Stage:
 
         PoolError if the partition was dissolved: the tasks would wait for ever.
         """
-        running = running_most(self.client, self.partition, self.slots)
+        running: int = on_scheduler(
+            self.client, running_most, name=self.partition, slots=self.slots
+        )
         if not running:
             check_slots(self.client, self.partition, self.slots, self.by_rule)
         return running
@@ -243,7 +246,7 @@ class Results(Iterator[Any]):
         self._running: dict[Future, Chunk] = {}
         self._done: queue.SimpleQueue[Future] = queue.SimpleQueue()
         # {index of its first item: a chunk that was fetched and not delivered yet}
-        self._back: dict[int, tuple[Chunk, Answer | Future]] = {}
+        self._back: dict[int, tuple[Chunk, ChunkResult | Future]] = {}
         self._next_item = 0  # index of the next one to deliver, if in order
         self._ready: deque[Any] = deque()  # results to be delivered
         self._failed: tuple[Chunk, Future] | None = None  # to be raised after these
@@ -444,7 +447,7 @@ class Results(Iterator[Any]):
                 if not _of_item(error):
                     self._failed = chunk, answer
                     return
-                answer = Answer([error], 0.0, 0)
+                answer = ChunkResult([error], 0.0, 0)
             count = len(answer.results)
             self._ready.extend(answer.results)
             self._next_item += count

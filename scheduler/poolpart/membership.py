@@ -13,7 +13,7 @@ from distributed import Client
 from .adapting import slots_of_new
 from .errors import PoolError
 from .inherit import begin_inheritance, is_inherited, workers_told
-from .internals import task_of_thread
+from .internals.worker import task_of_thread
 from .steward import NAME as STEWARD
 from .steward import Steward
 from .workers import on_scheduler

@@ -39,6 +39,8 @@ class Partition:
         Client of the cluster. By default, in a task, that of its worker.
     note
         A remark for users, such as that there were no GPUs.
+    by_rule
+        Whether a division of the pool made it, so that it can be dissolved.
 
     Notes
     -----
@@ -47,13 +49,14 @@ class Partition:
     lends its own while it waits for results.
     """
 
-    def __init__(self, name: str, client: Client | None = None, note: str = "") -> None:
+    def __init__(
+        self, name: str, client: Client | None = None, note: str = "", by_rule: bool = False
+    ) -> None:
         self.name, self.note = name, note
-        self._client = client
-        self._by_rule = False  # made while the cluster ran, so that it can be dissolved
+        self._client, self._by_rule = client, by_rule
 
     def __reduce__(self) -> tuple[Any, ...]:
-        return Partition, (self.name, None, self.note), {"_by_rule": self._by_rule}
+        return Partition, (self.name, None, self.note, self._by_rule)
 
     @property
     def client(self) -> Client:
@@ -388,7 +391,12 @@ class Partition:
         --------
         >>> gpu.adapt(0, 8)                                            # doctest: +SKIP
         """
-        adapt(self.client, self.name, Bounds.checked(self.name, minimum, maximum, idle_s))
+        bounds = Bounds.checked(self.name, minimum, maximum, idle_s)
+        if not on_scheduler(self.client, adapt, name=self.name, bounds=bounds):
+            raise PoolError(
+                f"Partition {self.name!r} has no jobs that can be started: only partitions of "
+                "start_partitions adapt. Those of a divided pool grow by Partition.grow."
+            )
 
     def want(self, slots: int) -> bool:
         """Say how many slots this client wants; returns whether the number of workers adapts.
@@ -408,7 +416,8 @@ class Partition:
         True
         """
         check_count("The number of slots that are wanted", slots, least=0)
-        return want(self.client, self.name, slots)
+        asking = {"slots": slots, "asking": self.client.id}
+        return bool(on_scheduler(self.client, want, name=self.name, **asking))
 
     def dissolve(self, timeout_s: float = 30.0) -> None:
         """Undo this partition; see `Pool.dissolve`."""

@@ -30,7 +30,8 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 from distributed.protocol.pickle import dumps, loads
 
 from .errors import PipeClosed, PipeFailed
-from .internals import QueueAndVariable, ask, handlers_of
+from .internals.client import ask
+from .internals.scheduler import QueueAndVariable, handlers_of
 from .task_context import own_client
 from .workers import check_client, on_scheduler
 
@@ -235,13 +236,15 @@ class Pipe:
                 taken.append(self._taken.popleft())
         return [*taken, *map(loads, reply["answer"])], reply["closed"]
 
-    def get_all(self, timeout_s: float | None = None) -> list[Any]:
+    def get_all(self, timeout_s: float | None = None, *, linger_s: float = 0.0) -> list[Any]:
         """Take all queued items, as soon as there are any.
 
         Parameters
         ----------
         timeout_s
             Longest wait in seconds.
+        linger_s
+            Wait so long for more once there are some.
 
         Raises
         ------
@@ -252,9 +255,6 @@ class Pipe:
         TimeoutError
             If nothing came for so long.
         """
-        return self._take_some(timeout_s)
-
-    def _take_some(self, timeout_s: float | None, linger_s: float = 0.0) -> list[Any]:
         deadline = _deadline(timeout_s)
         while True:
             items, closed = self._take(_one_wait(deadline), linger_s)
@@ -271,7 +271,7 @@ class Pipe:
             # One atomic operation: threads may share this object.
             return self._taken.popleft()
         except IndexError:
-            item, *more = self._take_some(timeout_s, _LINGER_S)
+            item, *more = self.get_all(timeout_s, linger_s=_LINGER_S)
             self._taken.extend(more)
             return item
 

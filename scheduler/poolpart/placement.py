@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 from distributed import get_worker
 
-from .internals import resources_here
+from .internals.worker import resources_here
 
 T = TypeVar("T")
 

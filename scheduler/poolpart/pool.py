@@ -11,15 +11,15 @@ from typing import Any
 from distributed import Client
 
 from .adapting import adaptive_names
+from .dashboard_page import leave_page, partitions_page
 from .division import ask, declare, dissolve
 from .errors import PoolError
 from .membership import forget_memberships
-from .page import leave_page, partitions_page
 from .partition import Partition
 from .probe import worker_gpus
 from .rules import Rule, check_name, named, per_gpu, per_host
 from .rules import n_workers as count
-from .workers import WorkerInfo, all_workers, ask_workers
+from .workers import WorkerInfo, all_workers, ask_workers, on_scheduler
 
 logger = logging.getLogger(__name__)
 
@@ -64,7 +64,7 @@ class Pool:
             package, or the client is closed or asynchronous.
         """
         workers = all_workers(client)
-        if not workers and not adaptive_names(client):
+        if not workers and not on_scheduler(client, adaptive_names):
             raise PoolError(
                 f"The cluster at {client.scheduler.address} has no workers: start some with "
                 f'dask worker {client.scheduler.address} --resources "GPU=1"'
@@ -105,7 +105,7 @@ class Pool:
         """Find the partitions that workers declare now, and adaptive ones, by name."""
         workers = all_workers(self.client)
         names = {name for worker in workers for name in worker.partitions}
-        names |= adaptive_names(self.client)  # perhaps empty
+        names |= on_scheduler(self.client, adaptive_names)  # perhaps empty
         return {name: Partition(name, self.client) for name in sorted(names)}
 
     def require(self, slots: Mapping[str, int], purpose: Mapping[str, str] | None = None) -> None:
@@ -271,7 +271,7 @@ class Pool:
 
     def leave_page(self) -> None:
         """Remove the page, unless other clients want it."""
-        leave_page(self.client)
+        on_scheduler(self.client, leave_page, owner=self.client.id)
 
     def dissolve(self, timeout_s: float = 30.0) -> list[str]:
         """Undo every partition of this cluster that was made while it ran, by any client.
@@ -321,9 +321,8 @@ class Pool:
             pool={worker.name: worker.gpus for worker in self.workers},
             seen=set(self.partitions()),
         )
-        parts = {name: Partition(name, self.client, note) for name, note in notes.items()}
+        parts = {name: Partition(name, self.client, note, True) for name, note in notes.items()}
         for part in parts.values():
-            part._by_rule = True
             if part.note:
                 logger.warning("Partition %r: %s", part.name, part.note)
         forget_memberships()

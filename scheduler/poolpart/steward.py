@@ -27,7 +27,8 @@ from distributed.diagnostics.plugin import SchedulerPlugin
 
 from .errors import PoolError
 from .fence import expect
-from .internals import Resources, call, declare_on_worker, hand_off, held_by, recount, show, wake
+from .internals.scheduler import Resources, call, hand_off, held_by, recount, show, wake
+from .internals.worker import declare_on_worker
 from .probe import worker_gpus
 from .rules import Rule, n_workers, partition_for, per_gpu, rest
 from .workers import WorkerInfo
@@ -55,7 +56,7 @@ class Seat:
     unplaced: bool = False  # it joined after the division, and no rule has taken it yet
     away: bool = False  # it has left, and its nanny may be restarting it
     gone: bool = False  # it is no longer expected
-    settling: asyncio.Task[None] | None = None
+    reconciler: asyncio.Task[None] | None = None
     giving_up: asyncio.TimerHandle | None = None
 
 
@@ -174,9 +175,9 @@ class Steward(SchedulerPlugin):
         for seat in list(self.seats.values()):
             if seat.info.address == worker and not seat.away:
                 seat.away = True
-                if seat.settling:
-                    seat.settling.cancel()
-                    seat.settling = None
+                if seat.reconciler:
+                    seat.reconciler.cancel()
+                    seat.reconciler = None
                 loop = asyncio.get_running_loop()
                 seat.giving_up = loop.call_later(HOLD_S if seat.nanny else 0, self._give_up, seat)
 
@@ -210,7 +211,7 @@ class Steward(SchedulerPlugin):
         self._placing = None
         waiting = [s for s in self.seats.values() if s.unplaced and not s.away]
         # A worker that is being asked for its GPUs is assigned when it has answered.
-        asked = [s for s in waiting if s.settling and s.settling.done()]
+        asked = [s for s in waiting if s.reconciler and s.reconciler.done()]
         self.settle([seat for seat in asked if self._place(seat)])
 
     def _place(self, seat: Seat) -> bool:
@@ -231,7 +232,7 @@ class Steward(SchedulerPlugin):
             return
         seat.info = seat.info.with_gpus(gpus)
 
-    # -- settling workers --------------------------------------------------------------
+    # -- reconciling workers --------------------------------------------------------------
 
     def settled(self, seat: Seat) -> bool:
         """Whether a worker declares its resources, and the scheduler knows them."""
@@ -244,9 +245,9 @@ class Steward(SchedulerPlugin):
         """Let workers declare their resources; `settled` waits until they do."""
         for seat in seats:
             # A running loop checks the seat again before it ends.
-            if not seat.away and (seat.settling is None or seat.settling.done()):
-                seat.settling = asyncio.ensure_future(self._settle(seat, seat.info.address))
-                seat.settling.add_done_callback(self._ended)
+            if not seat.away and (seat.reconciler is None or seat.reconciler.done()):
+                seat.reconciler = asyncio.ensure_future(self._settle(seat, seat.info.address))
+                seat.reconciler.add_done_callback(self._ended)
 
     def _ended(self, task: asyncio.Task[None]) -> None:
         if not task.cancelled() and (error := task.exception()):
@@ -321,7 +322,10 @@ class Steward(SchedulerPlugin):
         self._stop()
 
     def _stop(self) -> None:
-        work = [self._placing, *(w for s in self.seats.values() for w in (s.settling, s.giving_up))]
+        work = [
+            self._placing,
+            *(w for s in self.seats.values() for w in (s.reconciler, s.giving_up)),
+        ]
         for task in work:
             if task is not None:
                 task.cancel()

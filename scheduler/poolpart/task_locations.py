@@ -27,7 +27,7 @@ class TaskPlace:
 
 
 @dataclass(frozen=True)
-class Whereabouts:
+class TaskLocations:
     """Members of a partition, their slots, and tasks, at one moment.
 
     Workers that take no tasks at the moment, because Dask has paused them for their memory or they
@@ -55,7 +55,7 @@ class Whereabouts:
         return key in self.tasks and self.tasks[key].long_running
 
 
-def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> Whereabouts:
+def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -> TaskLocations:
     """Ask the scheduler about the slots of a partition and some tasks.
 
     Dask places a task by a worker's total resources, not by the free ones, and prefers the
@@ -63,21 +63,18 @@ def look_for_tasks(client: Client, partition: str, keys: Collection[str] = ()) -
     idle. A second long-running task there waits as long as the first runs. So choose the
     workers of long-running tasks yourself.
     """
-    arguments = {"partition": partition, "keys": list(keys), "patience_s": SILENT_S}
-    found: Whereabouts = on_scheduler(client, _look, **arguments)
+    found: TaskLocations = on_scheduler(client, _look, partition=partition, keys=list(keys))
     return found
 
 
-def _look(
-    partition: str, keys: list[str], patience_s: float, dask_scheduler: Any = None
-) -> Whereabouts:
+def _look(partition: str, keys: list[str], dask_scheduler: Any = None) -> TaskLocations:
     members = [ws for ws in dask_scheduler.workers.values() if ws.resources.get(partition)]
     addresses = frozenset(ws.address for ws in members)
-    silent = addresses & _silent_workers(dask_scheduler, patience_s)
+    silent = addresses & _silent_workers(dask_scheduler)
     usable = [ws for ws in members if ws.status.name == "running" and ws.address not in silent]
     places = {key: _place(dask_scheduler.tasks[key]) for key in keys if key in dask_scheduler.tasks}
     slots = sum(int(ws.resources[partition]) for ws in usable)
-    return Whereabouts(
+    return TaskLocations(
         members=addresses,
         silent=silent,
         free={ws.address: int(ws.resources[partition] - _in_use(ws, partition)) for ws in usable},
@@ -88,13 +85,13 @@ def _look(
     )
 
 
-def _silent_workers(scheduler: Any, patience_s: float) -> set[str]:
-    """Addresses of workers without a heartbeat for so long."""
+def _silent_workers(scheduler: Any) -> set[str]:
+    """Addresses of workers that have had no heartbeat for long."""
     # If all workers have been silent, the scheduler itself was stopped or busy, and will hear from
     # them soon.
     now = max((ws.last_seen for ws in scheduler.workers.values()), default=0.0)
     # Dask's interval, which is long in large clusters.
-    patience_s = max(patience_s, _BEATS * (1 + len(scheduler.workers) / 100))
+    patience_s = max(SILENT_S, _BEATS * (1 + len(scheduler.workers) / 100))
     return {ws.address for ws in scheduler.workers.values() if now - ws.last_seen > patience_s}
 
 

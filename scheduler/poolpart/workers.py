@@ -10,7 +10,7 @@ from distributed import Client
 from distributed.comm.core import CommClosedError
 
 from .errors import PoolError
-from .internals import ask
+from .internals.client import ask
 
 
 @dataclass(frozen=True)

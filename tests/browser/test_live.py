@@ -12,7 +12,7 @@ from lidarpool import Scene, Survey
 from lidarpool.live.live_page import live_page
 from lidarpool.run.conductor import Conductor, Kept
 from lidarpool.run.connection import local_client
-from lidarpool.run.jobs import OneJob
+from lidarpool.run.job_source import OneJob
 from lidarpool.run.options import RunOptions
 from lidarpool.run.progress import Screen
 from lidarpool.scenario.build import Job

@@ -13,7 +13,7 @@ from lidarpool.columns.table import SCAN
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.live.server import page_server
 from lidarpool.live.view import View
-from lidarpool.run.picture_file import Pictured, sensor_ways
+from lidarpool.run.picture_file import PictureContent, sensor_ways
 from lidarpool.scene.actors import Actor, box
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
@@ -45,7 +45,9 @@ def view(cloud):
     poses = Track([0, 2], [[0, -9, 4], [0, 9, 4.0]])
     survey = Survey(Sensor.grid(layers=4), steps=SCANS, trajectory=poses)
     hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
-    pictured = Pictured(scene, sensor_ways(survey), hits, rays, None, None, (), survey.duration_ns)
+    pictured = PictureContent(
+        scene, sensor_ways(survey), hits, rays, None, None, (), survey.duration_ns
+    )
     sweeps = Sweeps.of(survey, scene)
     assert (len(sweeps), sweeps.scans[-1]) == (10, SCANS)
     return View(CloudFile(cloud, [WET]), pictured, sweeps, title="a spiral")

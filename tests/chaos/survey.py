@@ -14,9 +14,9 @@ from functools import partial
 from pathlib import Path
 
 import numpy as np
+from tests.shapes import block
 
 from lidarpool import Planning, Result, Scene, Sensor, Survey, remove_run, simulate
-from lidarpool.scene.mesh import Mesh
 from poolpart import placement_violations
 
 from .arena import Arena
@@ -32,10 +32,7 @@ PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60
 
 def room() -> Scene:
     """A room of 10 by 8 by 6 metres around the sensor: every ray hits."""
-    corners = np.array([[x, y, z] for x in (-5, 5) for y in (-4, 4) for z in (-3, 3)], float)
-    quads = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
-    faces = [t for a, b, c, d in quads for t in ((a, b, c), (a, c, d))]
-    return Scene.from_meshes([Mesh("room", corners, np.array(faces))])
+    return Scene.from_meshes([block("room", (10, 8, 6))])
 
 
 def survey(poses: int = POSES, layers: int = 8) -> Survey:

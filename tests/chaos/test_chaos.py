@@ -1,7 +1,5 @@
 """The short versions of `python -m tests.chaos` and of its soak."""
 
-from __future__ import annotations
-
 import pytest
 from tests.chaos.__main__ import Campaign
 from tests.chaos.events import DAMAGE, KINDS, RANDOM, Fault
@@ -67,8 +65,6 @@ def test_a_soak_leaves_nothing_and_loses_nothing(arena, what, tmp_path):
     draw(soaked, tmp_path / "soak.png")
     assert (tmp_path / "soak.png").stat().st_size > 0
 
-
-# -- what a seed decides -------------------------------------------------------------------------
 
 WORKER, DRIVER = ("cast.start", "cast.end"), ("driver.take",)
 

@@ -1,7 +1,5 @@
 """The checker by itself, on logs that are written here."""
 
-from __future__ import annotations
-
 import pytest
 from tests.chaos.checker import judge
 

@@ -3,8 +3,6 @@
 What it did before, it goes on with, beside those who have taken its work over.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -19,6 +17,7 @@ from tests.chaos.survey import PLANNING, Reference, disturbed, room
 import poolpart.task_locations
 from lidarpool import simulate
 from lidarpool.base.tracing import trace_to
+from lidarpool.pipeline.names import GPU
 
 JOIN_S = 300.0
 STOP_S = 2.0  # for others to take over
@@ -40,7 +39,6 @@ def lonely(arena):
         started.append(
             subprocess.Popen(
                 [*command, "--resources", f"{partition}={slots}"],
-                env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
                 stdout=subprocess.DEVNULL,
                 stderr=subprocess.DEVNULL,
             )
@@ -76,25 +74,26 @@ def test_given_up_by_the_scheduler_what_it_does_counts_once(
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("stage", ["collect-0", "prepare"])  # a casting worker has prepared itself
+@pytest.mark.parametrize("stage", ["collect-0", GPU])
 def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch, stage):
     """The scheduler would take it for dead after five minutes, and wait that long."""
     monkeypatch.setattr("lidarpool.pipeline.policies.scans_per_batch", lambda *_: 10)
     seen, stopped, reasons, continued = [], [], set(), []
 
     def given_up() -> bool:
-        if stage == "prepare":
+        if stage == GPU:
             return "its worker is gone or silent" in reasons
         return not {None, stopped[0]} & {_worker_of(arena, stage)}
 
     def on_frame(frame) -> None:
         seen.append(frame.scan)
-        if frame.scan == 60:
-            stopped.append(_worker_of(arena, stage))
-            os.kill(stopped[0], signal.SIGSTOP)
-            # Only now: on a busy machine others that are well may be silent for so long.
-            patience.setattr(poolpart.task_locations, "SILENT_S", 2.0)
-        elif stopped and not continued and given_up():
+        if not stopped:
+            if frame.scan >= 60 and (pid := _worker_of(arena, stage)):
+                stopped.append(pid)
+                os.kill(pid, signal.SIGSTOP)
+                # Only now: on a busy machine others that are well may be silent for so long.
+                patience.setattr(poolpart.task_locations, "SILENT_S", 2.0)
+        elif not continued and given_up():
             continued.append(frame.scan)
             patience.undo()
             os.kill(stopped[0], signal.SIGCONT)
@@ -114,8 +113,10 @@ def test_given_up_by_the_driver_it_does_no_harm(arena, what, known, monkeypatch,
 
 
 def _worker_of(arena, stage) -> int | None:
-    """Process of the worker that runs a stage, or has prepared itself for one."""
+    """Process of the worker that runs a stage, or of a casting worker."""
     scheduler = arena.cluster.scheduler
+    if stage == GPU:
+        return next((w.pid for w in list(scheduler.workers.values()) if GPU in w.resources), None)
     tasks = [task for key, task in list(scheduler.tasks.items()) if str(key).startswith(stage)]
     pids = (w.pid for t in tasks for w in (t.processing_on, *(t.who_has or ())) if w)
     return next(pids, None)

@@ -9,13 +9,11 @@ import zipfile
 
 import pytest
 import trimesh
-from tests.lidarpool.meshes import NESTED
+from tests.meshes import NESTED
 
 from lidarpool.base import allowance
-from lidarpool.base.allowance import Allowance, memory_share
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.base.yamlfile import read_yaml
-from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.files.meshfile import load_meshes
 
 VERTEX = b'<vertex x="0" y="0" z="0"/>'
 MODEL = (
@@ -78,26 +76,6 @@ def draco():
 
 def entities(inside):
     return f'<!DOCTYPE a [<!ENTITY a "<n/>">{NESTED}]><{inside}>&g;</{inside}>'.encode()
-
-
-def sharing_dae():
-    """Two shapes of one triangle, at either end of a long list of vertices."""
-    shapes = "".join(
-        f"<geometry id='g{i}'><mesh><vertices id='v{i}'><input semantic='POSITION' source='#s'/>"
-        f"</vertices><triangles><input semantic='VERTEX' source='#v{i}' offset='0'/>"
-        "<p>0 1 59999</p></triangles></mesh></geometry>"
-        for i in range(2)
-    )
-    source = (
-        f"<source id='s'><float_array id='f'>{'0 0 0 ' * 60000}</float_array><technique_common>"
-        "<accessor source='#f' count='60000' stride='3'/></technique_common></source>"
-    )
-    placed = "".join(f"<node><instance_geometry url='#g{i}'/></node>" for i in range(2))
-    return (
-        f"<COLLADA><library_geometries><geometry id='g'><mesh>{source}</mesh></geometry>{shapes}"
-        f"</library_geometries><library_visual_scenes><visual_scene>{placed}</visual_scene>"
-        "</library_visual_scenes></COLLADA>"
-    ).encode()
 
 
 LAUGHS = b"a: &a [1,1,1,1,1,1,1,1,1,1]\n" + b"".join(
@@ -204,12 +182,6 @@ def test_bombs_take_little_memory_and_say_what_they_are(bombs):
     assert int(grown) < MOST, grown
 
 
-def test_vertices_that_parts_share_are_kept_where_they_are_used(tmp_path):
-    path = tmp_path / "shared.dae"
-    path.write_bytes(sharing_dae())
-    assert [len(mesh.vertices) for mesh in load_meshes(path)] == [3, 3]
-
-
 @pytest.mark.parametrize("suffix", [".glb", ".3mf"])
 def test_honest_files_are_far_below_the_limit(tmp_path, monkeypatch, suffix):
     monkeypatch.setattr(allowance, "LEAST", 0)
@@ -228,24 +200,3 @@ def test_a_large_mesh_is_read_though_memory_is_short(tmp_path, monkeypatch):
     monkeypatch.setattr(allowance, "memory", lambda: path.stat().st_size - 1)
     with pytest.raises(LidarpoolError, match=r"ball\.ply: it has .* more than the memory"):
         load_meshes(path)
-
-
-def test_values_of_yaml_count_as_what_python_makes_of_them(tmp_path, monkeypatch):
-    path = tmp_path / "values.yaml"
-    path.write_text("poses: [" + "1," * 3000 + "]")
-    assert len(read_yaml(path)["poses"]) == 3000
-    monkeypatch.setattr(allowance, "LEAST", 0)
-    with pytest.raises(LidarpoolError, match=r"values\.yaml: it has .* would unpack to 586"):
-        read_yaml(path)
-
-
-def test_the_limit_is_of_the_file_and_of_the_memory(monkeypatch):
-    monkeypatch.setattr(allowance, "memory", lambda: 2**40)
-    assert Allowance(1, "").limit == 2**28
-    assert Allowance(2**30, "").limit == 100 * 2**30
-    assert Allowance(2**35, "").limit == memory_share() == 2**38
-    grown = Allowance(2**25, "")
-    grown.grow(2**25)
-    grown.take(100 * 2**26)
-    with pytest.raises(LidarpoolError, match=r"it has 64\.00 MiB and would unpack to 6\.25 GiB"):
-        grown.take(1)

@@ -11,8 +11,8 @@ import pytest
 
 from lidarpool import LidarpoolError
 from lidarpool.base.storage import Storage
-from lidarpool.export.jobs import JobRow
-from lidarpool.render.page import Page
+from lidarpool.datasets.job_table import JobRow
+from lidarpool.render.picture_page import Page
 from lidarpool.report.campaign_report import write_card
 
 NAMES = ("visibility", "model", "night")
@@ -115,15 +115,6 @@ def test_same_jobs_make_the_same_files(card, tmp_path):
         assert (tmp_path / name).read_bytes() == (folder / name).read_bytes(), name
 
 
-def test_hash_tells_data_sets_apart(card, tmp_path):
-    _, report = card
-    place = Storage.at(tmp_path, durable=False)
-    slower = [row(k, seconds=9.0) if k != 3 else ROWS[3] for k in range(30)]
-    assert write(place, slower)["sha256"] == report["sha256"]
-    other = [*ROWS[:-1], row(29, sha256="f" * 64)]
-    assert write(place, other)["sha256"] != report["sha256"]
-
-
 def test_letters_of_users_are_escaped(tmp_path):
     names = (EVIL, "a")
     rows = [
@@ -156,10 +147,11 @@ def test_letters_of_users_are_escaped(tmp_path):
             row(k, values={"visibility": v})
             for k, v in enumerate([float("inf"), float("nan"), -5.0])
         ],
+        [row(k, values={"visibility": v}) for k, v in enumerate([0.3, 0.1 + 0.2])],
         [row(k, points=0, hits=0, rays=0, seconds=0.0, classes={}) for k in range(4)],
         [row(k, values={"model": f"city-{k:04d}.glb"}) for k in range(60)],
     ],
-    ids=["none", "failed", "one", "same", "mixed", "not-finite", "empty", "many-labels"],
+    ids=range(9),
 )
 def test_any_jobs_have_a_card(tmp_path, rows):
     report = write(Storage.at(tmp_path, durable=False), rows)
@@ -167,13 +159,6 @@ def test_any_jobs_have_a_card(tmp_path, rows):
     assert (tmp_path / "README.md").is_file() and (tmp_path / "report.html").is_file()
     text = (tmp_path / "README.md").read_text()
     assert all((tmp_path / path).is_file() for path in re.findall(r"\((pictures/.*?)\)", text))
-
-
-def test_a_url_has_a_card_too():
-    place = Storage.at("memory://test-campaign-report/set")
-    write(place, ROWS)
-    assert {"README.md", "report.html", "report.json"} <= set(place.sizes())
-    assert place.read("splits/val.txt").startswith(b"02\n05\n")
 
 
 def test_an_earlier_report_goes_first(tmp_path):
@@ -197,13 +182,13 @@ def test_splits_are_names_of_files(tmp_path, split):
 
 
 def test_memory_is_bounded(tmp_path):
-    """Ten thousand jobs take no more than some numbers each."""
+    """Thousands of jobs take no more than some numbers each."""
     place = Storage.at(tmp_path, durable=False)
     write(place, ROWS)
     peaks = []
-    for count in (1_000, 10_000):
+    for count in (300, 1_300):
         tracemalloc.start()
         write(place, (row(k % 30) for k in range(count)))
         peaks.append(tracemalloc.get_traced_memory()[1])
         tracemalloc.stop()
-    assert peaks[1] - peaks[0] < 9_000 * 600
+    assert peaks[1] - peaks[0] < 1_000 * 600

@@ -4,16 +4,14 @@ import json
 
 import numpy as np
 import pytest
-from tests.lidarpool.meshes import NESTED
+from tests.meshes import NESTED
 
-from lidarpool import Scene
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.instances import Instance
-from lidarpool.scene.mesh import triangle_areas
-from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.files.meshfile import load_meshes
+from lidarpool.scene.scene_instances import SceneInstance
+from lidarpool.scene.scene_mesh import triangle_areas
 from lidarpool.sensor.materials import MaterialTable
 
 # A cube of 2 units, its rings running outward.
@@ -125,7 +123,7 @@ def test_templates_are_placed_and_large_ones_shared(tmp_path):
     np.testing.assert_array_equal(two.bounds, [[84000, 447001, 3], [84004, 447005, 7]])
     many = {"templates": [geometry("MultiSurface", SOLID[0] * 10_000)], "vertices-templates": CUBE}
     shared = load(tmp_path, city(objects, **{"geometry-templates": many}))
-    assert all(isinstance(one, Instance) for one in shared)
+    assert all(isinstance(one, SceneInstance) for one in shared)
     assert shared[0].mesh is shared[1].mesh
 
 
@@ -239,19 +237,3 @@ def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
     monkeypatch.setattr("lidarpool.base.allowance.memory", lambda: 100_000_000)
     with pytest.raises(LidarpoolError, match=r"would unpack to .* CityJSONSeq"):
         load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
-
-
-def test_scenes_are_made_of_it(tmp_path):
-    path = write(tmp_path / "a.CityJSON", city({"a": thing(geometry())}))
-    scene = Scene.load(path)
-    assert scene.names == ("Building a",)
-    np.testing.assert_array_equal(scene.origin + scene.bounds[0], [84000, 447000, 3])
-
-
-def test_a_tower_is_not_suspected_of_another_unit(tmp_path):
-    tall = [[300 * x, 300 * y, 300 * z] for x, y, z in CUBE]
-    write(tmp_path / "a.city.json", city({"a": thing(geometry())}, tall))
-    scenario = Scenario.load(tmp_path / "a.city.json")
-    notes = advice(build(scenario))
-    assert any("this looks like an object" in note for note in notes)
-    assert not any("unit" in note for note in notes)

@@ -10,11 +10,16 @@ from pathlib import Path
 
 import pytest
 import yaml
+from hypothesis import given
+from hypothesis import strategies as st
 from jsonschema import Draft7Validator
 from tests.clusters import import_jobqueue
 
 from lidarpool import LidarpoolError
+from lidarpool.run.checks import gpu_note
 from lidarpool.run.cluster_file import ClusterFile
+from lidarpool.run.connection import default_workers, local_cluster
+from poolpart import PoolError, WorkerInfo
 
 EXAMPLES = Path(__file__).parents[2] / "examples" / "clusters"
 GOOD = """
@@ -55,7 +60,6 @@ def test_partitions_that_grow_with_their_work(tmp_path):
 
 
 WRONG = {
-    "empty": ("", "is empty; a cluster file has"),
     "a list": ("[1]", "holds a list; a cluster file has"),
     "a misspelt field": (
         GOOD.replace("arguments", "argument"),
@@ -67,8 +71,6 @@ WRONG = {
         "not a partition of a survey.*mean 'GPU'",
     ),
     "workers": (GOOD.replace("workers: 5", "workers: many"), "partitions.OTHER.workers is 'many'"),
-    "many": (GOOD.replace("workers: 5", "workers: 999999999"), "it must be 0 to 10000"),
-    "a number to adapt to": (GOOD.replace("workers: 5", "adapt: 8"), "partitions.OTHER.adapt is 8"),
     "a swapped range": (
         GOOD.replace("workers: 5", "adapt: [8, 0]"),
         r"partitions.OTHER.adapt is \[8, 0\]: give the least and the greatest number",
@@ -91,7 +93,6 @@ WRONG = {
         GOOD.replace("distributed.SSHCluster", "subprocess.Popen"),
         "cannot be started by partition",
     ),
-    "no module": (GOOD.replace("distributed.", ""), "cannot be started by partition"),
 }
 
 
@@ -133,6 +134,37 @@ assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
         env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         check=True,
     )
+
+
+@given(cores=st.integers(1, 256), gpus=st.integers(0, 16))
+def test_every_machine_gets_workers_and_no_more_than_cores_and_gpus(cores, gpus):
+    workers = default_workers(cores, gpus)
+    assert workers["GPU"] == gpus or gpus == 0
+    assert all(count >= 1 for count in workers.values())
+    # Every partition has a worker, also where that makes one more than there are cores.
+    assert sum(workers.values()) <= max(cores + 1, gpus + 1)
+
+
+@pytest.mark.parametrize("given", [{"gpu_workers": 0}, {"lidar_slots": 0}, {"other_workers": -1}])
+def test_counts_that_cannot_be(given):
+    (count,) = given.values()
+    with pytest.raises(PoolError, match=f"is {count}; give a whole number"):
+        local_cluster(**given)
+
+
+@pytest.mark.parametrize(
+    ("gpus", "backend", "says"),
+    [
+        (((), ()), "embree", ""),
+        ((("GPU-1",), ()), "cuda", ""),
+        ((("GPU-1",), ()), "embree", "the GPUs of partition GPU are not used"),
+        (((), ("GPU-1",)), "embree", "no GPU in partition GPU: CPU workers cast the rays"),
+    ],
+)
+def test_of_gpus_is_spoken_only_where_there_is_one_that_stays_idle(gpus, backend, says):
+    casting, other = (WorkerInfo(str(i), str(i), "host", 1, gpus=g) for i, g in enumerate(gpus))
+    note = gpu_note([casting, other], [casting], backend)
+    assert note.startswith(says) and bool(note) == bool(says)
 
 
 def test_the_manifest_is_what_the_operator_takes():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib.util
 import io
 import logging
 import pickle
@@ -15,9 +14,9 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
-from tests.lidarpool.meshes import write
 from tests.lidarpool.test_gltf import glb
 from tests.lidarpool.test_masks import card
+from tests.meshes import write
 from trimesh.visual import TextureVisuals
 from trimesh.visual.color import uv_to_color
 from trimesh.visual.material import PBRMaterial
@@ -25,22 +24,19 @@ from trimesh.visual.material import PBRMaterial
 from lidarpool import (
     Actor,
     Column,
-    Instance,
     LidarpoolError,
     Material,
-    Mesh,
     Noise,
     Pose,
     Returns,
     Scanner,
     Scene,
+    SceneInstance,
+    SceneMesh,
     Sensor,
     Track,
 )
 from lidarpool.columns.table import COLOURS
-from lidarpool.live.view import Surface, colours_for
-from lidarpool.scenario.advice import advice
-from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene import masks
 from lidarpool.scene.colours import (
@@ -49,13 +45,11 @@ from lidarpool.scene.colours import (
     WEIGHTS,
     Colours,
     as_srgb,
+    colours_summary,
     luminance,
     packed,
-    told,
     unpacked,
 )
-from lidarpool.scene.drawn import Drawn, cut
-from lidarpool.scene.scene_file import write_scene
 from lidarpool.sensor.materials import DARKEST, reflectances
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -108,7 +102,7 @@ def test_images_are_looked_up_as_trimesh_does(tmp_path, suffix):
     path = tmp_path / f"hills{suffix}"
     trimesh.Trimesh(vertices, faces, visual=visual, process=False).export(path)
     scene = Scene.load(path, up_axis="z", colours=True)
-    assert told([scene.colours]) == "1 texture"
+    assert colours_summary([scene.colours]) == "1 texture"
     cloud, found = sweep(scene)
     at = (weights(cloud, vertices, faces)[:, :, None] * uv[faces[cloud["triangle"]]]).sum(axis=1)
     # trimesh's elements are half a pixel off, which shows at the edges of blocks alone.
@@ -130,7 +124,7 @@ def test_colours_of_vertices_are_interpolated_in_linear_light(tmp_path, name):
     else:
         mesh.export(path, **({"encoding": "ascii"} if name == "text.ply" else {}))
     scene = Scene.load(path, up_axis="z", colours=True)
-    assert told([scene.colours]) == "colours of vertices"
+    assert colours_summary([scene.colours]) == "colours of vertices"
     cloud, found = sweep(scene)
     light = LINEAR[colours[faces[cloud["triangle"]]]]
     want = as_srgb((weights(cloud, vertices, faces)[:, :, None] * light).sum(axis=1))
@@ -245,22 +239,6 @@ def on_card(tmp_path, header, body):
     return found, (cloud.positions[:, 1] + 2) / 4, (2 - cloud.positions[:, 2]) / 4
 
 
-@pytest.mark.parametrize("wrap", [10497, 33071, 33648])
-def test_images_go_on_as_the_file_says(tmp_path, wrap):
-    uv = np.array([[0, 0], [1, 0], [1, 1], [0, 1]], "<f4") * 3 - 1
-    header, body = opaque(uv=uv, sampler={"wrapS": wrap, "wrapT": wrap})
-    found, u, v = on_card(tmp_path, header, body)
-
-    def element(x):
-        at = np.floor(x * 12 - 4).astype(int)
-        if wrap == 33071:
-            return np.clip(at, 0, 3)
-        return at % 4 if wrap == 10497 else np.where(at % 8 < 4, at % 4, 3 - at % 4)
-
-    near = np.abs(np.column_stack([u, v]) * 12 % 1 - 0.5).max(axis=1) > 0.499  # of an edge
-    assert (found == BLOCKS[element(v), element(u)])[~near].all() and near.mean() < 0.1
-
-
 def test_factors_and_colours_of_vertices_multiply_light(tmp_path):
     header, body = opaque()
     header["materials"][0]["pbrMetallicRoughness"]["baseColorFactor"] = [0.5, 0.25, 1, 1]
@@ -304,14 +282,6 @@ def test_what_cannot_be_read_is_a_note_and_grey(tmp_path, caplog, change, why):
     assert (found == GREY[0, 0]).all()
 
 
-def test_colours_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
-    header, body = opaque()
-    attributes = header["meshes"][0]["primitives"][0]["attributes"]
-    attributes["COLOR_0"] = attributes["TEXCOORD_0"]
-    found, _, _ = on_card(tmp_path, header, body)
-    assert "its COLOR_0 is not red" in caplog.text and (found == GREY[0, 0]).all()
-
-
 def test_files_that_name_missing_images_are_read_all_the_same(tmp_path, caplog):
     write(tmp_path / "m.mtl", "newmtl a\nmap_Kd gone.png\nnewmtl b\nKd nan 2 -1\nnewmtl c\nKd x\n")
     ground = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nv -9 9 0\nmtllib m.mtl\n"
@@ -347,40 +317,40 @@ def textured():
     corners[::2] = 255
     plain = np.array([[[250, 40, 10]]], np.uint8)
     colours = Colours((PICTURE, plain), image, uv[faces].astype(np.float32), corners)
-    return Mesh("Hills", vertices, faces, colours=colours)
+    return SceneMesh("Hills", vertices, faces, colours=colours)
 
 
 def test_instances_and_actors_have_the_colours_of_their_mesh():
     mesh = textured()
     turn = trimesh.transformations.rotation_matrix(0.7, [0, 0, 1], [1, 2, 0])
     turn[:3, :3] @= np.diag([1.1, -0.9, 1.2])  # mirrored
-    flat = Scene.from_meshes([Instance(mesh, turn).flat()])
+    flat = Scene.from_meshes([SceneInstance(mesh, turn).flat()])
     cloud, want = sweep(flat)
     assert len(np.unique(want, axis=0)) > 30
-    shared = Scene.from_meshes([Instance(mesh, turn), Instance(mesh, Pose((50, 0, 0)))])
+    shared = Scene.from_meshes([SceneInstance(mesh, turn), SceneInstance(mesh, Pose((50, 0, 0)))])
     other, found = sweep(shared)
     np.testing.assert_array_equal(other.positions, cloud.positions)
     assert (found == want).all(axis=1).mean() > 0.99
     pose = Pose((1.0, 0.5, 0.1), 50)
     half = np.radians(25)
     way = Track([0, 10], [pose.position] * 2, [[0, 0, np.sin(half), np.cos(half)]] * 2)
-    far = Mesh("Far", mesh.vertices, mesh.faces).moved("Far", np.eye(3), np.array([0, 0, -90]))
+    far = SceneMesh("Far", mesh.vertices, mesh.faces).moved("Far", np.eye(3), np.array([0, 0, -90]))
     moving = Scene.from_meshes([far]).with_actors([Actor(mesh, way)])
-    _, want = sweep(Scene.from_meshes([Instance(mesh, pose), far]))
+    _, want = sweep(Scene.from_meshes([SceneInstance(mesh, pose), far]))
     _, found = sweep(moving)
     assert (found == want).all(axis=1).mean() > 0.99
 
 
 def test_an_image_is_sent_once_whatever_shares_it():
     mesh = textured()
-    many = [Mesh(str(n), mesh.vertices, mesh.faces, colours=mesh.colours) for n in range(20)]
+    many = [SceneMesh(str(n), mesh.vertices, mesh.faces, colours=mesh.colours) for n in range(20)]
     alone, all_of = (len(pickle.dumps(Scene.from_meshes(some))) for some in (many[:1], many))
     assert all_of < 20 * alone - 15 * PICTURE.nbytes
     assert len(Scene.from_meshes(many).colours.images) == 2
 
 
 def test_textures_are_the_reflectance(caplog):
-    bare = Mesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
+    bare = SceneMesh("Bare", *hills()[:2]).moved("Bare", np.eye(3), np.array([0, 9, 0]))
     scene = Scene.from_meshes([textured(), bare])
     materials = [Material("*", 0.4), Material("Hills", "texture", scale=0.8)]
     cloud, found = sweep(scene, "reflectivity", "intensity", materials=materials)
@@ -389,25 +359,11 @@ def test_textures_are_the_reflectance(caplog):
     share[cloud["object"] == 1] = 0.4
     np.testing.assert_allclose(cloud["reflectivity"], share * plain["reflectivity"], rtol=1e-5)
     # What has no colour has the luminance of the default.
-    grey, found = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity",
+    grey, found = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity",
                         materials=[Material("*", "texture")])  # fmt: skip
-    usual, _ = sweep(Scene.from_meshes([Mesh("Bare", *hills()[:2])]), "intensity")
+    usual, _ = sweep(Scene.from_meshes([SceneMesh("Bare", *hills()[:2])]), "intensity")
     assert (found == 188).all() and "nothing in the scene has colours" in caplog.text
     np.testing.assert_allclose(grey["intensity"], usual["intensity"], rtol=0.01)
-
-
-@pytest.mark.parametrize(
-    "asked",
-    [
-        {"cloud": {"columns": ["red"]}},
-        {"materials": [{"objects": "*", "reflectance": "texture"}]},
-        {"cloud": {}},
-    ],
-)
-def test_a_scenario_notes_that_nothing_has_colours(asked):
-    scenario = Scenario.from_data(asked)
-    noted = any("needs colours" in note for note in advice(build(scenario)))
-    assert noted == (asked != {"cloud": {}})
 
 
 def test_each_sub_ray_has_the_light_of_its_own_hit():
@@ -418,7 +374,7 @@ def test_each_sub_ray_has_the_light_of_its_own_hit():
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = (corners[faces][..., :2] / 16).astype(np.float32)
     colours = Colours((image,), np.zeros(2, np.int32), uv)
-    scene = Scene.from_meshes([Mesh("Ground", corners, faces, colours=colours)])
+    scene = Scene.from_meshes([SceneMesh("Ground", corners, faces, colours=colours)])
     materials = [Material("*", "texture")]
     options = {"materials": materials, "pose": Pose((0.05, 0.1, 3.0))}
     one, _ = sweep(scene, "reflectivity", **options)
@@ -434,7 +390,7 @@ def test_each_sub_ray_has_the_light_of_its_own_hit():
 
 def test_lane_markings_stand_out_in_intensity():
     scene = Scene.load(EXAMPLES / "road.glb", up_axis="y", colours=True)
-    assert told([scene.colours]) == "1 texture, 2 plain colours"
+    assert colours_summary([scene.colours]) == "1 texture, 2 plain colours"
     materials = [Material("*", "texture"), Material("Pavement*", material="concrete, road")]
     pose = Pose((-6.0, -2.4, 1.9))
     sensor = Sensor.grid(rays_per_revolution=1800, layers=64, vertical_fov_deg=80)
@@ -453,48 +409,6 @@ def test_lane_markings_stand_out_in_intensity():
     assert np.median(flat[marking & near]) < 1.3 * np.median(flat[bare & near])
 
 
-def test_the_script_of_the_example_makes_its_file(tmp_path):
-    spec = importlib.util.spec_from_file_location("road", EXAMPLES / "road.py")
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    (tmp_path / "road.glb").write_bytes(module.road().export(file_type="glb"))
-    made, stored = (
-        Scene.load(folder / "road.glb", up_axis="y", colours=True)
-        for folder in (tmp_path, EXAMPLES)
-    )
-    np.testing.assert_array_equal(made.colours.means(), stored.colours.means())
-    np.testing.assert_array_equal(made.vertices, stored.vertices)
-
-
-def test_pictures_and_the_page_have_the_mean_of_each_face():
-    mesh = textured()
-    scene = Scene.from_meshes([mesh, Instance(mesh, Pose((20, 0, 0)), "Copy")])
-    means = mesh.colours.means()
-    drawn = Drawn.of(scene).scene
-    np.testing.assert_array_equal(drawn.colours.means(), np.tile(means, (2, 1)))
-    alone = Scene.from_meshes([mesh])
-    assert colours_for(alone, None) == ("grey", "hits", "object", "colour")
-    none = np.zeros(len(means)), np.zeros((0, 3), np.float32)
-    arrays, _ = Surface(alone).coloured("colour", *none)
-    np.testing.assert_allclose(arrays["colours"][:, 0], means, atol=1)
-    plain = mesh.colours.image == 1
-    assert (means[plain & (np.arange(len(means)) % 2 == 0)] == [250, 40, 10]).all()
-
-
-def test_leaves_are_drawn_in_the_colours_of_their_images(tmp_path):
-    image = np.dstack([BLOCKS[:4, :4].repeat(8, 0).repeat(8, 1), np.full((32, 32), 255, np.uint8)])
-    image[:16, :, 3] = 0  # its upper half is not there
-    header, body = card(png(image))
-    write(tmp_path / "m.glb", glb(header, body))
-    scene = Scene.load(tmp_path / "m.glb", up_axis="z", colours=True)
-    assert scene.masked
-    drawn = Drawn.of(cut(scene)).scene
-    middles, means = drawn.vertices[drawn.faces].mean(axis=1), drawn.colours.means()
-    u, v = (middles[:, 1] + 2) / 4, (2 - middles[:, 2]) / 4
-    want = BLOCKS[np.floor(v * 4).astype(int).clip(0, 3), np.floor(u * 4).astype(int).clip(0, 3)]
-    assert (means == want).all(axis=1).mean() > 0.8 and v.min() > 0.45
-
-
 def test_colours_that_do_not_fit_are_refused():
     vertices, faces, _ = hills()
     for colours in (
@@ -505,7 +419,7 @@ def test_colours_that_do_not_fit_are_refused():
         Colours((GREY.astype(float),), np.zeros(128, np.int32)),
     ):
         with pytest.raises(LidarpoolError, match="do not fit its 128 faces"):
-            Mesh("Hills", vertices, faces, colours=colours)
+            SceneMesh("Hills", vertices, faces, colours=colours)
 
 
 @given(st.lists(st.tuples(*[st.integers(0, 255)] * 3), min_size=1, max_size=20))
@@ -517,7 +431,7 @@ def test_light_and_bytes_are_one_another(rows):
 
 
 def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
-    scene = Scene.from_meshes([Mesh("Ground", *hills()[:2])])
+    scene = Scene.from_meshes([SceneMesh("Ground", *hills()[:2])])
     snow, white = Material("*", material="snow, melting"), Material("*", 1.0)
     for nm, share in ((850.0, 0.70), (1064.0, 0.70), (1550.0, 0.01), (1600.0, 0.01)):
         sensor = replace(SENSOR, optics=replace(SENSOR.optics, wavelength_nm=nm))
@@ -529,7 +443,7 @@ def test_a_material_has_the_reflectance_of_the_nearer_wavelength():
 
 
 def test_a_gloss_adds_to_diffuse_light_and_replaces_that_of_metals():
-    scene = Scene.from_meshes([Mesh("Ground", *hills()[:2])])
+    scene = Scene.from_meshes([SceneMesh("Ground", *hills()[:2])])
     columns = "reflectivity", Column("cosine", "float64", "", "of incidence", "cosine")
 
     def returned(**arguments):
@@ -579,8 +493,3 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for name, (shares, library, sample) in table.items():
         row = f"| `{name}` | {shares[0]:.2f} | {shares[1]:.2f} | {library}: {sample} |"
         assert row in page
-
-
-def test_a_written_scene_keeps_masks_and_loses_colours(tmp_path):
-    path = write_scene(tmp_path / "m.glb", Scene.from_meshes([textured()]))
-    assert Scene.load(path, colours=True).triangles == 128

@@ -5,14 +5,15 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import trimesh
+from tests.shapes import quad
 
-from lidarpool import LidarpoolError, Pose, Scanner, load_sensor
+from lidarpool import LidarpoolError, Pose
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.materials import MaterialTable
 
 
@@ -23,9 +24,8 @@ def folder(tmp_path):
     points = np.stack([x, y, 2 + np.sin(x / 5) + y / 10], axis=-1).reshape(-1, 3)
     corner = np.arange(10 * 21).reshape(10, 21)[:, :-1].reshape(-1, 1)
     faces = np.concatenate([corner + np.array(more) for more in ((0, 1, 22), (0, 22, 21))])
-    corners = np.array([[10, -10, 8], [20, -10, 8], [20, 10, 8], [10, 10, 8.0]])
-    roof = Mesh("Roof", corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    write_scene(tmp_path / "land.glb", Scene.from_meshes([Mesh("Hill", points, faces), roof]))
+    roof = quad("Roof", (10, -10, 8), (20, -10, 8), (20, 10, 8), (10, 10, 8))
+    write_scene(tmp_path / "land.glb", Scene.from_meshes([SceneMesh("Hill", points, faces), roof]))
     tree = trimesh.util.concatenate(
         trimesh.creation.cylinder(
             0.2, 2, transform=[[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 1], [0, 0, 0, 1]]
@@ -135,13 +135,6 @@ def test_without_a_name_they_stand_on_the_highest_surface_and_stay_in_a_rectangl
     assert np.array_equal(scene.instances.transforms[:, :, :3], np.tile(np.eye(3), (100, 1, 1)))
 
 
-def test_a_roof_over_all_of_a_surface_does_not_count(made):
-    scatter = {"count": 50, "surfaces": "Hill", "within": [12, -8, 19, 8]}
-    scene = made(TREE | {"scatter": scatter}).scene
-    at = places(scene)
-    assert np.abs(at[:, 2] - height(at[:, :2])).max() < 1e-6
-
-
 def test_a_ground_without_files_carries_copies_too(made):
     scatter = {"count": 20, "within": [100, 100, 120, 110]}
     scene_of = {"files": [], "ground": {"height_m": 1.5, "margin_m": 3}}
@@ -198,46 +191,22 @@ def test_a_file_is_read_once_for_all_entries(made, monkeypatch):
     assert scene.names[2:] == ("Tree", "Bush")
 
 
-def test_copies_are_scanned_where_they_stand(made):
-    crate = {"name": "Crate", "box": [2, 2, 3], "at": [{"position": [5, 0, 0], "yaw_deg": 45}]}
-    scene = made(crate, scene={"files": []}).scene
-    scanner = Scanner(scene, load_sensor("velodyne/vlp16"), columns=["range"])
-    cloud = scanner.sweep((0, 0, 1))
-    assert len(cloud) > 100 and abs(cloud["range"].min() - (5 - 2**0.5)) < 0.01
-
-
-def test_many_copies_can_be_planned_around(made):
-    """Each is an obstacle."""
-    crate = {
-        "name": "Crate",
-        "box": [0.1, 0.1, 1],
-        "scatter": {"count": 1000, "within": [-20, -10, 10, 10]},
-    }
-    ends = {"start": [-25, 0], "target": [25, 0], "obstacles": ["Crate*"]}
-    planning = made(crate, planning=ends).planning
-    assert len(planning.radii) == 1000 and np.allclose(planning.radii, 0.05 * 2**0.5)
-
-
 WRONG = {
     "neither": ({"name": "A", "at": [[0, 0]]}, "give either file or box."),
     "no place": (TREE, "give one of at, table and scatter."),
     "two": (TREE | {"at": [[0, 0]], "table": "a.csv"}, "give one of at, table and scatter."),
     "short": (TREE | {"at": [[0]]}, "at least 2 items"),
-    "text": (TREE | {"at": ["here"]}, "is 'here'; it must be"),
     "outside": (
         TREE | {"at": [[0, 0], [99, 1], [99, 2]]},
         "copies[0]: below x 99, y 1 nothing of the scene's files or ground faces up to stand on "
         "(2 copies): give z.",
     ),
-    "flat": (TREE | {"at": [{"position": [0, 0], "scale": [1, 0, 1]}]}, "would flatten"),
     "name": (TREE | {"scatter": {"count": 1, "surfaces": "Hil"}}, "'Hil', but no object has"),
     "ordered": (TREE | {"scatter": {"count": 1, "within": [5, 0, 4, 1]}}, "the lowest x and y"),
-    "factors": (TREE | {"scatter": {"count": 1, "scale": [2, 1]}}, "the largest factor"),
     "full": (
-        TREE | {"scatter": {"count": 200, "spacing_m": 5}},
-        "of 200 found room on * within x -20 to 20, y -10 to 10: take fewer",
+        TREE | {"scatter": {"count": 9, "spacing_m": 25}},
+        "of 9 found room on * within x -20 to 20, y -10 to 10: take fewer",
     ),
-    "many": (TREE | {"scatter": {"count": 1_000_001}}, "it must be 1 to 1000000"),
     "no file": (TREE | {"table": "none.csv"}, "none.csv is not a usable table of copies"),
     "no column": (TREE | {"table": "a.csv"}, "it has no column 'y'; it has x, z"),
     "nan": (
@@ -248,7 +217,6 @@ WRONG = {
         TREE | {"table": "some.csv"},
         "its column 'z' has '' in line 5: give a number in every line, or leave the column out.",
     ),
-    "short row": (TREE | {"table": "short.csv"}, "its column 'yaw_deg' has '' in line 2"),
     "angle": (
         TREE | {"table": "yaw.csv"},
         "column 'yaw' has no unit: call it yaw_deg, in degrees, or give columns: {yaw_deg: yaw}",
@@ -258,12 +226,12 @@ WRONG = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_what_cannot_be_is_told_in_a_line(made, folder, name):
+def test_what_cannot_be_is_told_in_a_line(made, folder, name, monkeypatch):
+    monkeypatch.setattr("lidarpool.scenario.static_scene.DRAWS_LEAST", 0)
     entry, says = WRONG[name]
     (folder / "a.csv").write_text("x,z\n1,nan\n")
     (folder / "some.csv").write_text("x,y,z\n# first\n1,2,3\n\n4,5,\n")
     (folder / "yaw.csv").write_text("x,y,yaw\n1,2,90\n")
-    (folder / "short.csv").write_text("x;y;yaw_deg\n1;2\n")
     with pytest.raises(LidarpoolError) as raised:
         made(entry)
     assert says in str(raised.value) and len(str(raised.value).splitlines()) == 1
@@ -274,9 +242,3 @@ def test_nothing_to_stand_on(made):
         made(TREE | {"scatter": {"count": 1}}, scene={"files": []})
     with pytest.raises(LidarpoolError, match="give z"):
         made(TREE | {"at": [[0, 0]]}, scene={"files": []})
-
-
-def test_lists_stand_on_a_ground_that_reaches_under_them(made):
-    ground = {"files": [], "ground": {"height_m": 1}}
-    scene = made(TREE | {"at": [[5, 5], [50, 5]]}, scene=ground).scene
-    assert scene.bounds[0, 2] + scene.origin[2] == 1

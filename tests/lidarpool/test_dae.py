@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 import trimesh
-from tests.lidarpool.meshes import NESTED
+from tests.meshes import NESTED
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.files.meshfile import load_meshes
 from lidarpool.scene.scene import Scene
 
 DAE = """<?xml version="1.0"?>{doctype}

@@ -14,16 +14,15 @@ import numpy as np
 import pyarrow.dataset
 import pyarrow.parquet
 import pytest
-from rosbags.highlevel import AnyReader
-from rosbags.typesys import Stores, get_typestore
-from tests.lidarpool.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
+from tests.drives import SCANS, TURNS, points_of, the_scene, the_sweeps
 
-from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey, read_cloud
+from lidarpool import Cloud, LidarpoolError, Scene, Sensor, Survey
 from lidarpool.base.storage import Storage
+from lidarpool.datasets.dataset import INDEX_FILE, DataSet, Listing
+from lidarpool.datasets.job_table import JobRow
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.dataset import DATA_SETS, INDEX_FILE, DataSet, Listing
+from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.formats import Format
-from lidarpool.export.jobs import JobRow
 from lidarpool.export.sweeps import Sweeps
 
 
@@ -86,29 +85,6 @@ def test_parquet_is_one_table_of_partitions(written, job):
         np.testing.assert_allclose(rows[["x", "y", "z"]], cloud.positions)
         np.testing.assert_array_equal(rows["class"], cloud["class"])
     assert len(frame) == sum(len(job(number)) for number in (0, 1, 7))
-
-
-def test_folder_has_a_result_for_each_job(written, job):
-    _, place = written("folder")
-    cloud = read_cloud(place / "jobs/007/cloud.ply")
-    np.testing.assert_allclose(cloud.positions, job(7).positions, atol=1e-4)
-    assert len(cloud.sweeps()) == 2 * TURNS  # so it can be saved in other formats
-
-
-def test_bags_are_those_of_jobs_by_themselves(written, job, sweeps, tmp_path):
-    _, place = written("mcap", layout="velodyne")
-    assert {path.name for path in (place / "bags").iterdir()} == {
-        "000.mcap",
-        "001.mcap",
-        "007.mcap",
-    }
-    # A bag holds the name of its file.
-    Format("mcap").write(tmp_path / "007.mcap", job(7), sweeps)
-    assert (place / "bags/007.mcap").read_bytes() == (tmp_path / "007.mcap").read_bytes()
-    with AnyReader(
-        [place / "bags/007.mcap"], default_typestore=get_typestore(Stores.ROS2_HUMBLE)
-    ) as bag:
-        assert "/rear_left/points" in bag.topics
 
 
 def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
@@ -223,17 +199,6 @@ def test_a_large_job_is_written_a_sweep_at_a_time(sweeps, job, tmp_path, monkeyp
     assert max(held) < 16 * len(job(0)) / 3
 
 
-def test_boxes_are_kept_as_the_formats_have_them(written, job, sweeps):
-    for format in DATA_SETS:  # noqa: A001
-        _, place = written(format, (4,))
-        name = "jobs/004/boxes.npz" if format == "folder" else "boxes/004.npz"
-        with np.load(place / name) as kept:
-            for sweep, points in enumerate(sweeps.points(job(4))):
-                wanted = Boxes.of(sweeps, sweep, points)
-                np.testing.assert_allclose(kept["centres"][sweep], wanted.centres)
-                np.testing.assert_array_equal(kept["there"][sweep], wanted.there)
-
-
 @pytest.mark.parametrize("format", DATA_SETS)
 def test_a_manifest_lists_the_files_of_a_job(written, format):  # noqa: A002
     data, place = written(format, (4,))
@@ -275,8 +240,6 @@ def test_parquet_with_as_many_files_as_sweeps(scene, sweeps, job, tmp_path):
 
 def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeypatch):
     place = Storage.at(tmp_path / "d")
-    with pytest.raises(LidarpoolError, match=r"format is 'las'; .* kitti, nuscenes"):
-        DataSet(place, "las")
     bare = Cloud(job(0).positions, {"scan": job(0).scan})
     with pytest.raises(LidarpoolError, match="kitti needs object, intensity, class"):
         DataSet(place, "kitti").write_job(JobRow(0, "0"), bare, sweeps)

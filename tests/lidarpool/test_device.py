@@ -13,12 +13,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
-from tests.lidarpool.casting import cast_between
 from tests.lidarpool.test_memory import MANY
 from tests.lidarpool.test_memory import SCENE as SPHERE
 from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
+from tests.shapes import cast_between
 
-from lidarpool import Actor, Column, Instance, Mounted, Noise, Pose, Scanner, Scene, Survey, Track
+from lidarpool import (
+    Actor,
+    Column,
+    Mounted,
+    Noise,
+    Pose,
+    Scanner,
+    Scene,
+    SceneInstance,
+    Survey,
+    Track,
+)
 from lidarpool.columns.parts import pack
 from lidarpool.pipeline import rigs as stage
 from lidarpool.scene.actors import box
@@ -69,7 +80,7 @@ def scenes():
     for k, stretch in enumerate((1, 2, -1, 1, 1, 0.5)):
         matrix = np.diag([stretch, 1, 1, 1.0])
         matrix[:2, 2:] = [[0, 2 * k - 5], [0.3, 0.1]]
-        copies.append(Instance(objects[1 + k % 3], matrix, f"copy {k}"))
+        copies.append(SceneInstance(objects[1 + k % 3], matrix, f"copy {k}"))
     return {
         "plain": Scene.from_meshes(objects),
         "instances": Scene.from_meshes(copies),
@@ -194,18 +205,6 @@ def test_a_casting_task_gives_the_part_that_numpy_gives(scenes, backend, monkeyp
         samples, exact = mine.part.samples, other.part.samples
         assert pack(mine.part) == pack(replace(other.part, samples=samples))
         assert np.allclose(samples, exact, rtol=0, atol=survey.precision_m, equal_nan=True)
-
-
-@pytest.mark.parametrize("more", [{}, MORE["a user's column"]], ids=["", "hits"])
-def test_the_hosts_memory_is_what_was_estimated(more, scenes, backend, monkeypatch):
-    taken = []
-    monkeypatch.setattr(HOST.cuda, "alloc_pinned_memory", lambda n: taken.append(n) or bytearray(n))
-    survey = replace(MADE["on the move"], **more)
-    columns_of(list(Rig(scenes["plain"], survey, backend).cast(0, 14)))
-    assert 0 < sum(taken) < cast_bytes(scenes["plain"], survey, 14, on_device=True)
-    assert cast_bytes(scenes["plain"], survey, 14, on_device=True) < cast_bytes(
-        scenes["plain"], survey, 14
-    )
 
 
 def test_a_sweep_keeps_no_page_locked_memory(scenes, backend):

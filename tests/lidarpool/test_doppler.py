@@ -2,34 +2,29 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.shapes import Cart, block, cast_between, wall
 
 from lidarpool import (
     Material,
-    Mesh,
     Mounted,
     Noise,
     Pose,
     Returns,
-    Scanner,
     Scene,
     Sensor,
     Survey,
     Track,
     load_sensor,
 )
-from lidarpool.columns.table import TABLE
-from lidarpool.render.colouring import colours_of
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.robot import Hinge, LinkPath
 from lidarpool.sensor.trajectory import Stations, quaternions_of, rotations_of, velocities
-from lidarpool.simulator.hits import AIR, FALSE_ALARM, Hits, joined
+from lidarpool.simulator.hits import AIR, FALSE_ALARM
 from lidarpool.simulator.rig import Rig
-
-from .casting import Cart, cast_between
 
 SPEED, RADIUS = 25.0, 50.0  # of the train
 RATE = SPEED / RADIUS
@@ -45,27 +40,9 @@ def circle(radius, seconds, count=40_000, before=0.0):
     return Track(times, places, turns, smooth=True, start_s=0.0)
 
 
-@dataclass(frozen=True)
-class Wobble:
-    """A trajectory of a user's class, with or without derivatives of its own."""
-
-    moves: bool = True
-    stations: int = 1
-    duration_ns: float = np.inf
-
-    def pose(self, station, time_ns=0.0):
-        return Pose.of(*(part[0] for part in self.poses(station, np.array([time_ns]))))
-
-    def poses(self, station, times_ns):
-        t = times_ns / 1e9
-        places = np.stack([np.sin(t), np.cos(2 * t), 0.1 * t**2], axis=1)
-        return places, rotations_of(np.stack([40 * t, 0 * t, 0 * t], axis=1))
-
-
 def wall_around():
     """A box to look at from inside, far from round."""
-    room = box("Room", (260.0, 240.0, 30.0))
-    return Mesh("Room", room.vertices - [0, 0, 4], room.faces)
+    return block("Room", (260, 240, 30), (0, 0, 11))
 
 
 def found_of(rig):
@@ -170,21 +147,10 @@ def test_actors_that_wait_do_not_move():
     assert not linear.any()
 
 
-def test_a_class_without_derivatives_gets_differences():
-    times = np.linspace(0.5, 3, 40) * 1e9
-    for found, expected in zip(
-        velocities(Wobble(), 0, times), differences(Wobble(), times, 2e6), strict=True
-    ):
-        np.testing.assert_allclose(found, expected, atol=1e-6)
-
-
 def test_a_mirror_that_moves_counts_twice():
     # The virtual image of a wall, in a mirror that comes nearer.
-    plane = np.array([[0, -9, -9], [0, 9, -9], [0, 9, 9], [0, -9, 9]], float)
-    faces = np.array([[0, 1, 2], [0, 2, 3]])
     way = Track([0, 2], [[10, 0, 0], [4, 0, 0]], np.tile([0, 0, 0, 1.0], (2, 1)))
-    mirror = Actor(Mesh("Mirror", plane, faces), way)
-    behind = Mesh("Wall", plane * 5 + [-20, 0, 0], faces)
+    mirror, behind = Actor(wall("Mirror", 0, (-9, 9), (-9, 9)), way), wall("Wall", -20)
     sensor = Sensor.grid(180, 3, 20.0, step_deg=360)
     survey = Survey(
         sensor, poses=[(0, 0, 0)], steps=1, columns=["radial_velocity"],
@@ -252,18 +218,6 @@ def test_noise_of_velocities():
     assert (found_of(Rig(Scene.seed(), other, "numpy")).radial_velocity != found).mean() > 0.99
 
 
-def test_velocities_of_what_is_no_surface():
-    ray = np.arange(2)
-    own = ray, np.ones(2), np.zeros(2, np.int32), np.ones(2)
-    surface = Hits(*own, velocity=np.array([1.0, 2.0]))
-    others = Hits(*own, cause=np.array([AIR, FALSE_ALARM], np.uint8))
-    made = joined([surface, others])
-    assert made.velocity[:2].tolist() == [1, 2]
-    assert np.isnan(made.velocity[2:]).all()
-    assert joined([others]).velocity is None
-    assert made.cause.tolist() == [0, 0, AIR, FALSE_ALARM]
-
-
 @pytest.mark.parametrize("subrays", [1, 7])
 def test_drops_are_at_rest(subrays):
     # A moving carrier in rain, before a wall and among cars.
@@ -289,27 +243,6 @@ def test_drops_are_at_rest(subrays):
     assert cuts == cast_between(
         Rig(Scene.seed().with_actors([car]), survey, "embree"), survey, [0, 3]
     )
-
-
-def test_a_scanner_that_starts_late():
-    way = Track([0, 1, 2], [[0, 0, 1], [5, 0, 1], [0, 0, 1]])
-    scanner = Scanner(Scene.seed(), load_sensor("velodyne/vlp16"), columns=["radial_velocity"])
-    ahead = scanner.sweep(way, number=0)["radial_velocity"]
-    back = scanner.sweep(way, number=0, start_s=1.5)["radial_velocity"]
-    assert np.abs(ahead).max() == pytest.approx(np.abs(back).max(), rel=0.05)
-    assert np.abs(ahead).max() > 4.5
-
-
-def test_velocities_are_blue_and_red():
-    values = np.array([-8.0, 0.0, 2.0, np.nan], np.float32)
-    made = colours_of(values, TABLE["radial_velocity"])
-    assert made.limits[0] == -made.limits[1]
-    nearer, still, farther, unknown = made.paint(values)
-    assert nearer[2] > nearer[0]
-    assert farther[0] > farther[2]
-    assert np.ptp(still) < 0.02
-    assert unknown.tolist() == [0.5, 0.5, 0.5]
-    assert made.scale is not colours_of(values, TABLE["range"]).scale
 
 
 def test_false_alarms_have_no_velocity():

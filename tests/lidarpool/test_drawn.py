@@ -4,11 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from tests.shapes import block, level
 
 from lidarpool import Scene
-from lidarpool.scene.drawn import PART_LEAST, Drawn, cut
-from lidarpool.scene.mesh import Cutout, Mesh, triangle_areas
-from lidarpool.scene.plants import SPECIES, placed, tree
+from lidarpool.render.closeup import ShownPart, floor_and_cut
+from lidarpool.scene.actors import box
+from lidarpool.scene.generated.plants import SPECIES, placed, tree
+from lidarpool.scene.scene_mesh import Cutout, SceneMesh, triangle_areas
+from lidarpool.scene.simplified import PART_LEAST, Drawn, cut
+from raybeam import RayCaster
 
 
 @pytest.fixture(scope="module")
@@ -22,12 +26,6 @@ def avenue():
 
 def sizes(drawn):
     return np.bincount(drawn.scene.face_object, minlength=len(drawn.scene.names))
-
-
-def test_few_triangles_are_all_there(avenue):
-    drawn = Drawn.of(avenue)
-    assert len(drawn.scene.faces) == avenue.triangles
-    np.testing.assert_allclose(drawn.scene.object_bounds, avenue.object_bounds, atol=1e-9)
 
 
 @pytest.mark.parametrize("most", [40_000, 8_000])
@@ -72,7 +70,10 @@ def test_what_masks_leave_is_drawn(repeats):
     corners = np.array([[0.0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
     uv = (corners[faces, :2] / [2, 1] * repeats).astype(np.float32)
-    wall, card = Mesh("Wall", corners, faces), Mesh("Card", corners, faces, (Cutout(mask, uv),))
+    wall, card = (
+        SceneMesh("Wall", corners, faces),
+        SceneMesh("Card", corners, faces, (Cutout(mask, uv),)),
+    )
     scene = Scene.from_meshes([wall, card])
     drawn, before = Drawn.of(cut(scene)), Drawn.of(scene)
     own = drawn.scene.faces[drawn.scene.face_object == 1]
@@ -92,6 +93,35 @@ def test_what_masks_leave_is_drawn(repeats):
 def test_a_card_that_is_transparent_everywhere_stays_a_speck():
     uv = np.zeros((1, 3, 2), np.float32)
     cutout = Cutout(np.zeros((2, 2), bool), uv)
-    scene = Scene.from_meshes([Mesh("Card", np.eye(3), np.arange(3)[None], (cutout,))])
+    scene = Scene.from_meshes([SceneMesh("Card", np.eye(3), np.arange(3)[None], (cutout,))])
     drawn = Drawn.of(cut(scene)).scene
     assert len(drawn.faces) == 1 and np.ptp(drawn.vertices, axis=0).max() < 0.1
+
+
+def test_what_is_wide_is_cut_and_what_stands_outside_is_left_out():
+    """Two triangles of ground, a tower and a hut inside, and a hut outside."""
+    scene = Scene.from_meshes([
+        level("ground", 0, 200),
+        block("tower", (10, 10, 80), (10, 10, 40)),
+        block("hut", (4, 4, 3), (-10, 10, 1.5)),
+        block("other hut", (4, 4, 3), (100, 10, 1.5)),
+    ])  # fmt: skip
+    cut = ShownPart.whole(scene).cut(np.array([[-30.0, -20, 0], [30, 20, 27]]))
+    part, shares = cut.scene, cut.shares
+    there = {scene.names[k] for k in np.unique(part.face_object)}
+    assert there == {"ground", "tower", "hut"}
+    assert part.bounds == pytest.approx(np.array([[-30, -20, 0], [30, 20, 27]]))
+    assert np.array_equal(part.face_object, scene.face_object[cut.parents])
+    ground = part.face_object == 0
+    a, b, c = (part.vertices[part.faces[ground, k]] for k in range(3))
+    assert np.cross(b - a, c - a)[:, 2].sum() / 2 == pytest.approx(60 * 40)  # none turned over
+    assert shares[ground].sum() == pytest.approx(2 * 60 * 40 / 400**2)
+    assert (shares[part.face_object == 2] == 1).all()
+
+
+def test_a_roof_is_cut_open_and_a_crown_is_not():
+    places = np.array([[0.9, 0, 1], [-0.8, 0.5, 1], [0, 1.1, 1]])
+    for over, height in ((box("hall", (20, 20, 7)), 4.0), (tree(SPECIES[0]), None)):
+        scene = Scene.from_meshes([over])
+        caster = RayCaster(scene.vertices, scene.faces, "numpy")
+        assert floor_and_cut(scene, caster, places)[1] == (height and pytest.approx(height))

@@ -9,14 +9,25 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import trimesh
-from tests.lidarpool.casting import Cart, cast_between, tally_of
+from tests.shapes import (
+    COLUMNS,
+    CPU,
+    Cart,
+    beam_along_x,
+    cast,
+    cast_between,
+    level,
+    quad,
+    solid,
+    tally_of,
+    wall,
+)
 
 from lidarpool import (
     Beams,
     LidarpoolError,
     Material,
     Noise,
-    Optics,
     Pose,
     Returns,
     Scene,
@@ -24,7 +35,7 @@ from lidarpool import (
     Spin,
     Survey,
 )
-from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.noise import Purpose, raw
@@ -32,30 +43,6 @@ from lidarpool.simulator.echoes import chosen
 from lidarpool.simulator.hits import Hits
 from lidarpool.simulator.rig import Rig
 from lidarpool.simulator.separation import separated
-from raybeam import available_backends
-
-COLUMNS = ("ray", "range", "intensity", "reflectivity", "return_number", "returns", "class")
-
-
-def wall(name, x, y=(-50.0, 50.0), z=(-50.0, 50.0)):
-    """A rectangle across the x axis."""
-    corners = [[x, y[0], z[0]], [x, y[1], z[0]], [x, y[1], z[1]], [x, y[0], z[1]]]
-    return Mesh(name, np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
-
-
-def beam_along_x(rays=1, max_range_m=float("inf"), **optics):
-    """A sensor that fires once, so many beams along x."""
-    return Sensor(Beams(np.zeros(rays)), Spin(1, 360), 0, max_range_m, optics=Optics(**optics))
-
-
-def cast(meshes, sensor=None, backend="numpy", at=(0, 0, 0), **options):
-    """Points of one scan of some meshes, by column."""
-    options = {"keep_every": 1, "columns": COLUMNS, **options}
-    survey = Survey(sensor or beam_along_x(), poses=[at], steps=1, **options)
-    rig = Rig(Scene.from_meshes(meshes), survey, backend)
-    (batch,) = rig.cast(0, 1)
-    return {c.name: c.make(batch) for c in survey.stored_columns} | {"batch": batch}
-
 
 # -- random numbers ------------------------------------------------------------------------------
 
@@ -80,7 +67,9 @@ def test_energy_falls_with_distance_angle_and_reflectance():
     assert near["intensity"] == pytest.approx([4.0])
     assert near["reflectivity"] == pytest.approx([1.0])
     assert cast([wall("W", 20)])["intensity"] == pytest.approx([0.5 / 4]), "half is scattered"
-    slanted = Mesh("S", np.array([[4, -9, 9], [4, 9, 9], [22, -9, -9.0]]), np.array([[0, 1, 2]]))
+    slanted = SceneMesh(
+        "S", np.array([[4, -9, 9], [4, 9, 9], [22, -9, -9.0]]), np.array([[0, 1, 2]])
+    )
     found = cast([slanted], materials=[Material("S", reflectance=0.8, semantic_class=65_535)])
     assert found["reflectivity"] == pytest.approx([0.8 * math.sqrt(0.5)], rel=1e-6)
     assert found["class"].tolist() == [65_535]
@@ -118,20 +107,6 @@ def test_the_last_material_that_names_an_object_counts():
 
 
 # -- beams ---------------------------------------------------------------------------------------
-
-
-def test_half_a_beam_on_each_of_two_surfaces_is_two_returns():
-    """As bright both, where the farther one scatters four times as much of the light."""
-    materials = [Material("Near", 0.2), Material("Far", 0.8)]
-    meshes = [wall("Near", 5, y=(0, 50)), wall("Far", 10)]
-    beam = Returns("all", subrays=217, divergence_mrad=3, pulse_ns=5)
-    found = cast(meshes, materials=materials, returns=beam)
-    assert found["range"] == pytest.approx([5, 10], abs=1e-3)
-    assert found["intensity"] / found["intensity"].sum() == pytest.approx([0.5, 0.5], abs=0.02)
-    assert found["intensity"].sum() == pytest.approx(0.8, rel=1e-3)
-    assert found["return_number"].tolist() == [1, 2]
-    assert found["returns"].tolist() == [2, 2]
-    assert found["object"].tolist() == [0, 1]
 
 
 @pytest.mark.parametrize(("apart_m", "returns"), [(0.74, 1), (0.76, 2)])
@@ -176,9 +151,6 @@ def test_modes(mode):
 # -- glass and mirrors ---------------------------------------------------------------------------
 
 
-CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
-
-
 @pytest.mark.parametrize("backend", CPU)
 def test_light_passes_glass(backend):
     meshes = [wall("Pane", 4), wall("Behind", 9)]
@@ -202,10 +174,7 @@ def test_a_pane_has_two_surfaces_from_whatever_side(backend, away_m, angle_deg):
     pane = trimesh.creation.box((0.004, 300, 20))
     angle = math.radians(angle_deg)
     pane.apply_transform(trimesh.transformations.rotation_matrix(angle, (0, 0, 1)))
-    meshes = [
-        Mesh("Pane", np.add(pane.vertices, (away_m + 30, 0, 0)), pane.faces),
-        wall("Behind", away_m + 60),
-    ]
+    meshes = [solid("Pane", pane, (away_m + 30, 0, 0)), wall("Behind", away_m + 60)]
     materials = [Material("Behind", 0.5), Material("Pane", transparent="pass")]
     found = cast(meshes, at=(away_m, 0.01, 0.02), backend=backend, materials=materials)
     through = (1 - fresnel(np.array([math.cos(angle)]))) ** 4  # two surfaces, there and back
@@ -224,10 +193,8 @@ def test_glass_reflects_by_fresnel():
 @pytest.mark.parametrize("subrays", [1, 19])
 def test_a_mirror_shows_what_is_reflected_at_the_unfolded_range(subrays, backend):
     """A mirror at 45 degrees turns the beam up, to a ceiling 3 m above."""
-    corners = np.array([[2, -9, -2], [2, 9, -2], [6, 9, 2], [6, -9, 2.0]])
-    mirror = Mesh("Mirror", corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    ceiling = np.array([[-9, -9, 3], [9, -9, 3], [9, 9, 3], [-9, 9, 3.0]])
-    meshes = [mirror, Mesh("Ceiling", ceiling, mirror.faces)]
+    mirror = quad("Mirror", (2, -9, -2), (2, 9, -2), (6, 9, 2), (6, -9, 2))
+    meshes = [mirror, level("Ceiling", 3, 9)]
     materials = [Material("*"), Material("Mirror", transparent="mirror")]
     beam = Returns(subrays=subrays, divergence_mrad=1)
     found = cast(meshes, materials=materials, returns=beam, backend=backend)
@@ -262,8 +229,7 @@ def test_ranges_have_the_noise_that_was_asked_for(distance, beam):
 
 def test_light_goes_where_a_beam_points_and_its_angle_is_reported_without_noise():
     """On a wall that is met at 45 degrees, ranges tell how far beams point off."""
-    corners = np.array([[-40, 50, -50], [60, -50, -50], [60, -50, 50], [-40, 50, 50.0]])
-    slanted = Mesh("W", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    slanted = quad("W", (-40, 50, -50), (60, -50, -50), (60, -50, 50), (-40, 50, 50))
     found = cast([slanted], beam_along_x(MANY), noise=Noise(angle_deg=0.1))
     # Along x the wall is at 10 m; turned by a small angle, at 10 (1 - angle).
     off = (10 - found["range"]) / 10

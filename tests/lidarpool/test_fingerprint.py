@@ -1,16 +1,19 @@
-"""Fingerprints: another content or another code is another one, and the same is the same."""
+"""Fingerprints and sources: another content or another code is another one, the same the same."""
 
 from __future__ import annotations
 
 import copy
 import enum
 import os
+import shutil
 import subprocess
 import sys
 import threading
+import time
 from collections import namedtuple
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -21,6 +24,7 @@ from hypothesis.extra import numpy as npst
 
 from lidarpool import Beams, LidarpoolError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
+from lidarpool.base.software import PACKAGES, difference, software, sources
 from lidarpool.sensor import Head
 
 Pair = namedtuple("Pair", "a b")
@@ -207,3 +211,46 @@ def test_what_has_none_is_refused_by_name(thing, name):
     for outer in (thing, [thing], Box({"a": thing})):
         with pytest.raises(LidarpoolError, match=f"of type {name} has no fingerprint.*keep num"):
             fingerprint(outer)
+
+
+ASK = "from lidarpool.base.software import sources; print(sources())"
+
+
+@pytest.fixture
+def packages(tmp_path: Path) -> Path:
+    """The packages, copied to another place."""
+    for package in PACKAGES:
+        spec = find_spec(package)
+        assert spec is not None and spec.submodule_search_locations
+        shutil.copytree(spec.submodule_search_locations[0], tmp_path / package)
+    return tmp_path
+
+
+def asked(folder: Path) -> str:
+    env = {**os.environ, "PYTHONPATH": os.pathsep.join([str(folder), *sys.path])}
+    return subprocess.run(
+        [sys.executable, "-c", ASK], env=env, check=True, capture_output=True, text=True
+    ).stdout.strip()
+
+
+def test_the_same_sources_in_another_place_are_the_same_and_one_letter_more_is_not(packages):
+    ours = sources()
+    assert asked(packages) == ours
+    changed = packages / "raybeam" / "intersect.cu"
+    changed.write_text(changed.read_text() + "\n")
+    os.utime(changed, (0, 0))
+    assert asked(packages) not in ("", ours)
+
+
+def test_a_process_older_than_its_files_does_not_speak_for_them(packages):
+    late = time.time() + 3600
+    os.utime(packages / "lidarpool" / "simulator" / "returns.py", (late, late))
+    assert asked(packages) == "changed since the process started"
+
+
+def test_the_first_difference_is_named():
+    here = software("numpy")
+    assert difference(here, here) == ""
+    there = here | {"numpy": "1.0 with nothing"}
+    assert difference(there, here) == f"numpy 1.0 with nothing, the run numpy {here['numpy']}"
+    assert difference({}, here).startswith("lidarpool not installed, the run lidarpool 0.")

@@ -6,10 +6,10 @@ import struct
 
 import numpy as np
 import pytest
-from tests.lidarpool.meshes import write
+from tests.meshes import write
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.files.meshfile import load_meshes
 
 CORNERS = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], "<f4").tobytes()
 
@@ -135,19 +135,6 @@ def test_sparse_positions(tmp_path, base):
     np.testing.assert_array_equal(
         mesh.vertices[:3], [[0, 0, 0], [9, 8, 7], [0, 1, 0] if base else [0, 0, 0]]
     )
-
-
-def test_draco(tmp_path):
-    draco = pytest.importorskip("DracoPy", reason="the decoder of packed glTF is an extra")
-    points = np.frombuffer(CORNERS, "<f4").reshape(3, 3)
-    body = draco.encode(points, np.array([[0, 1, 2]]))
-    header = triangle(body)
-    del header["accessors"][0]["bufferView"]
-    packed = {"KHR_draco_mesh_compression": {"bufferView": 0, "attributes": {"POSITION": 0}}}
-    header["meshes"][0]["primitives"] = [{"attributes": {"POSITION": 0}, "extensions": packed}]
-    header["extensionsRequired"] = list(packed)
-    (mesh,) = load(tmp_path, header, body)
-    np.testing.assert_allclose(np.ptp(mesh.vertices, axis=0), [1, 1, 0], atol=1e-3)
 
 
 @pytest.mark.parametrize("where", ["nodes", "meshes"])

@@ -240,18 +240,6 @@ def test_channels_of_a_mirror_that_stands_are_the_beams_of_a_head_that_turns(imp
         assert np.allclose(fired(of, number, [7])[0, 0], there)
 
 
-def test_angular_resolutions_set_the_rates(imported):
-    wide = {"scanAngleMax_deg": 90, "scanAngleEffectiveMax_deg": 50}
-    device = scanner("rotating", "", headRotatePerSecMax_deg=99, **wide)
-    fine = 'pulseFreq_hz="9000" verticalResolution_deg="2" horizontalResolution_deg="0.5" '
-    ends = 'headRotateStart_deg="0" headRotateStop_deg="50"'
-    made, _, of = imported(device, legs(fine + ends, (0, 0)), platform="tripod")
-    head = of.carried[0].sensor.head
-    assert head.firings_per_turn == pytest.approx(720) and head.rate_hz == pytest.approx(50 / 360)
-    assert of.ray_count == 100 * 50  # lines half a degree apart, of -48 to 50 degrees by 2
-    assert made.scenario.sensors["leg0"].steps == 5
-
-
 def test_the_cloud_of_a_flight_lies_on_the_ground_and_knows_its_legs(imported):
     template = '<scannerSettings id="t" pulseFreq_hz="1000" scanAngle_deg="20" active="true"/>'
     template += '<platformSettings id="p" movePerSec_m="10"/>'
@@ -424,14 +412,11 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
     [
         (("<survey", "<survey <"), "fly.xml is not readable XML"),
         (("<document", '<!DOCTYPE a [<!ENTITY e "">]><document'), "declares an XML entity"),
-        (("document>", "kml>"), "fly.xml is XML, but not of HELIOS[+][+]"),
         (("devices.xml#s", "devices.xml#t"), "no <scanner> 't' in .*devices.xml"),
         (("devices.xml#s", "lasers.xml#s"), "no file 'lasers.xml'.*--assets"),
         (('scanner="devices.xml#s"', ""), "names no scanner"),
         (("ground.obj", "grund.obj"), "scene 'field', part 0: there is no file .*grund.obj"),
-        (("objloader", "objreader"), "part 0: the filter 'objreader' is not known"),
         (("objloader", "xyzloader"), "has no part that can be read"),
-        (('value="100"', 'value="1;2"'), "part 0: '1;2' is not 1 number"),
         (('x="3"', 'x="three"'), "leg 1: x is 'three'; it must be a number"),
         (('x="3" y="4"', 'x="0" y="0"'), "no two legs are at different places"),
         (('movePerSec_m="10"', 'movePerSec_m="0"'), "leg 0: movePerSec_m is 0; it never ends"),
@@ -441,7 +426,6 @@ def test_voxels_are_scene_files_where_light_goes_through_them(survey, tmp_path):
         (("#plane", "#tripod"), "leg 0: nothing moves"),
         (('pulseFreq_hz="1000"', 'headRotatePerSec_deg="9"'), "only one with rotating optics may"),
         (('optics="conic"', 'optics="flash"'), "optics 'flash'; there are rotating, oscillating"),
-        (('optics="conic"', 'optics="rotating"'), "cannot scan at scanFreq_hz 0"),
     ],
 )
 def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, change, message):

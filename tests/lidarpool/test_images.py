@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
-from tests.lidarpool.casting import Cart
+from tests.shapes import Cart
 
 from lidarpool import (
     Beams,
@@ -21,7 +21,6 @@ from lidarpool import (
     Noise,
     Pose,
     Returns,
-    Scanner,
     Sensor,
     Spin,
     Survey,
@@ -33,11 +32,11 @@ from lidarpool.export.formats import Format
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.sensor.beams import Mirror
-from lidarpool.sensor.described import described, remade
 from lidarpool.sensor.models import model_names, read_model
-from lidarpool.sensor.rays import ListedSensor
+from lidarpool.sensor.plain_data import described, remade
+from lidarpool.sensor.ray_sensors import ListedSensor
 from lidarpool.sensor.sensor import LineSensor
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
@@ -190,28 +189,6 @@ def test_what_has_no_return_has_no_values(made):
             assert np.isfinite(image[name]).all()
 
 
-def test_lost_returns_are_silent_rays(made):
-    """The share that is lost is that of the noise: 10 % beside what is too weak."""
-    _, _, images = made("noise")
-    clear = made("still")[2]
-    lost = hit = 0
-    for file in [*images][:1]:
-        there = np.isfinite(clear[file]["range"])
-        near = there & (clear[file]["range"] < 10)  # far above the threshold
-        lost += int(np.isnan(images[file]["range"][near]).sum())
-        hit += int(near.sum())
-    sigma = np.sqrt(0.1 * 0.9 / hit)
-    assert abs(lost / hit - 0.1) < 4 * sigma and hit > 300
-
-
-def test_ranges_of_a_loop_are_the_same_images(made):
-    _, _, images = made("still")
-    scanner = Scanner(SCENE, GRID, backend="embree")
-    ranges = scanner.ranges([(0, 0, 2)])[0].T
-    ranges[np.isinf(ranges)] = np.nan
-    np.testing.assert_array_equal(ranges, images["lidar/000000.npz"]["range"])
-
-
 @pytest.mark.parametrize("name", SURVEYS)
 def test_a_saved_survey_gives_the_same_images(made, tmp_path, name):
     cloud, sweeps, images = made(name)
@@ -236,14 +213,6 @@ def test_a_described_sensor_fires_the_same_rays(name):
     assert [again.firings(k) for k in range(5)] == [sensor.firings(k) for k in range(5)]
     np.testing.assert_array_equal(again.directions(firings), sensor.directions(firings))
     np.testing.assert_array_equal(again.times_ns(firings), sensor.times_ns(firings))
-
-
-def test_files_of_other_surveys_are_as_before():
-    for survey in (
-        Survey(GRID, poses=[(0, 0, 2)], columns=["range"]),
-        Survey(GRID, poses=[(0, 0, 2)], columns=["ray", "range"], keep_every=2),
-    ):
-        assert Sweeps.of(survey, SCENE).fired is None
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,9 @@
-"""The examples that scan in a loop: an environment of Gymnasium, and a node of ROS 2."""
+"""The examples that scan in a loop, and those in docstrings."""
 
 from __future__ import annotations
 
+import doctest
+import importlib
 import re
 import runpy
 import sys
@@ -13,6 +15,7 @@ import pytest
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
+import lidarpool
 from lidarpool import Pose, Scene, Survey, load_sensor
 from lidarpool.export.ros import write_mcap
 from lidarpool.export.sweeps import Sweeps
@@ -60,24 +63,6 @@ def test_a_robot_reaches_its_goal_by_its_ranges(capsys, robot_env):
     assert 340 < steps < 400 and 68 < reward < 74 and left < 1
 
 
-def test_episodes_repeat_and_end_at_walls(robot_env):
-    env = robot_env["RobotEnv"]()
-    first, _ = env.reset(seed=3)
-    assert env.observation_space.contains(first) and first[:64].min() < 15
-    second, reward, ended, cut, _ = env.step(np.float32([1, 0.5]))
-    assert abs(reward) <= 0.11 and not ended and not cut
-    again, _ = env.reset(seed=3)
-    assert np.array_equal(again, first)
-    assert np.array_equal(env.step(np.float32([1, 0.5]))[0], second)
-    nearest = env.reset(seed=3)[0][:64].argmin()
-    env.yaw += nearest * 2 * np.pi / 64
-    for _ in range(400):
-        _, reward, ended, cut, _ = env.step(np.float32([2, 0]))
-        if ended:
-            break
-    assert ended and reward < -9, "it drove into what was nearest"
-
-
 def test_a_node_publishes_what_a_bag_holds(tmp_path):
     node = runpy.run_path(str(EXAMPLES / "ros2_scanner.py"), run_name="ros2_scanner")
     scene, pose = Scene.seed(), Pose((0.5, 0.2, 1), 30)
@@ -101,3 +86,17 @@ def test_a_node_publishes_what_a_bag_holds(tmp_path):
         )
         assert store.serialize_cdr(message, connection.msgtype) == bytes(written)
     assert len(message.data) == 22 * len(cloud) > 10_000
+
+
+ROOT = Path(lidarpool.__file__).parents[1]
+MODULES = [
+    ".".join(path.relative_to(ROOT).with_suffix("").parts)
+    for path in sorted((ROOT / "lidarpool").rglob("*.py"))
+    if ">>> " in path.read_text(encoding="utf-8")
+]
+
+
+@pytest.mark.parametrize("name", MODULES)
+def test_examples(name):
+    done = doctest.testmod(importlib.import_module(name))
+    assert done.failed == 0 < done.attempted

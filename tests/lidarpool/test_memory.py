@@ -14,12 +14,12 @@ from hypothesis import strategies as st
 from lidarpool import (
     Beams,
     Material,
-    Mesh,
     Mounted,
     Noise,
     Optics,
     Returns,
     Scene,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
@@ -36,9 +36,9 @@ RAYS = 600_000
 
 BALL = trimesh.creation.icosphere(4, 60.0)  # around the sensor: all rays hit
 COLOURS = Colours.of_faces(np.arange(3 * len(BALL.faces), dtype=np.uint8).reshape(-1, 3))
-PLATE = Mesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
+PLATE = SceneMesh("Sign", np.array([[20.0, 0, 0], [20, 1, 0], [20, 0, 1]]), np.array([[0, 1, 2]]))
 SCENE = Scene.from_meshes(
-    [Mesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS), PLATE]
+    [SceneMesh("Ball", np.array(BALL.vertices), np.array(BALL.faces), colours=COLOURS), PLATE]
 )
 
 DELAYS = 300.0 * np.arange(128)
@@ -58,15 +58,12 @@ SIGN = {"materials": [Material("*", 0.5), Material("Sign", 1.0, retro=True)]}
 
 SURVEYS = {
     "positions": Survey(MANY, **STILL),
-    "every 5th": Survey(MANY, **STILL, keep_every=5),
     "all columns, on the move": Survey(MANY, **WAY, **ALL),
     "one beam, on the move": Survey(ONE, **WAY),
     "rays that never repeat": Survey(load_sensor("livox/mid40", step_deg=30), **STILL),
-    "noise of angles": Survey(MANY, **STILL, noise=Noise(angle_deg=0.01)),
     "lost returns": Survey(MANY, **STILL, noise=Noise(dropout=0.01), materials=HALF),
     "colours": Survey(MANY, **STILL, **PAINT),
     "noise and colours": Survey(MANY, **STILL, **PAINT, noise=Noise(angle_deg=0.01)),
-    "velocities": Survey(MANY, **WAY, columns=["radial_velocity"]),
     "velocities of sub-rays": Survey(
         MANY, **WAY, columns=["radial_velocity"], returns=Returns("strongest", 7, 3.0)
     ),

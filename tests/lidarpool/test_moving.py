@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.lidarpool.casting import cast_between
+from tests.shapes import cast_between, level, made, quad
 
 from lidarpool import (
     LidarpoolError,
@@ -19,10 +19,9 @@ from lidarpool import (
     Track,
     load_sensor,
 )
-from lidarpool.run.jobs import identity_of
+from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
 from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import Returns
 from lidarpool.simulator import world
 from lidarpool.simulator.motion import into_axes
@@ -42,25 +41,15 @@ DRIVE = Track(
 MOUNT = Pose((1.2, 0.1, 0.4), 20, 5, -3)
 
 
-def made(survey, scene, backend="numpy"):
-    """Columns of all points that a survey gives: {name: (n,)}."""
-    batches = list(Rig(scene, survey, backend).cast(0, survey.scan_count))
-    return {
-        column.name: np.concatenate([column.make(batch) for batch in batches])
-        for column in survey.stored_columns
-    }
-
-
 def stored_positions(columns, precision_m=PRECISION_M):
     return np.stack([columns[axis] for axis in "xyz"], axis=1) * precision_m
 
 
 @pytest.fixture(scope="module")
 def wall():
-    corners = np.array(
-        [[-500, WALL_M, -50], [500, WALL_M, -50], [500, WALL_M, 90], [-500, WALL_M, 90]]
-    )
-    return Scene.from_meshes([Mesh("Wall", corners * 1.0, np.array([[0, 1, 2], [0, 2, 3]]))])
+    y = WALL_M
+    corners = (-500, y, -50), (500, y, -50), (500, y, 90), (-500, y, 90)
+    return Scene.from_meshes([quad("Wall", *corners)])
 
 
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "velodyne/hdl64e-s2", "ouster/os0-32"])
@@ -103,9 +92,7 @@ CAR = Actor(
 
 @pytest.fixture(scope="module")
 def street(wall):
-    corners = np.array([[-99, -99, 0], [99, -99, 0], [99, 99, 0], [-99, 99, 0.0]])
-    ground = Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    return Scene.from_meshes([*wall.meshes(), ground])
+    return Scene.from_meshes([*wall.meshes(), level("Ground", 0, 99)])
 
 
 COLUMNS = ["ray", "time", "range", "triangle", "intensity", "class"]
@@ -158,8 +145,7 @@ def test_an_actor_is_where_it_is_at_the_time_of_each_ray(street, name, backend):
 
 @pytest.mark.parametrize("backend", ["numpy", "embree"])
 def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
-    corners = np.array([[-90, 2, -9], [90, 2, -9], [90, 2, 9], [-90, 2, 9.0]])
-    pane = Mesh("Pane", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    pane = quad("Pane", (-90, 2, -9), (90, 2, -9), (90, 2, 9), (-90, 2, 9))
     found = []
     for meshes in ([], [pane]):
         scene = replace(Scene.from_meshes([*street.meshes(), *meshes]), actors=(CAR,))
@@ -179,8 +165,7 @@ def test_an_actor_behind_glass_is_where_it_is_without(street, backend):
 
 
 TURNED = {"poses": [Pose((0, 0, 1.5), 40, 8, -5), Pose((1, 0, 1.5), -17, 2, 9)], "steps": 54}
-CORNERS = np.array([[-9, -3, 0], [9, -3, 0], [9, -3, 9], [-9, -3, 9.0]])
-MIRROR = Mesh("Mirror", CORNERS, np.array([[0, 1, 2], [0, 2, 3]]))
+MIRROR = quad("Mirror", (-9, -3, 0), (9, -3, 0), (9, -3, 9), (-9, -3, 9))
 
 
 @pytest.mark.parametrize("model", ["velodyne/vlp16", "livox/mid40"])

@@ -25,7 +25,7 @@ from lidarpool import (
     load_sensor,
 )
 from lidarpool.export.formats import Format
-from lidarpool.export.navigation import (
+from lidarpool.export.navigation_files import (
     GNSS_FILE,
     IMU_FILE,
     Instruments,
@@ -34,10 +34,10 @@ from lidarpool.export.navigation import (
 )
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scenario.build import Job, build
-from lidarpool.scenario.campaign import Campaign
+from lidarpool.scenario.campaign import CampaignSpec
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.sensor.navigation import fixes, geodetic, imu_samples
-from lidarpool.sensor.trajectory import Stations, matrices, quaternions_of, rotations_of
+from lidarpool.sensor.trajectory import Stations, matrices
 
 GRAVITY = 9.80665
 
@@ -200,50 +200,6 @@ def test_dead_reckoning_finds_the_way_of_the_imu(smooth):
     assert path.duration_ns == times[-1]
 
 
-def heading(t):
-    return 0 * t, 0 * t, 0 * t, 0.6 * np.sin(t), 0 * t, 0 * t
-
-
-def climbing_turn(t):
-    return 20 * np.cos(t / 2), 20 * np.sin(t / 2), 0.8 * t, t / 2, 0 * t - 0.1, 0.1 * np.sin(t)
-
-
-def tumble(t):
-    s = t + 0.3 * np.sin(1.3 * t)
-    turns = 0.9 * np.sin(s), 0.5 * np.sin(1.1 * s + 1), 0.7 * np.cos(0.8 * s)
-    return 5 * np.sin(s), 3 * np.cos(0.7 * s), np.sin(0.9 * t), *turns
-
-
-@pytest.mark.parametrize("motion", [heading, climbing_turn, tumble])
-def test_an_imu_on_a_smooth_way_feels_the_derivatives_of_the_motion(motion):
-    lever, hz, h = np.array([0.5, 0.0, 0.0]), 200.0, 1e-3
-
-    def at(t):
-        values = np.stack(motion(t), axis=1)
-        turns = rotations_of(np.degrees(values[:, 3:]))
-        return values[:, :3], turns, values[:, :3] + turns @ lever
-
-    poses = np.linspace(0, 20, 201)
-    places, turns, _ = at(poses)
-    path = Track(poses, places, quaternions_of(turns), smooth=True)
-    imu = Imu(rate_hz=hz, mount=Pose(tuple(lever)))
-    samples = list(imu_samples(Moving(Navigation(imu=imu), path, path.duration_ns)))
-    middles = joined(samples, "times_ns") / 1e9 - 0.5 / hz
-    # Central differences of the motion itself, to the fourth order.
-    (_, before, far), (_, turns, place), (_, after, near) = (
-        at(middles + k * h) for k in (-1, 0, 1)
-    )
-    (_, early, first), (_, late, last) = (at(middles + k * h) for k in (-2, 2))
-    slope = (8 * (after - before) - (late - early)) / (12 * h)
-    spin = np.einsum("nji,njk->nik", turns, slope)
-    rates = np.stack([spin[:, 2, 1], spin[:, 0, 2], spin[:, 1, 0]], axis=1)
-    pull = (16 * (near + far) - 30 * place - first - last) / (12 * h * h) + [0, 0, GRAVITY]
-    forces = np.einsum("nji,nj->ni", turns, pull)
-    for name, truth, most in (("rates", rates, 2e-3), ("forces", forces, 0.02)):
-        off = joined(samples, name) - truth
-        assert np.sqrt((off**2).sum(axis=1).mean()) < most, name
-
-
 def test_a_carrier_that_stands_feels_gravity():
     mount = Pose((0, 0, 0), roll_deg=90)
     survey = standing(1, imu=Imu(mount=mount))
@@ -354,17 +310,6 @@ def test_bags_have_the_instruments(tmp_path):
     assert times == sorted(times)
 
 
-def test_positions_without_latitudes(tmp_path):
-    survey, cloud, sweeps = of_drive()
-    found = written(tmp_path, survey, sweeps)
-    assert (tmp_path / GNSS_FILE).read_text().startswith("time_ns,x_m,y_m,z_m\n")
-    Format("mcap").write(tmp_path / "cloud.mcap", cloud, found)
-    topics = {topic: message for topic, _, message in read_bag(tmp_path / "cloud.mcap")}
-    assert "/gnss/fix" not in topics
-    assert topics["/gnss/position"].header.frame_id == "map"
-    assert topics["/gnss/position"].point.x == pytest.approx(5, abs=0.3)
-
-
 def test_latitudes_by_epsg(tmp_path):
     pytest.importorskip("rasterio")
     survey, _, _ = of_drive(epsg=25832)
@@ -408,7 +353,7 @@ def test_what_does_not_fit():
         Survey(Sensor.grid(), poses=[(0, 0, 1), (1, 0, 1)], navigation=Navigation(imu=Imu()))
     survey = Survey(poses=[(0, 0, 1)], navigation=Navigation(imu=Imu()))
     with pytest.raises(LidarpoolError, match="single surveys"):
-        Campaign(lambda number, rng: Job(Scene.seed(), survey), 1).job(0)
+        CampaignSpec(lambda number, rng: Job(Scene.seed(), survey), 1).job(0)
     with pytest.raises(LidarpoolError, match="rate_hz is 0"):
         Imu(rate_hz=0)
     with pytest.raises(LidarpoolError, match=r"origin\[0\] is 100; it must be at most 90"):

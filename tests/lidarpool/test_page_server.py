@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from tests.pages import ask
 
-from lidarpool.live.points import Abandoned
+from lidarpool.live.point_selection import Abandoned
 from lidarpool.live.server import announced, page_server
 
 # Another user's process: asks for addresses, prints their status and whether it saw anything.
@@ -184,9 +184,3 @@ def test_a_cell_shows_the_page_and_says_how_else_to_reach_it(served, monkeypatch
     proxied = f"/user/ada/proxy/{page.port}/{page.token}/"
     assert f'<iframe src="{proxied if hub else page.url}"' in shown and page.url in shown
     assert (f"ssh -L {page.port}:127.0.0.1:{page.port}" in shown) == hub
-
-
-def test_json_has_no_words_that_browsers_cannot_read(served, monkeypatch):
-    page, source = served
-    monkeypatch.setattr(source, "answer", lambda *_: ({"x": float("nan")}, {}))
-    assert said(page, "GET", "secret")[0] == 500

@@ -1,28 +1,42 @@
 """What a page shows of a finished result: its points, scene, sensors, sweeps and planning."""
 
+from __future__ import annotations
+
+import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import trimesh
-from tests.pages import ask
 
 from lidarpool import LidarpoolError, Planning, Pose, Scene, Sensor, Survey, Track
+from lidarpool.columns.cloud import Cloud
 from lidarpool.columns.cloud_file import CloudFile
 from lidarpool.columns.ply_format import header, row_type
-from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE
+from lidarpool.columns.table import CHANNEL, OBJECT, SCAN, TABLE, Column
 from lidarpool.export.sweeps import SWEEPS_FILE, Sweeps
+from lidarpool.live import point_selection as points
+from lidarpool.live.point_selection import (
+    TILES,
+    Abandoned,
+    Eye,
+    Filter,
+    HeldPoints,
+    PointFinder,
+)
 from lidarpool.live.view import (
-    Surface,
+    ShownSurface,
     View,
+    as_bytes,
     colours_for,
+    legend_of,
     open_result,
     range_image,
-    result_page,
     view_result,
 )
 from lidarpool.plan import Plan
-from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay
+from lidarpool.render.colouring import colours_of as colouring_of
+from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay
 from lidarpool.scene.actors import Actor, box
 from lidarpool.scene.colours import Colours
 
@@ -88,7 +102,7 @@ def pictured():
     poses = np.column_stack([np.full(POSES, 3.0), np.linspace(1, 7, POSES), np.ones(POSES)])
     rays = np.stack([np.repeat(poses[:2], 9, axis=0), np.full((18, 3), 2.9)], axis=1)
     rays[:9, 1, 2] = 0.5
-    return Pictured(
+    return PictureContent(
         scene,
         (SensorWay(np.arange(POSES), poses),),
         np.arange(12),
@@ -103,7 +117,7 @@ def seen(scene, places, moves=False):
     """Return what is known of a survey of two seconds with one sensor."""
     way = SensorWay(np.linspace(0, 2e9, len(places)), np.array(places, float), moves, "", "VLP-16")
     hits, rays = np.zeros(scene.triangles, np.int64), np.zeros((0, 2, 3), np.float32)
-    return Pictured(scene, [way], hits, rays, None, None, (), 2e9)
+    return PictureContent(scene, [way], hits, rays, None, None, (), 2e9)
 
 
 @pytest.fixture
@@ -196,16 +210,6 @@ def test_a_drive_through_a_large_scene_is_looked_at_from_near(cloud):
     assert np.ptp(state["box"], axis=0).max() < 200 < np.ptp(state["bounds"], axis=0).max()
 
 
-def test_around_an_object_a_picture_of_all_holds_it_and_the_sensors_not_a_box_of_both(cloud):
-    scene = Scene.from_meshes([box("Duck", (2, 2, 2))])
-    places = np.array([[9, 0, 1.0], [-9, 0, 1], [0, 0, 9]])
-    state, arrays = told(View(CloudFile(cloud), seen(scene, places)), "state")
-    corners = arrays["corners"]
-    assert np.array_equal([corners[:8].min(axis=0), corners[:8].max(axis=0)], scene.bounds)
-    assert np.array_equal(corners[8:], places)
-    assert np.array_equal([corners.min(axis=0), corners.max(axis=0)], state["box"])
-
-
 def test_actors_are_told_with_their_poses_and_numbers(cloud):
     scene = Scene.from_meshes([box("Hall", (8, 8, 8)), box("Table", (2, 2, 2))])
     half = np.sqrt(0.5)
@@ -276,15 +280,6 @@ def test_a_range_image_has_channels_from_above_and_azimuth_from_left_to_right():
     assert few.shape[0] == 128  # by elevation
 
 
-@pytest.mark.parametrize("steps", [360, 900, 1024])
-def test_a_range_image_of_a_full_turn_has_no_empty_columns(steps):
-    turn = np.radians((np.arange(steps) + 0.5) * 360 / steps)
-    ring = 5 * np.stack([np.cos(turn), np.sin(turn), 0 * turn], axis=1)
-    image = range_image(ring, np.full(steps, 5.0), np.repeat([0, 7], [steps - 20, 20]), (5.0, 9.0))
-    assert image[:, :, 3].any(axis=0).all()
-    assert image.shape[1] > 0.8 * steps
-
-
 def test_a_range_image_of_a_sensor_that_looks_down_is_a_row_across_its_way():
     across = np.radians(np.linspace(20, -20, 200))
     places = 500 * np.stack([0 * across, np.sin(across), -np.cos(across)], axis=1)
@@ -331,17 +326,6 @@ def test_columns_of_other_programs_can_be_coloured_and_filtered_by(tmp_path):
     assert len(places(view, filter="nx,3,5")) == 3
 
 
-def test_what_a_column_is_filtered_by_is_told(cloud, pictured):
-    view = View(CloudFile(cloud), pictured)
-    assert told(view, "column", name="object")[0] == {"labels": [["room", 0]]}
-    scans = told(view, "column", name="scan")[0]
-    assert (scans["low"], scans["high"], scans["whole"]) == (0, 99, True)
-    heights = told(view, "column", name="z")[0]
-    assert heights["low"] >= 0 and heights["high"] == 3
-    with pytest.raises(KeyError):
-        told(view, "column", name="nothing")
-
-
 def test_causes_and_no_surface_are_told_in_words(tmp_path, pictured):
     row = row_type(np.dtype(np.float64), (SCAN, CHANNEL, OBJECT, TABLE["cause"]))
     rows = np.zeros(6, row)
@@ -381,16 +365,9 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
     assert "shows 10,000 points" in said
 
 
-def test_questions_come_by_http(cloud, pictured):
-    with result_page(View(CloudFile(cloud), pictured), port=0, browser=False) as page:
-        told = ask(page.url, "points", colour="z", most=100)
-        assert told["count"] == 10_000
-        assert told["arrays"]["positions"].shape == (100, 3)
-
-
 def test_many_triangles_become_few_that_keep_shape_and_hits():
     scene = Scene.seed()
-    surface = Surface(scene, most=5000)
+    surface = ShownSurface(scene, most=5000)
     corners = surface.corners.reshape(-1, 3)
     assert 500 < len(surface.corners) <= 5000
     assert np.allclose(corners.min(axis=0), scene.vertices.min(axis=0), atol=0.5)
@@ -405,7 +382,7 @@ def test_many_triangles_become_few_that_keep_shape_and_hits():
     assert vivid[there].mean() > 0.9
     assert not vivid[~there].any()
     assert "hits per square metre" in legend["title"]
-    assert len(Surface(scene).corners) == len(scene.faces)  # few enough
+    assert len(ShownSurface(scene).corners) == len(scene.faces)  # few enough
 
 
 def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
@@ -413,8 +390,181 @@ def test_a_scene_is_coloured_by_the_reflectance_of_its_objects():
     share = np.array([1.0, 0.0])
     assert colours_for(scene, share) == ("grey", "hits", "object", "reflectance")
     assert colours_for(scene, np.array([0.5, 0.5])) == ("grey", "hits", "object")
-    arrays, legend = Surface(scene, share).coloured("reflectance", share, NOWHERE)
+    arrays, legend = ShownSurface(scene, share).coloured("reflectance", share, NOWHERE)
     colours = arrays["colours"]
     assert np.unique(colours[scene.face_object == 0]).tolist() == [255]
     assert colours[scene.face_object == 1].max() < 40
     assert legend["title"] == "reflectance"
+
+
+def colours_of(*arguments):
+    """Colours (n, 3) as bytes, and the legend as JSON."""
+    coloured = colouring_of(*arguments)
+    return as_bytes(coloured.paint(arguments[0])), json.dumps(
+        legend_of(coloured), ensure_ascii=False
+    )
+
+
+def test_times_of_a_long_survey_are_told_apart():
+    """Nanoseconds of an hour: more digits than single precision has."""
+    colours, _ = colours_of(3_600_000_000_000 + np.arange(200) * 1000, TABLE["time"])
+    assert len(np.unique(colours, axis=0)) > 100
+
+
+@pytest.mark.parametrize(
+    ("span_ns", "told"), [(2e9, "time, s:"), (3e7, "time, ms:"), (50, "time, ns:")]
+)
+def test_times_are_told_in_a_unit_that_can_be_read(span_ns, told):
+    legend = colours_of(np.linspace(0, span_ns, 200).astype(np.int64), TABLE["time"])[1]
+    assert told in legend
+    assert ('"1.0"' in legend) == (span_ns == 2e9)
+
+
+def test_what_is_no_surface_is_grey_and_has_no_object_s_colour():
+    values = np.arange(200, dtype=np.int32) % 3 - 1
+    colours, legend = colours_of(values, OBJECT, ("Ball", "Box"))
+    assert (colours[values < 0] == 128).all()
+    assert not (colours[values >= 0] == 128).all(axis=1).any()
+    assert '["no surface", [128, 128, 128], -1]' in legend
+    own = Column("zone", "int32", "", "zone", kind="label")
+    assert "no surface" not in colours_of(values, own)[1]
+    many = tuple(f"thing {number}" for number in range(1100))
+    assert '"thing 99"' in colours_of(np.arange(100), OBJECT, many)[1]
+    assert '"more": 100' in colours_of(np.arange(1100), OBJECT, many)[1]
+    often = np.append(np.arange(100), np.full(9, 73))
+    assert "thing 73" in colours_of(often, OBJECT, many)[1]
+
+
+@pytest.mark.parametrize("column", TABLE.values(), ids=lambda column: column.name)
+def test_every_column_takes_no_points_equal_ones_and_its_largest(column):
+    dtype = np.dtype(column.dtype)
+    assert colours_of(np.zeros(0, dtype), column)[0].shape == (0, 3)
+    same, legend = colours_of(np.ones(5, dtype), column, ("Ball",))
+    assert len(np.unique(same, axis=0)) == 1
+    assert "nan" not in legend
+    if dtype.kind in "iu":
+        assert colours_of(np.array([0, np.iinfo(dtype).max], dtype), column)[0].shape == (2, 3)
+
+
+ALL_ROWS = slice(None)
+
+
+def along_y(y=0.0, parallel=False):
+    """Return a camera at (0, y, 0) that looks along y, 90° high and twice as wide; z is up."""
+    view = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, y], [0, 0, 0, 1]])
+    near, far = 0.1, 1000.0
+    if parallel:  # 10 metres high
+        lens = np.diag([1 / 10, 1 / 5, -2 / (far - near), 1.0])
+        lens[2, 3] = -(far + near) / (far - near)
+    else:
+        lens = np.diag([0.5, 1.0, -(far + near) / (far - near), 0.0])
+        lens[2, 3], lens[3, 2] = -2 * far * near / (far - near), -1.0
+    columns = (lens @ view).T.ravel()
+    return Eye.read(",".join(map(repr, columns.tolist())))
+
+
+EYE = along_y()
+
+
+def test_a_camera_sees_what_is_before_it():
+    places = np.array([[0, 5, 0], [9, 5, 0], [-11, 5, 0], [0, 5, 4], [0, 5, -6], [0, -5, 0.0]])
+    at, inside = EYE.seen(places)
+    assert inside.tolist() == [True, True, False, True, False, False]
+    assert at[:2] == pytest.approx(np.array([[0, 0], [0.9, 0]]))
+    assert at[3, 1] == pytest.approx(0.8)  # up
+    tiles = EYE.tiles(places)
+    assert (tiles >= 0).tolist() == inside.tolist()
+    assert tiles.max() < TILES
+    assert len(set(tiles[inside].tolist())) == 3
+
+
+def test_a_filter_keeps_what_is_within_all_limits():
+    cloud = Cloud(
+        np.arange(12.0).reshape(4, 3),
+        {"range": np.float32([1, 2, np.nan, 4]), "class": np.uint16([0, 1, 1, 1])},
+    )
+    held = HeldPoints(cloud)
+    wanted = Filter.read("class,1,1;range,0,9;nothing,1,2", ["class", "range"])
+    assert wanted.limits == (("class", 1, 1), ("range", 0, 9))
+    assert wanted.keeps(held, ALL_ROWS).tolist() == [False, True, False, True]
+    assert Filter((("z", 3, 8),)).keeps(held, ALL_ROWS).tolist() == [False, True, True, False]
+    assert Filter().keeps(held, np.array([0, 3])).all()
+
+
+@pytest.fixture
+def file(tmp_path, monkeypatch):
+    """Return a file of 100,000 points along y, from 1 to 100 metres, in blocks of 1,000."""
+    monkeypatch.setattr(points, "BLOCK", 1000)
+    rows = np.zeros(100_000, row_type(np.dtype(np.float32), (SCAN, TABLE["intensity"])))
+    random = np.random.default_rng(0)
+    rows["y"] = np.linspace(1, 100, 100_000)
+    rows["x"], rows["z"] = random.uniform(-0.3, 0.3, (2, 100_000))
+    rows["scan"] = np.arange(100_000) // 100
+    rows["intensity"] = rows["scan"] % 100
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(header(rows.dtype, len(rows)) + rows.tobytes())
+    return CloudFile(path)
+
+
+class Read:
+    """A file that notes the blocks that are read of it."""
+
+    def __init__(self, file):
+        self._file, self.table, self.rows_of, self.blocks = file, file.table, file.rows_of, set()
+
+    def __len__(self):
+        return len(self._file)
+
+    def values(self, name, rows):
+        if isinstance(rows, slice):
+            self.blocks.add(rows.start // 1000)
+        return self._file.values(name, rows)
+
+
+def test_without_a_filter_an_even_choice_of_all_is_found(file):
+    rows, count = PointFinder(file, np.zeros(3)).find(5000)
+    assert (len(rows), count) == (5000, 100_000)
+    assert np.histogram(rows, 10, (0, 100_000))[0].tolist() == [500] * 10
+    rows, count = PointFinder(file, np.zeros(3)).find(5000, scans=((10, 19), (500, 504)))
+    assert rows.tolist() == [*range(1000, 2000), *range(50_000, 50_500)]
+    assert count == 1500
+
+
+def test_all_points_that_a_filter_keeps_are_found_or_an_even_choice_of_them(file):
+    finder = PointFinder(read := Read(file), np.zeros(3))
+    rows, count = finder.find(5000, Filter((("intensity", 7, 7),)))
+    assert len(rows) == count == 1000
+    assert set(file.values("intensity", rows).tolist()) == {7}
+    assert len(read.blocks) == 100
+    rows, count = finder.find(5000, Filter((("intensity", 0, 49),)))
+    assert count == 50_000
+    assert 2000 < len(rows) <= 5000
+    assert (np.diff(rows) > 0).all()
+    assert np.histogram(rows, 10, (0, 100_000))[0].min() > 150
+    read.blocks.clear()
+    rows, count = finder.find(5000, Filter((("intensity", 95, 99),)), ((995, 2000),))
+    assert (len(rows), count, read.blocks) == (500, 500, {99})  # nothing else is read
+    assert len(finder.find(5000, Filter((("intensity", 200, 300),)))[0]) == 0
+
+
+@pytest.mark.parametrize("parallel", [False, True])
+def test_a_camera_finds_what_is_before_it_and_reads_no_block_behind_it_again(file, parallel):
+    finder = PointFinder(read := Read(file), np.zeros(3))
+    eye = along_y(90.0, parallel)
+    rows, count = finder.find(20_000, eye=eye)
+    assert count == 100_000
+    assert len(read.blocks) == 100
+    assert file.values("y", rows).min() > 90
+    assert 9000 < len(rows) < 10_200
+    read.blocks.clear()
+    fewer, _ = finder.find(4000, eye=eye)
+    assert len(read.blocks) < 12
+    assert 2000 < len(fewer) <= 4000
+
+
+def test_a_search_that_nobody_waits_for_is_given_up(file):
+    asked = iter([False] * 5 + [True])
+    finder = PointFinder(read := Read(file), np.zeros(3))
+    with pytest.raises(Abandoned):
+        finder.find(5000, Filter((("intensity", 7, 7),)), abandoned=lambda: next(asked))
+    assert len(read.blocks) == 5

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -27,7 +26,6 @@ from lidarpool.columns.parts import (
     unpack,
 )
 from lidarpool.columns.table import OPTIONAL, stored
-from lidarpool.pipeline.messages import Receipt, summary_type
 
 COLUMNS = stored(OPTIONAL)
 ORIGIN = np.array([500_000.0, 5_400_000.0, 300.0])
@@ -62,38 +60,6 @@ def test_what_is_packed_comes_back(first, counts):
         assert again.cells.tolist() == [axes.min(axis=0).tolist(), axes.max(axis=0).tolist()]
     else:
         assert again.cells is None
-
-
-def test_numpy_opens_a_part():
-    part = part_of(7, [2, 0, 3])
-    with np.load(io.BytesIO(pack(part)), allow_pickle=False) as archive:
-        own = [".scans", ".counts", ".triangles", ".hits", ".scan_hits", ".samples"]
-        assert archive.files == [*own, *(c.name for c in COLUMNS)]
-        assert archive[".scans"].tolist() == [7, 10]
-        assert archive[".counts"].tolist() == [2, 0, 3]
-        for column in COLUMNS:
-            assert archive[column.name].dtype == np.dtype(column.dtype)
-            assert np.array_equal(archive[column.name], part.columns[column.name])
-
-
-def test_columns_that_are_not_contiguous_are_packed_as_they_read():
-    part = part_of(0, [4])
-    wide = {name: np.repeat(values, 2)[::2] for name, values in part.columns.items()}
-    again = replace(part, columns=wide)
-    assert bytes(pack(again)) == bytes(pack(part))
-
-
-def test_a_part_says_what_its_receipt_says():
-    part = part_of(7, [2, 0, 3])
-    data = pack(part)
-    receipt = Receipt.of_part(unpack(data), 12, "a.npz", len(data))
-    assert receipt == Receipt.of_part(part, 12, "a.npz", len(data))
-    assert (receipt.job, receipt.first, receipt.stop) == (12, 7, 10)
-    assert (receipt.rows, receipt.hits) == (5, 25)
-    summaries = np.frombuffer(receipt.summaries, summary_type(4))
-    assert summaries["hits"].tolist() == [10, 0, 15]
-    assert summaries["points"].tolist() == [2, 0, 3]
-    assert np.array_equal(summaries["samples"], part.samples)
 
 
 SMALL = part_of(3, [1, 2], columns=COLUMNS[:4])
@@ -159,13 +125,6 @@ def storage(request, tmp_path):
     place.prepare()
     yield place
     place.remove(list(place.sizes()))
-
-
-def test_a_part_in_storage(storage):
-    storage.write("a.npz", pack(SMALL))
-    assert pack(read_part(storage, "a.npz")) == pack(SMALL)
-    triangles, hits = read_tally(storage, "a.npz")
-    assert np.array_equal(triangles, SMALL.triangles) and np.array_equal(hits, SMALL.hits)
 
 
 @pytest.mark.parametrize("read", [read_part, read_tally])

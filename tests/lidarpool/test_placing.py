@@ -10,20 +10,22 @@ from pathlib import Path
 import numpy as np
 import pytest
 import trimesh
+from tests.shapes import block, level, quad, wall
 from trimesh import creation
 
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.placing import inside_note, place, poses_around
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.city import city
-from lidarpool.scene.instances import Instance
-from lidarpool.scene.mesh import Mesh
-from lidarpool.scene.plants import SPECIES, tree
+from lidarpool.scene.floor import room_at
+from lidarpool.scene.generated.city import city
+from lidarpool.scene.generated.plants import SPECIES, tree
+from lidarpool.scene.generated.terrain import terrain
 from lidarpool.scene.scene import Scene
 from lidarpool.scene.scene_file import write_scene
-from lidarpool.scene.surroundings import Surroundings, in_the_way, is_open
-from lidarpool.scene.terrain import terrain
+from lidarpool.scene.scene_instances import SceneInstance
+from lidarpool.scene.scene_mesh import SceneMesh
+from lidarpool.scene.surroundings import Surroundings, in_the_way
 from lidarpool.scene.transform import Transform
 from lidarpool.sensor import Mounted, Sensor, Survey
 from lidarpool.sensor.models import load_sensor
@@ -34,26 +36,13 @@ GRID = Mounted(Sensor.grid())
 
 def scene_of(*meshes, at=(0.0, 0.0, 0.0)):
     return Scene.from_meshes(
-        Mesh(f"mesh{i}", mesh.vertices + at, mesh.faces) for i, mesh in enumerate(meshes)
+        SceneMesh(f"mesh{i}", mesh.vertices + at, mesh.faces) for i, mesh in enumerate(meshes)
     )
 
 
 def inverted(mesh):
     mesh.invert()
     return mesh
-
-
-def gear(radius):
-    """A flat body with 24 upright teeth."""
-    angles = np.arange(96) * 2 * np.pi / 96
-    reach = np.where(np.arange(96) // 2 % 2, 1.0, 0.85) * radius
-    ring = np.stack([reach * np.cos(angles), reach * np.sin(angles)], axis=1)
-    low, high = (np.c_[ring, np.full(96, z)] for z in (0, 0.2 * radius))
-    i, j = np.arange(96), np.roll(np.arange(96), -1)
-    sides = [np.c_[i, j, 96 + j], np.c_[i, 96 + j, 96 + i]]
-    caps = [np.c_[np.full(96, 192), j, i], np.c_[np.full(96, 193), 96 + i, 96 + j]]
-    middles = [[0, 0, 0], [0, 0, 0.2 * radius]]
-    return trimesh.Trimesh(np.vstack([low, high, middles]), np.vstack(sides + caps), process=False)
 
 
 OBJECTS = {
@@ -63,8 +52,6 @@ OBJECTS = {
     "round casing": (creation.icosphere(3, 4.0), inverted(creation.icosphere(3, 3.8))),
     "torus": (creation.torus(1, 0.3),),
     "capsule": (creation.capsule(12, 2.5),),
-    "gear": (gear(1.0),),
-    "gear in millimetres": (gear(80.0),),
     "machine with an opening": (creation.torus(6, 4.5), creation.icosphere(3, 2.0)),
 }
 
@@ -147,8 +134,7 @@ def test_in_a_place_the_sensor_stands_in_the_middle(name):
 def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
     alone = tree(species)
     assert place(Scene.from_meshes([alone]), GRID).around
-    corners = np.array([[-20.0, -20, 0], [20, -20, 0], [20, 20, 0], [-20, 20, 0]])
-    lawn = Mesh("lawn", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    lawn = level("lawn", 0, 20)
     for far in (0.0, 4_000_000.0):
         meshes = [mesh.moved(mesh.name, np.eye(3), np.full(3, far)) for mesh in (lawn, alone)]
         scene = Scene.from_meshes(meshes)
@@ -160,10 +146,6 @@ def test_a_tree_is_an_object_and_on_ground_the_sensor_stands_beside_it(species):
         assert at[:, 2] + scene.origin[2] - far == pytest.approx([1, 2, 3])
     middle = np.array([[0, 0, 1.0]]) + far - scene.origin
     assert in_the_way(scene, middle)
-
-
-def test_open_surfaces_are_known_without_rays():
-    assert is_open(terrain(2_000, 0, 100.0)) and not is_open(scene_of(creation.icosphere(3)))
 
 
 def test_a_narrow_sensor_is_farther_away_and_tilted():
@@ -189,8 +171,7 @@ def test_poses_within_a_closed_body_are_told_of_with_some_that_see_it(tmp_path):
 
 @pytest.mark.parametrize("far", [0.2, 5.0])
 def test_a_card_seen_from_behind_is_no_body(far):
-    corners = np.array([[0.0, -5, 0], [0, 5, 0], [0, 5, 2], [0, -5, 2]])
-    fence = Scene.from_meshes([Mesh("Fence", corners, np.array([[0, 1, 2], [0, 2, 3]]))])
+    fence = Scene.from_meshes([wall("Fence", 0, (-5, 5), (0, 2))])
     views = Surroundings(fence).views([[-far, 0, 1]])
     assert views.back[views.hit].all() and views.hit.any()
     assert inside_note(fence, [[-far, 0, 1]], GRID) == ""
@@ -222,15 +203,6 @@ def test_files_of_our_own_need_no_unit_and_no_axes(tmp_path, suffix):
     assert advice(build(read)) == []
 
 
-def test_the_axes_of_several_objs_are_one_note(tmp_path):
-    for name in "ab":
-        (tmp_path / f"{name}.obj").write_text(creation.icosphere(2).export(file_type="obj"))
-    read = Scenario.from_data({"scene": {"files": ["a.obj", "b.obj"]}}, folder=tmp_path)
-    (note,) = [note for note in advice(build(read)) if "axes" in note]
-    assert note.startswith("a.obj states no axes and is taken as Z-up") and "\n" not in note
-    assert "set up_axis: y" in note and note.endswith("; 1 more file, too")
-
-
 CHECK = """
 import re
 from pathlib import Path
@@ -247,11 +219,47 @@ def test_looking_around_in_a_forest_takes_little_memory():
     """1,000 trees of 50,000 leaves: all triangles that pictures show took over a gigabyte."""
     rng = np.random.default_rng(0)
     leaves = rng.normal(size=(50_000, 1, 3)) + 0.05 * rng.normal(size=(50_000, 3, 3))
-    tree = Mesh("Tree", leaves.reshape(-1, 3), np.arange(150_000).reshape(-1, 3))
+    tree = SceneMesh("Tree", leaves.reshape(-1, 3), np.arange(150_000).reshape(-1, 3))
     at = [(np.eye(3), np.array([8.0 * (k % 32), 8.0 * (k // 32), 0])) for k in range(1000)]
-    forest = [Instance(tree, Transform(*each), f"Tree {k}") for k, each in enumerate(at)]
+    forest = [SceneInstance(tree, Transform(*each), f"Tree {k}") for k, each in enumerate(at)]
     write_scene(Path("forest.glb"), Scene.from_meshes(forest))
     run = subprocess.run([sys.executable, "-c", CHECK], capture_output=True, text=True, check=True)
     *told, peak = run.stdout.splitlines()
     assert "1,000 of them instances of 1 mesh, 50,000,000 triangles" in told[1]
     assert int(peak) < 400_000  # kB
+
+
+def boxes(*sizes_and_heights):
+    """Boxes, each of a size and with its middle at a height, over (0, 0)."""
+    return Scene.from_meshes(block("box", size, (0, 0, z)) for size, z in sizes_and_heights)
+
+
+def test_on_the_ground_of_a_terrain():
+    scene = terrain(2000, 3, 100)
+    floor = room_at(scene, 0, 0)[0]
+    assert floor > scene.bounds[0, 2] + 0.1
+    nearest = np.hypot(*scene.vertices[:, :2].T).argmin()
+    assert floor == pytest.approx(scene.vertices[nearest, 2], abs=5)
+
+
+def test_on_a_slab_and_not_on_the_roof():
+    floor_and_roof = boxes(((8, 6, 0.2), -0.1), ((8, 6, 0.2), 3))
+    assert room_at(floor_and_roof, 0, 0)[0] == pytest.approx(0)
+
+
+def test_the_ceiling_is_above_the_furniture():
+    room = (((8, 6, 0.2), -0.1), ((1, 1, 0.1), 0.75), ((8, 6, 0.2), 2.6), ((8, 6, 0.2), 5.6))
+    assert room_at(boxes(*room), 0, 0) == pytest.approx((0, 2.5))
+    assert room_at(boxes(*room[:2]), 0, 0) == (pytest.approx(0), np.inf)
+
+
+def test_within_a_hall_that_is_one_box():
+    assert room_at(boxes(((8, 6, 3), 1.5)), 0, 0)[0] == 0
+
+
+def test_in_world_coordinates():
+    shift = np.array([500_000.0, 4_000_000.0, 20_000.0])
+    ground = np.array([[-9, -9, 0], [9, -9, 0], [9, 9, 3.6], [-9, 9, 3.6]])
+    scene = Scene.from_meshes([quad("g", *(ground + shift))])
+    assert room_at(scene, 500_001, 4_000_000)[0] == pytest.approx(20_001.8)
+    assert room_at(scene, 500_001, 4_000_005)[0] == pytest.approx(20_002.8)

@@ -10,18 +10,28 @@ from typing import Any
 import click
 import numpy as np
 import pytest
-from PIL import Image
 
-from lidarpool import Cloud, LidarpoolError, Mounted, Planning, Pose, Scene, Sensor, Survey, Track
+from lidarpool import (
+    Cloud,
+    LidarpoolError,
+    Mounted,
+    Planning,
+    Pose,
+    Scene,
+    Sensor,
+    Survey,
+    Track,
+    save_cloud,
+)
 from lidarpool.base.storage import Storage
 from lidarpool.cli.commands import cli
 from lidarpool.columns.table import Column
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.render.page import Page
-from lidarpool.run.picture_file import PICTURE_FILE, Pictured, SensorWay, sensor_ways
+from lidarpool.render.picture_page import Page
+from lidarpool.run.picture_file import PICTURE_FILE, PictureContent, SensorWay, sensor_ways
 from lidarpool.scene.actors import Actor, box
-from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 
 SMALL = ("--size", "480x480")
@@ -29,10 +39,10 @@ NAMES = ("Kübel\x00", "a\udc80", "")  # as files may have them
 
 
 @pytest.fixture(scope="module")
-def planned() -> Pictured:
+def planned() -> PictureContent:
     objects = seed_objects(rings=8, segments=12)[:3]
     scene = Scene.from_meshes(
-        [Mesh(name, o.vertices, o.faces) for name, o in zip(NAMES, objects, strict=True)]
+        [SceneMesh(name, o.vertices, o.faces) for name, o in zip(NAMES, objects, strict=True)]
     )
     counts = np.arange(len(scene.faces), dtype=np.int64) % 5
     planning = Planning(
@@ -41,7 +51,7 @@ def planned() -> Pictured:
     trials = [run_trial(planning, number) for number in range(3)]
     rays = np.zeros((4, 2, 3), np.float32)
     rays[:, 1] = scene.vertices[:4]
-    return Pictured(
+    return PictureContent(
         scene,
         (SensorWay(np.zeros(2), np.array([[0, 0, 1], [0, 0, 2.0]])),),
         counts,
@@ -53,8 +63,8 @@ def planned() -> Pictured:
 
 
 @pytest.fixture(scope="module")
-def unplanned(planned: Pictured) -> Pictured:
-    return Pictured(
+def unplanned(planned: PictureContent) -> PictureContent:
+    return PictureContent(
         planned.scene, planned.sensors, planned.hit_counts, planned.sample_rays, None, None, ()
     )
 
@@ -64,17 +74,17 @@ def cloud_at(positions: Any) -> Cloud:
     return Cloud(positions, {"scan": zeros, "channel": zeros, "object": zeros})
 
 
-def make(folder: Path, shown: Pictured) -> Path:
+def make(folder: Path, shown: PictureContent) -> Path:
     """Write the folder of a result."""
     folder.mkdir()
     positions = shown.scene.vertices[::2]
-    cloud_at(positions).save(folder / "cloud.ply")
+    save_cloud(cloud_at(positions), folder / "cloud.ply")
     shown.save(folder / PICTURE_FILE)
     return folder
 
 
 @pytest.fixture
-def result(planned: Pictured, tmp_path: Path) -> Path:
+def result(planned: PictureContent, tmp_path: Path) -> Path:
     return make(tmp_path / "result", planned)
 
 
@@ -89,7 +99,7 @@ def names(folder: Path) -> set[str]:
 def test_what_is_pictured_comes_back(planned, unplanned, tmp_path):
     for shown in (planned, unplanned):
         shown.save(tmp_path / "a.npz")
-        again = Pictured.load(tmp_path / "a.npz")
+        again = PictureContent.load(tmp_path / "a.npz")
         assert again.scene.names == shown.scene.names
         assert np.array_equal(again.hit_counts, shown.hit_counts)
         assert (again.plan is None) == (shown.plan is None)
@@ -106,10 +116,10 @@ def test_what_moves_is_drawn_where_it_is_halfway(tmp_path):
     nose = Mounted(Sensor.grid(), Pose((2, 0, 0)), "nose")
     survey = Survey(trajectory=drive, sensors=[nose])
     none = np.zeros((0, 2, 3), np.float32)
-    shown = Pictured(
+    shown = PictureContent(
         scene, sensor_ways(survey), np.ones(scene.triangles, np.int64), none, None, None, (), 1e9
     )
-    again = Pictured.load(make(tmp_path / "result", shown) / PICTURE_FILE)
+    again = PictureContent.load(make(tmp_path / "result", shown) / PICTURE_FILE)
     (way,) = again.sensors
     assert (way.name, way.moves) == ("nose", True)
     assert np.allclose(way.at(5e8), (7, 0, 1), atol=0.01)
@@ -147,14 +157,6 @@ def test_a_damaged_file_is_refused(damage, said, result):
     assert str(file) in str(caught.value) and "\n" not in str(caught.value)
 
 
-def test_some_are_drawn_to_another_folder(result, tmp_path):
-    before = names(result)
-    out = tmp_path / "new" / "folder"
-    plot(result, "--only", "path", "--only", "scene", *SMALL, "--out", out)
-    assert names(out) == {"scene.png", "path.png"}
-    assert names(result) == before
-
-
 def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkeypatch):
     wet = Column("wetness", "float32", "%", "how wet it is", source="wetness")
     shown = replace(unplanned, own=[replace(wet, source="")])
@@ -163,7 +165,7 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
     zeros = np.zeros(len(positions), np.int32)
     wetness = np.linspace(0, 100, len(positions))
     columns = {"scan": zeros, "channel": zeros, "object": zeros + 1, "wetness": wetness}
-    Cloud(positions, columns, [wet]).save(result / "cloud.ply")
+    save_cloud(Cloud(positions, columns, [wet]), result / "cloud.ply")
     figures = []
     monkeypatch.setattr(Page, "save", lambda page, path: figures.append(page.figure))
     for name in ("z", "wetness", "object", "ring"):
@@ -173,43 +175,6 @@ def test_the_cloud_is_coloured_by_any_of_its_columns(unplanned, tmp_path, monkey
     assert [key[0] for key in keys] == ["a\ufffd", "channel 0"]
     with pytest.raises(LidarpoolError, match=r"no column 'wettness'\. Did you mean 'wetness'"):
         plot(result, "--only", "cloud", "--colour", "wettness")
-
-
-def test_markings_stand_out_in_the_picture_of_intensity_and_in_true_colour(
-    result, tmp_path, monkeypatch
-):
-    """Stripes within one flat object, 1 m wide, which differ in reflectivity and colour alone."""
-    positions = np.random.default_rng(1).uniform((-9, -9, 0.1), (9, 9, 0.1), (200_000, 3))
-    stripe = np.floor(positions[:, 0]) % 2 == 0
-    zeros = np.zeros(len(positions), np.int32)
-    columns = dict.fromkeys(("scan", "channel", "object"), zeros)
-    columns |= {"intensity": zeros, "reflectivity": np.where(stripe, 0.6, 0.1).astype(np.float32)}
-    columns |= {name: np.where(stripe, 200, 40).astype(np.uint8) for name in ("red", "green")}
-    shown = Pictured.load(result / PICTURE_FILE)
-    floor = Scene.from_meshes([box("Floor", (20, 20, 0.2))])
-    hits = np.zeros(floor.triangles, np.int64)
-    shown = replace(shown, scene=floor, hit_counts=hits, sensors=(), planning=None, plan=None)
-    shown.save(result / PICTURE_FILE)
-    Cloud(positions, columns).save(result / "cloud.ply")
-    with pytest.raises(LidarpoolError, match="no column 'rgb'"):
-        plot(result, "--only", "cloud", "--colour", "rgb")
-    Cloud(positions, columns | {"blue": columns["red"]}).save(result / "cloud.ply")
-    plot(result, "--colour", "rgb", "--only", "cloud", "--only", "intensity", "--out", tmp_path)
-    bright, grey = (np.asarray(Image.open(tmp_path / f"{name}.png").convert("RGB"), np.float64)
-                    for name in ("intensity", "cloud"))  # fmt: skip
-    part = np.s_[400:600, 650:850]  # of the floor
-    warm = bright[part][..., 0] - bright[part][..., 2]
-    assert ((warm > 50).mean(), (warm < -20).mean()) == pytest.approx((0.5, 0.5), abs=0.1)
-    assert np.ptp(grey[part], axis=2).max() < 30, "no column is on a scale of colours"
-    light = grey[part].mean(axis=2)
-    assert np.corrcoef(light.ravel(), warm.ravel())[0, 1] > 0.8
-
-
-def test_the_cloud_is_needed_for_its_own_picture_only(result):
-    (result / "cloud.ply").unlink()
-    plot(result, "--only", "path", *SMALL)
-    with pytest.raises(LidarpoolError, match=r"cloud\.ply cannot be read: No such file"):
-        plot(result, "--only", "cloud", *SMALL)
 
 
 @pytest.mark.parametrize(

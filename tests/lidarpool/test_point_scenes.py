@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 from click.testing import CliRunner
 
-from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor
+from lidarpool import Cloud, Noise, Pose, Scanner, Scene, load_sensor, save_cloud
 from lidarpool.base.errors import LidarpoolError
 from lidarpool.base.open3d_module import load_open3d
 from lidarpool.cli.scenario_commands import scene as command
-from lidarpool.scene.points import scene_of_points
+from lidarpool.scene.point_scene import scene_of_points
 from lidarpool.scene.scene_file import write_scene
 
 GRID = np.mgrid[0:4:40j, 0:3:30j].reshape(2, -1).T
@@ -63,7 +63,7 @@ def test_a_place_scanned_again_has_the_ranges_of_the_real_one(tmp_path):
     scanner = Scanner(real, sensor, noise=Noise(range_m=0.005))
     sweeps = [scanner.sweep(Pose((x, y, 2))) for x, y in ((0, 0), (3, 2), (-2, 3))]
     points = np.concatenate([sweep.positions for sweep in sweeps])
-    Cloud(points.astype(np.float64), {}).save(tmp_path / "scan.ply")
+    save_cloud(Cloud(points.astype(np.float64), {}), tmp_path / "scan.ply")
     write_scene(tmp_path / "place.glb", scene_of_points(tmp_path / "scan.ply"))
     pose = [(1, 2, 1.5)]
     true, again = (
@@ -128,7 +128,7 @@ def test_what_is_wrong_is_said(tmp_path, name, text, words):
 
 def test_too_many_points_are_refused(tmp_path, monkeypatch):
     path = written(tmp_path / "a.ply", plane())
-    monkeypatch.setattr("lidarpool.scene.points.memory", lambda: 1_000_000)
+    monkeypatch.setattr("lidarpool.scene.point_scene.memory", lambda: 1_000_000)
     with pytest.raises(LidarpoolError, match=r"1,200 surfels, .* larger voxel_m than 0.01"):
         scene_of_points(path, voxel_m=0.01)
     assert len(scene_of_points(path, voxel_m=0.3).faces) < 2 * 500

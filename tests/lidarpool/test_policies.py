@@ -3,30 +3,26 @@
 from __future__ import annotations
 
 from collections import Counter
+from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
 
-from lidarpool.pipeline.jobs import Batch, Outcome, Place
+from lidarpool.pipeline.job_state import Batch, BatchState, Outcome
 from lidarpool.pipeline.names import INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
-    LATE_FACTOR,
     LATE_S,
     SUSPECT_DEATHS,
-    TASK_BATCHES,
-    TASK_SECONDS,
-    batches_per_task,
     handovers,
-    late_after_s,
     loss,
     offers,
     scans_per_batch,
     slots_wanted,
-    weight,
 )
-from poolpart import Whereabouts
+from lidarpool.pipeline.task_book import MISPLACED_MOST, RECORDS_MOST, StageTotals, TaskBook
+from poolpart import TaskLocations, TaskRecord
 from poolpart.task_locations import TaskPlace
 
 A, B = "tcp://a:1", "tcp://b:1"
@@ -38,7 +34,7 @@ JOB, OTHER, ELSEWHERE = (
 )
 
 
-def batch(number, place=Place.WAITING, worker="", collector="", suspect="", job=JOB, scans=1):
+def batch(number, place=BatchState.WAITING, worker="", collector="", suspect="", job=JOB, scans=1):
     deaths = Counter({suspect: SUSPECT_DEATHS} if suspect else {})
     return Batch(
         job, number, number + scans, number, number, place, 0.0, str(number), worker, collector,
@@ -47,7 +43,7 @@ def batch(number, place=Place.WAITING, worker="", collector="", suspect="", job=
 
 
 def casting(number, worker, suspect=""):
-    return batch(number, Place.CASTING, worker, suspect=suspect)
+    return batch(number, BatchState.CASTING, worker, suspect=suspect)
 
 
 def waiting(count, first=10, **of):
@@ -107,56 +103,9 @@ def test_small_batches_share_tasks_and_wait_for_others_where_nobody_waits_for_th
     there = [casting(0, A), casting(1, B)]
     assert sizes([*there, *waiting(3)]) == []
     assert sizes([*there, *waiting(5)]) == [4]
-    slow = batch(0, Place.CAST, A)  # stage 4 is behind
+    slow = batch(0, BatchState.CAST, A)  # stage 4 is behind
     assert sizes([slow, *waiting(3)]) == []
     assert sizes([slow, *waiting(4)]) == [4]
-
-
-def test_a_task_has_as_many_batches_as_are_worth_it():
-    assert batches_per_task([]) == 1
-    assert batches_per_task([0.3, 0.2, 9.0]) == 1
-    assert batches_per_task([TASK_SECONDS / 4.5]) == 4
-    assert batches_per_task([0.0]) == TASK_BATCHES
-
-
-def test_the_batches_of_a_task_fit_into_memory_together():
-    assert weight([batch(0, scans=25)], 4) == weight([batch(0)], 4) == 1
-    assert weight([batch(0, scans=50)], 4) == 2 and weight([batch(0, scans=100)], 1) == 1
-    assert sizes(waiting(10, scans=50)) == [2, 2, 2, 2]
-    assert sizes([*waiting(2, scans=75), *waiting(4, first=20)]) == [1, 2]
-    there = waiting(20, scans=50)
-    assert len(numbers(offers(there, {A: 9}, 12, 4))) == 6, "they count twice among all"
-
-
-def test_jobs_of_one_scene_share_tasks_and_others_do_not():
-    there = [batch(n, job=job) for n, job in enumerate((JOB, OTHER, ELSEWHERE) * 4)]
-    tasks = [task for task, _ in offers(there, {A: 1, B: 1}, 99, 4)]
-    assert [[b.first for b in task] for task in tasks] == [
-        [0, 1, 3, 4],
-        [2, 5, 8, 11],
-        [6, 7, 9, 10],
-    ]
-    for one in there:
-        one.divided = one.job is OTHER  # because a task with it has failed
-    tasks = [task for task, _ in offers(there, {A: 1, B: 1}, 99, 4)]
-    assert [{b.job.number for b in task} for task in tasks] == [{0}, {1}, {2}]
-
-
-def test_there_are_at_most_so_many_batches_under_way():
-    collecting = batch(0, Place.COLLECTING)
-    there = [collecting, batch(1, Place.CAST), casting(2, A), *waiting(9)]
-    assert numbers(offers(there, {A: 9}, most=5)) == [(10, A), (11, A)]
-    assert offers(there, {A: 9}, most=2) == []
-    assert offers(there, {}, most=99) == []
-
-
-def test_a_suspect_has_a_worker_for_itself():
-    suspect = batch(5, suspect="intersect")
-    assert numbers(offers([suspect, *waiting(5)], {A: 1, B: 1}, 99)) == [(5, A), (10, B), (11, B)]
-    alone = casting(0, A, suspect="intersect")
-    assert {where for _, where in offers([alone, *waiting(5)], {A: 1, B: 1}, 99)} == {B}
-    # Until a worker is free the others wait, too: they would occupy all.
-    assert offers([casting(0, A), casting(1, B), suspect, *waiting(5)], {A: 1, B: 1}, 99) == []
 
 
 def test_the_only_worker_is_left_to_a_suspect():
@@ -166,7 +115,7 @@ def test_the_only_worker_is_left_to_a_suspect():
 
 
 def test_a_collector_on_the_host_of_the_columns_is_preferred():
-    there = [batch(n, Place.CAST, worker) for n, worker in enumerate((A, B, A, A, A, A, A))]
+    there = [batch(n, BatchState.CAST, worker) for n, worker in enumerate((A, B, A, A, A, A, A))]
     chosen = handovers(there, {"collect-0": "tcp://b:7", "collect-1": "tcp://a:7"})
     assert dict(numbers(chosen)) == {
         0: "collect-1", 1: "collect-0", 2: "collect-1", 3: "collect-1", 4: "collect-0",
@@ -178,43 +127,26 @@ def test_a_collector_on_the_host_of_the_columns_is_preferred():
 
 def test_a_suspect_is_collected_alone():
     collectors = {"collect-0": A, "collect-1": B}
-    suspect = batch(5, Place.CAST, A, suspect="collect")
-    other = batch(6, Place.CAST, A)
+    suspect = batch(5, BatchState.CAST, A, suspect="collect")
+    other = batch(6, BatchState.CAST, A)
     assert numbers(handovers([other, suspect], collectors)) == [(5, "collect-0")]
-    busy = batch(7, Place.COLLECTING, A, "collect-1")
+    busy = batch(7, BatchState.COLLECTING, A, "collect-1")
     assert handovers([suspect, other, busy], collectors) == []
-    busy = batch(7, Place.COLLECTING, A, "collect-1", suspect="collect")
+    busy = batch(7, BatchState.COLLECTING, A, "collect-1", suspect="collect")
     assert handovers([other, busy], collectors) == []
-    assert numbers(handovers([other, batch(8, Place.CAST, A, suspect="intersect")], collectors))
+    assert numbers(
+        handovers([other, batch(8, BatchState.CAST, A, suspect="intersect")], collectors)
+    )
 
 
 # -- again ---------------------------------------------------------------------------------------
 
-HERE = Whereabouts(frozenset({A, B}), frozenset(), {A: 1, B: 1})
-
-
-def test_batches_are_late_by_what_others_took():
-    assert late_after_s([]) == float("inf")
-    assert late_after_s([0.1, 0.2, 99.0]) == LATE_S
-    assert late_after_s([10.0, 20.0, 30.0]) == LATE_FACTOR * 20
-
-
-@pytest.mark.parametrize(
-    ("place", "reason"),
-    [
-        (Place.WAITING, None),
-        (Place.CASTING, Outcome.DIED),
-        (Place.CAST, Outcome.GONE),
-        (Place.COLLECTING, None),  # its collector may have the columns, and says if it has not
-    ],
-)
-def test_the_batches_of_a_worker_that_is_gone(place, reason):
-    assert loss(batch(0, place, "tcp://gone:1"), HERE, 2, 0.0, LATE_S) is reason
+HERE = TaskLocations(frozenset({A, B}), frozenset(), {A: 1, B: 1})
 
 
 def test_a_silent_worker_is_left_if_there_is_another():
-    seen = Whereabouts(frozenset({A, B}), frozenset({A}), {B: 1})
-    for place in (Place.CASTING, Place.CAST):
+    seen = TaskLocations(frozenset({A, B}), frozenset({A}), {B: 1})
+    for place in (BatchState.CASTING, BatchState.CAST):
         assert loss(batch(0, place, A), seen, 1, 0.0, LATE_S) is Outcome.GONE
         assert loss(batch(0, place, A), seen, 0, 0.0, LATE_S) is None
 
@@ -230,20 +162,44 @@ def test_a_silent_worker_is_left_if_there_is_another():
     ],
 )
 def test_a_worker_that_takes_no_tasks_ends_what_it_has_begun(task, reason):
-    seen = Whereabouts(HERE.members, frozenset(), {B: 1}, tasks={"0": task} if task else {})
+    seen = TaskLocations(HERE.members, frozenset(), {B: 1}, tasks={"0": task} if task else {})
     assert loss(casting(0, A), seen, 1, 0.0, LATE_S) is reason
 
 
-@pytest.mark.parametrize(
-    ("place", "prepared", "reason"),
-    [
-        (Place.WAITING, 2, None),
-        (Place.CASTING, 2, Outcome.LATE),
-        (Place.CASTING, 1, None),  # nobody else could do it
-        (Place.CAST, 2, None),  # it waits for a collector
-        (Place.COLLECTING, 1, Outcome.LATE),
-    ],
-)
-def test_a_late_batch(place, prepared, reason):
-    assert loss(batch(0, place, A), HERE, prepared, LATE_S + 1, LATE_S) is reason
-    assert loss(batch(0, place, A), HERE, prepared, LATE_S - 1, LATE_S) is None
+def record(number: int, resources: tuple[str, ...] = ("GPU",), every: float = 1.0) -> TaskRecord:
+    start = every * number
+    return TaskRecord("intersect", "GPU", f"w{number % 3}", resources, start, start + 0.5, 2)
+
+
+def test_totals_are_exact_however_many_tasks_there_are():
+    book, count = TaskBook(), 5 * RECORDS_MOST
+    for number in range(count):
+        book.add(record(number))
+    totals = book.stages["intersect"]
+    assert (totals.tasks, totals.items) == (count, 2 * count)
+    assert totals.seconds == pytest.approx(0.5 * count)
+    assert (totals.start, totals.stop) == (0, count - 0.5)
+    assert totals.workers == {"w0", "w1", "w2"}
+    assert totals.resources == {"GPU": count}
+    assert totals.violations == 0
+
+
+def test_the_timeline_is_thinned_evenly():
+    totals = StageTotals("intersect", "GPU")
+    for number in range(5 * RECORDS_MOST):
+        totals.add(record(number))
+    kept = [r.start for r in totals.records]
+    assert RECORDS_MOST / 2 <= len(kept) <= RECORDS_MOST
+    steps = {b - a for a, b in pairwise(kept)}
+    assert len(steps) == 1 and kept[0] == 0
+
+
+def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
+    totals = StageTotals("intersect", "GPU")
+    for number in range(3 * MISPLACED_MOST):
+        totals.add(record(number, ("OTHER",) if number % 2 else ()))
+    assert totals.violations == 3 * MISPLACED_MOST
+    assert totals.misplaced == [
+        record(n, ("OTHER",) if n % 2 else ()) for n in range(MISPLACED_MOST)
+    ]
+    assert totals.resources == {"OTHER": 30, "none": 30}

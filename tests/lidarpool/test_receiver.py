@@ -8,10 +8,10 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from tests.lidarpool.casting import Cart, cast_between
-from tests.lidarpool.test_echoes import beam_along_x, cast, wall
+from tests.shapes import Cart, beam_along_x, cast, cast_between, made, wall
 
 from lidarpool import (
+    Actor,
     Beams,
     LidarpoolError,
     Material,
@@ -21,11 +21,12 @@ from lidarpool import (
     Pose,
     Returns,
     Scene,
+    SceneInstance,
     Sensor,
     Spin,
     Survey,
 )
-from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.noise import THRESHOLD_SIGMAS
 from lidarpool.simulator.hits import BLOOMING, CROSSTALK, FALSE_ALARM, SURFACE
 from lidarpool.simulator.rig import Rig
@@ -64,18 +65,6 @@ def test_weak_returns_are_noisier_by_the_threshold_over_their_energy():
         assert np.mean(found) == pytest.approx(distance, abs=4 * expected / len(found) ** 0.5)
 
 
-def test_a_fit_of_scatter_against_energy_gives_the_model_back():
-    noise = Noise(0.01, detection_range_m=FAR, range_at_threshold_m=0.05)
-    distances = np.array([15.0, 60.0, 120.0, 200.0, 250.0])
-    variances = [np.var(ranges_at(distance, noise)) for distance in distances]
-    weak = (THRESHOLD / (10 / distances) ** 2) ** 2
-    # Weighted by the standard errors, which are proportional to the variances.
-    rows = np.stack([np.ones(5), weak], axis=1) / np.array(variances)[:, None]
-    (near, slope), *_ = np.linalg.lstsq(rows, np.ones(5), rcond=None)
-    assert math.sqrt(near) == pytest.approx(0.01, rel=0.02)
-    assert math.sqrt(slope) == pytest.approx(0.05, rel=0.02)
-
-
 def test_strong_returns_appear_nearer_as_of_a_gaussian_pulse_over_a_threshold():
     noise = Noise(detection_range_m=FAR, walk_m=0.1)
     for distance in (5.0, 100.0, 250.0):
@@ -88,12 +77,6 @@ def test_strong_returns_appear_nearer_as_of_a_gaussian_pulse_over_a_threshold():
     sign_at = cast([wall("W", 50)], noise=noise, materials=sign, columns=COLUMNS)["range"][0]
     plain = cast([wall("W", 50)], noise=noise, materials=WHITE, columns=COLUMNS)["range"][0]
     assert 0.1 < plain - sign_at < 0.3, "a sign appears nearer than a wall beside it"
-
-
-def test_walk_moves_no_return_at_or_below_the_threshold():
-    noise = Noise(detection_range_m=FAR, walk_m=0.1)
-    energy = np.array([0.5, 1.0, math.sqrt(math.e)]) * THRESHOLD
-    assert noise.walk(energy) == pytest.approx([0, 0, 0.1])
 
 
 @pytest.mark.parametrize(
@@ -219,7 +202,7 @@ def test_a_sign_blooms_over_the_angle_where_its_stray_light_passes_the_threshold
     stray = 3e-6
     noise = Noise(detection_range_m=FAR, stray_light=stray)
     sensor, ahead = window()
-    found = cast([sign()], sensor, backend, noise=noise, materials=SIGN, columns=COLUMNS)
+    found = cast([sign()], sensor, backend=backend, noise=noise, materials=SIGN, columns=COLUMNS)
     bloom = found["cause"] == BLOOMING
     off = off_square(ahead, 20.0, 0.25)
     strong = 220 * (10 / 20) ** 2 / THRESHOLD  # of the sign, in thresholds
@@ -266,39 +249,23 @@ def test_a_wall_as_far_away_as_the_sign_hides_the_stray_light():
 
 
 def test_instances_and_actors_bloom_like_meshes():
-    from lidarpool import Actor, Instance
-
     noise = Noise(detection_range_m=FAR, stray_light=3e-6)
     sensor, _ = window()
-    here = sign()
-    ground = wall("W", -50)
-    alone = Mesh("S", here.vertices - [20, 0, 0], here.faces)
-    counts = []
-    for scene in (
-        Scene.from_meshes([here, ground]),
-        Scene.from_meshes([ground, Instance(alone, np.array(_moved(20.0)), "S")]),
-        Scene.from_meshes([ground]).with_actors((Actor(here),)),
-    ):
-        survey = Survey(
-            sensor,
-            poses=[(0, 0, 0)],
-            steps=1,
-            noise=noise,
-            materials=SIGN,
-            columns=COLUMNS,
-            keep_every=1,
+    here, ground = sign(), wall("W", -50)
+    alone = SceneMesh("S", here.vertices - [20, 0, 0], here.faces)
+    survey = Survey(
+        sensor, [(0, 0, 0)], 1, noise=noise, materials=SIGN, columns=COLUMNS, keep_every=1
+    )
+    plain, *others = (
+        np.bincount(made(survey, scene)["cause"], minlength=5).tolist()
+        for scene in (
+            Scene.from_meshes([here, ground]),
+            Scene.from_meshes([ground, SceneInstance(alone, Pose((20, 0, 0)), "S")]),
+            Scene.from_meshes([ground]).with_actors((Actor(here),)),
         )
-        (batch,) = Rig(scene, survey, "numpy").cast(0, 1)
-        (cause,) = (c.make(batch) for c in survey.stored_columns if c.name == "cause")
-        counts.append(np.bincount(cause, minlength=5).tolist())
-    assert counts[0][BLOOMING] > 50
-    assert counts[0] == counts[1] == counts[2]
-
-
-def _moved(x):
-    matrix = np.eye(4)
-    matrix[0, 3] = x
-    return matrix
+    )
+    assert plain[BLOOMING] > 50
+    assert others == [plain, plain]
 
 
 # -- crosstalk -----------------------------------------------------------------------------------
@@ -344,7 +311,7 @@ def ring(radius=30.0, sides=720):
     vertices = np.concatenate([low, high]) * [radius, radius, 20.0]
     a, b = np.arange(sides), np.arange(sides) + 1
     faces = [np.stack([a, b, a + sides + 1], 1), np.stack([b, b + sides + 1, a + sides + 1], 1)]
-    return Mesh("R", vertices, np.concatenate(faces))
+    return SceneMesh("R", vertices, np.concatenate(faces))
 
 
 def test_a_sensor_that_turns_alike_is_seen_by_each_ray_its_delay_farther_away():

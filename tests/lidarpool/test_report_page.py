@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,15 +25,15 @@ from lidarpool import (
     Survey,
     load_sensor,
 )
-from lidarpool.pipeline import COLLECT, GENERATE, INTERSECT, SORT
+from lidarpool.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.page.page import ROWS_MOST, write_page
+from lidarpool.report.page.rendering import ROWS_MOST, write_page
 from lidarpool.report.report import STAGES, CountedCloud, make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor import Sensor
 from poolpart import TaskRecord
 
@@ -67,7 +67,9 @@ def records(workers: int = 1, tasks: int = 20, prefix: str = "") -> list[TaskRec
 
 def scene_of(names: Sequence[str]) -> Scene:
     corners, faces = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], float), np.array([[0, 1, 2]])
-    return Scene.from_meshes([Mesh(name, corners + 2 * k, faces) for k, name in enumerate(names)])
+    return Scene.from_meshes(
+        [SceneMesh(name, corners + 2 * k, faces) for k, name in enumerate(names)]
+    )
 
 
 def counted(cloud: Any, objects: int) -> CountedCloud:
@@ -246,23 +248,6 @@ def test_points_by_object_are_all_accounted_for(write):
     assert int(more[1]) + 25 + (int(missed[1]) if missed else 0) == 300
 
 
-def test_the_head_says_who_scanned_and_what_a_user_asks_for(write):
-    """Times and placement of tasks are further down, behind the survey and its cloud."""
-    text, _ = write()
-    page = html.fromstring(text)
-    assert page.findtext(".//h1") == page.findtext(".//title")
-    assert page.findtext(".//h1") == "Sensor with 16 channels from 2 positions"
-    facts = {
-        fact.findtext("dt"): fact.findtext("dd") for fact in page.xpath("//dl[@class='facts']/div")
-    }
-    assert facts["points in the cloud"] == "500"
-    assert facts["of scanning"] == "333 ms"
-    assert {"points per m² of surface, the median", "size of the cloud"} < {*facts}
-    assert not [what for what in facts if "partition" in what or "overlap" in what]
-    order = page.xpath("//h2/text()")
-    assert order.index("The cloud") < order.index("Sensor and scene") < order.index("Timeline")
-
-
 @pytest.mark.parametrize("each", [4, 400])
 def test_the_density_is_that_of_the_surfaces(each):
     """Of a floor and a wall, sparser than a cell has or denser, wherever they are."""
@@ -273,21 +258,6 @@ def test_the_density_is_that_of_the_surfaces(each):
     columns = {name: np.zeros(len(both), np.int32) for name in ("scan", "channel", "object")}
     found = counted(Cloud(both + np.array([5e5, 0, 100]), columns), 1)
     assert found.density == pytest.approx(each, rel=0.3)
-
-
-class Chunks(Cloud):
-    """A cloud that gives itself out in small parts."""
-
-    def chunks(self, points: int = 0, first: int = 0) -> Iterator[Cloud]:
-        return super().chunks(97)
-
-
-def test_the_cloud_is_counted_in_parts():
-    cloud = cloud_of(1000, 2, 12, 16)
-    found = counted(Chunks(cloud.positions, cloud.columns), 2)
-    assert found.by_object.tolist() == np.bincount(cloud["object"]).tolist()
-    for name in ("scan", "channel", "object"):
-        assert found.limits[name] == (cloud[name].min(), cloud[name].max())
 
 
 def lanes(text: str) -> list[str]:

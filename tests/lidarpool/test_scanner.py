@@ -9,22 +9,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from tests.shapes import level
 
 from lidarpool import (
     Actor,
     Beams,
     Cloud,
     Column,
-    Instance,
     LidarpoolError,
     Material,
-    Mesh,
     Mounted,
     Noise,
     Pose,
     Returns,
     Scanner,
     Scene,
+    SceneInstance,
+    SceneMesh,
     Sensor,
     Spin,
     Survey,
@@ -34,7 +35,7 @@ from lidarpool import (
 from lidarpool.columns.table import OPTIONAL, SCAN
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import box
-from lidarpool.scene.mesh import Cutout
+from lidarpool.scene.scene_mesh import Cutout
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.simulator import rig as rig_module
 from lidarpool.simulator.batch import columns_of
@@ -79,9 +80,7 @@ SENSORS = {
 
 @pytest.fixture(scope="module")
 def scene():
-    corners = np.array([[-30, -30, 0], [30, -30, 0], [30, 30, 0], [-30, 30, 0.0]])
-    ground = Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
-    meshes = [*seed_objects(rings=8, segments=12), ground]
+    meshes = [*seed_objects(rings=8, segments=12), level("Ground")]
     return Scene.from_meshes(meshes).with_actors([CAR])
 
 
@@ -98,10 +97,6 @@ def same(one: Cloud, other: Cloud):
     for name, values in other.columns.items():
         assert one[name].dtype == values.dtype and np.array_equal(one[name], values), name
     return True
-
-
-def sweep_of(cloud, steps):
-    return cloud.part(np.flatnonzero((cloud.scan >= steps.start) & (cloud.scan < steps.stop)))
 
 
 @pytest.mark.parametrize("physics", [{}, PHYSICS], ids=["plain", "all effects"])
@@ -299,7 +294,7 @@ def with_copies(scene, crate=None, *grates):
     uv = np.array([[[0, 0], [2, 0], [2, 2]]], np.float32)
     corners = np.array([[0, -2, 0], [0, 2, 0], [0, 2, 2], [0, -2, 2.0]])
     faces = np.array([[0, 1, 2], [0, 2, 3]])
-    grate = Mesh("Grate", corners, faces, (Cutout(np.array([[True, False]]), uv),))
+    grate = SceneMesh("Grate", corners, faces, (Cutout(np.array([[True, False]]), uv),))
     meshes = [(box("Crate", (2, 1, 1)), crate or Pose((5, 2, 0), 10), (1.4, 0.7, 2.1))]
     meshes += [(grate, pose, 1.3) for pose in grates or [Pose((-5, y, 0), 5) for y in (-3, 3)]]
     placed = []
@@ -307,7 +302,7 @@ def with_copies(scene, crate=None, *grates):
         matrix = np.eye(4)
         matrix[:3, :3] = (np.eye(3) if pose.rotation is None else pose.rotation) * scale
         matrix[:3, 3] = pose.position
-        placed.append(Instance(mesh, matrix))
+        placed.append(SceneInstance(mesh, matrix))
     return Scene.from_meshes([*scene.meshes(), *placed]).with_actors(scene.actors)
 
 
@@ -349,18 +344,6 @@ def test_a_copy_waits_for_sweeps_before_it_moves(scene):
         assert {sweep.result().positions.tobytes() for sweep in sweeps} <= {*seen}
 
 
-def test_a_copy_has_no_trajectory(scene):
-    scanner = Scanner(with_copies(scene), GRID)
-    with pytest.raises(LidarpoolError, match="'Crate' is an Instance, which stands still during"):
-        scanner.move("Crate", DRIVE)
-    with pytest.raises(
-        LidarpoolError, match=r"no actor or instance 'Grate\.4'\. Did you mean 'Grate\.2"
-    ):
-        scanner.move("Grate.4", (0, 0, 0))
-    with pytest.raises(LidarpoolError, match="make it an Actor or an Instance"):
-        scanner.move("Bowl", (0, 0, 0))
-
-
 @pytest.mark.parametrize(("backend", "sensor"), [("numpy", LATE), ("embree", VLP16)])
 def test_threads_share_a_scanner(scene, backend, sensor):
     def scan(number):
@@ -390,7 +373,7 @@ WRONG = {
     "start": (lambda s: s.ranges((0, 0, 1), start_s=float("nan")), "start_s is nan"),
     "late": (lambda s: s.sweep(DRIVE, start_s=0.45), "from 0.45 to 0.549167 s"),
     "actor": (lambda s: s.move("Cart", (0, 0, 1)), "no actor or instance 'Cart'. Did you mean"),
-    "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the scene"),
+    "object": (lambda s: s.move("Bowl", (0, 0, 1)), "'Bowl'. It is part of the standing scene"),
     "pose": (lambda s: s.sweep("here"), "pose is 'here'"),
     "poses": (lambda s: s.ranges([[0, 0]]), "of the shape (1, 2)"),
     "mixed": (lambda s: s.ranges([HERE, "here"]), "a pose is 'here'"),

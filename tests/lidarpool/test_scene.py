@@ -1,19 +1,22 @@
 """A scene keeps every triangle, name and digit of the meshes it is made of."""
 
+from __future__ import annotations
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene, unique_names
+from lidarpool.scene.scene_mesh import SceneMesh
+from lidarpool.scene.transform import UP_AXES, Transform
 
 FACES = np.array([[0, 1, 2]])
 
 
 def triangle(name="T", at=(0.0, 0.0, 0.0)):
-    return Mesh(name, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + np.array(at), FACES)
+    return SceneMesh(name, np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]]) + np.array(at), FACES)
 
 
 def world(scene):
@@ -34,18 +37,6 @@ def test_world_coordinates_come_back(centre, offsets):
         assert np.abs(scene.vertices).max() < 1001
     elif np.abs(centre).max() < 9_000:
         assert not scene.origin.any()
-
-
-def test_a_scene_is_shown_in_one_line():
-    scene = Scene.from_meshes([triangle()])
-    assert repr(scene) == "<Scene: 1 object, 1 triangle, 1.00 x 1.00 x 0.00 m>"
-
-
-def test_georeferenced_coordinates_lose_no_digit():
-    given = triangle(at=(512_345.678_9, 5_403_210.123_4, 431.5))
-    scene = Scene.from_meshes([given])
-    np.testing.assert_array_equal(world(scene), given.vertices[given.faces])
-    np.testing.assert_array_equal(scene.origin, [512_346, 5_403_211, 432])
 
 
 @given(st.lists(st.sampled_from(["a", "b", "a.2", "a.3", "b.2.2"]), max_size=12))
@@ -84,3 +75,32 @@ def test_scenes_that_do_not_fit_together(change, message):
     Scene(**good)
     with pytest.raises(LidarpoolError, match=message):
         Scene(**(good | change))
+
+
+@pytest.mark.parametrize("axis", "xyz")
+def test_the_up_axis_becomes_z(axis):
+    matrix = UP_AXES[axis]
+    np.testing.assert_array_equal(matrix @ np.eye(3)["xyz".index(axis)], [0, 0, 1])
+    assert np.linalg.det(matrix) == 1
+
+
+def test_scale_then_x_then_y_then_z_then_translation():
+    placed = Transform.place((10, 20, 30), (90, 0, 90), (2, 3, 4))
+    # x: scaled to 2, stays under the turn about x, goes to y under the turn about z.
+    np.testing.assert_allclose(placed.linear.T, [[0, 2, 0], [0, 0, 3], [4, 0, 0]], atol=1e-12)
+    assert placed.offset.tolist() == [10, 20, 30]
+
+
+@pytest.mark.parametrize(
+    ("make", "message"),
+    [
+        (lambda: Transform.place(scale=0), "flattens"),
+        (lambda: Transform.place((0, 0, np.nan)), "finite"),
+        (lambda: Transform.from_matrix(np.eye(3)), "four rows"),
+        (lambda: Transform.from_matrix(np.full((4, 4), 1.0)), "last one 0 0 0 1"),
+        (lambda: Transform(np.eye(2), np.zeros(3)), r"\(2, 2\)"),
+    ],
+)
+def test_no_placements(make, message):
+    with pytest.raises(LidarpoolError, match=message):
+        make()

@@ -14,13 +14,12 @@ from click.testing import CliRunner
 from lidarpool import LidarpoolError, Scene
 from lidarpool.cli.scenario_commands import scene as command
 from lidarpool.scene.actors import box
-from lidarpool.scene.city import city
 from lidarpool.scene.colours import WHITE, Colours
-from lidarpool.scene.instances import Instance
-from lidarpool.scene.mesh import Cutout
-from lidarpool.scene.meshfile import load_meshes
-from lidarpool.scene.plants import SPECIES
+from lidarpool.scene.files.meshfile import load_meshes
+from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_file import write_scene
+from lidarpool.scene.scene_instances import SceneInstance
+from lidarpool.scene.scene_mesh import Cutout
 
 
 @pytest.mark.parametrize("suffix", [".ply", ".glb", ".obj", ".GLB"])
@@ -63,14 +62,14 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
     card = replace(cube, name="Card", cutouts=(Cutout(mask, uv),), colours=Colours.plain(red, 12))
     copies = np.tile(np.eye(4), (3, 1, 1))
     copies[:, 0, 3] = 5, 9, 13
-    placed = Instance.several(replace(meshes[4], name="Copy"), copies, "Copy")
+    placed = SceneInstance.several(replace(meshes[4], name="Copy"), copies, "Copy")
     path = write_scene(tmp_path / "all.glb", Scene.from_meshes([*meshes, card, *placed]))
     wanted = {mesh.name: (mesh, np.zeros(3)) for mesh in [*meshes, card]}
     names = ("Copy", "Copy.2", "Copy.3")
     wanted |= {n: (meshes[4], one.matrix[:3, 3]) for n, one in zip(names, placed, strict=True)}
     read = {}
     for one in load_meshes(path, colours=True):
-        mesh = one.flat() if isinstance(one, Instance) else one
+        mesh = one.flat() if isinstance(one, SceneInstance) else one
         read.setdefault(mesh.name, []).append(mesh)
     assert {*read} == {*wanted}
     for name, (mesh, shift) in wanted.items():
@@ -91,30 +90,6 @@ def test_colours_come_back_from_a_glb_file(tmp_path):
     assert seen["Plain"].visual.material.main_color.tolist() == [147, 1, 0, 255]  # linear
     texture = np.asarray(seen["Textured"].visual.material.baseColorTexture.convert("RGB"))
     np.testing.assert_array_equal(texture, image)
-
-
-def test_a_generated_city_has_colours_and_the_triangles_that_it_had(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    arguments = ["city", "a.glb", "--triangles", "20000", "--trees", "9", "--cars", "9"]
-    CliRunner().invoke(command, arguments, catch_exceptions=False)
-    made, read = city(20_000, 0, 9, 9), Scene.load("a.glb", colours=True)
-    assert (read.names, read.triangles) == (made.names, made.triangles)
-
-    def shade(name):
-        own = read.face_object == read.names.index(name)
-        return np.unique(read.colours.take(own).means(), axis=0)
-
-    assert (len(shade("ground")), len(shade("pavement"))) == (1, 1)
-    assert shade("ground").max() < shade("pavement").min()
-    assert len(shade("building-1")) > 1, "a roof has another colour than walls"
-    trees = {species.name for species in SPECIES}
-    for name in {name.partition(".")[0] for name in read.names if "-" not in name} - {
-        "ground",
-        "pavement",
-    }:
-        red, green, blue = shade(name).astype(int).T
-        leaves = (green > np.maximum(red, blue)).any()
-        assert (len(red), leaves) == ((2, True) if name in trees else (1, False)), name
 
 
 @pytest.mark.parametrize(
@@ -149,20 +124,12 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
     ("arguments", "words"),
     [
         (
-            ["city", "out.glb", "--triangles", "3000", "--seed", "5"],
-            r"2,9\d\d triangles, \d+ objects, \d+ x \d+ x \d+ m: out.glb\n",
-        ),
-        (
             ["terrain", "out.ply", "--triangles", "800", "--side", "50"],
             r"800 triangles, 1 object, 50 x 50 x 8 m: out.ply\n",
         ),
         (
             ["city", "out.glb", "--triangles", "20000", "--trees", "40", "--cars", "20"],
             r"\d+,\d+ triangles, \d+ objects, \d+ x \d+ x \d+ m: out.glb\n",
-        ),
-        (
-            ["terrain", "out.glb", "--triangles", "800", "--side", "100", "--trees", "30"],
-            r"\d+,\d+ triangles, 31 objects, 100 x 100 x \d+ m: out.glb\n",
         ),
     ],
 )

@@ -6,32 +6,32 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tests.lidarpool.casting import tally_of
+from tests.shapes import tally_of
 
 from lidarpool import (
     Actor,
-    Instance,
     LidarpoolError,
     Material,
-    Mesh,
     Noise,
     Pose,
     Returns,
     Scene,
+    SceneInstance,
+    SceneMesh,
     Survey,
     Track,
     load_sensor,
 )
 from lidarpool.columns.table import SCAN
 from lidarpool.scene.actors import box, one_mesh
-from lidarpool.scene.mesh import Cutout
+from lidarpool.scene.scene_mesh import Cutout
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
 
 SPHERE = seed_objects(rings=8, segments=12)[0]
-SPHERE = Mesh(SPHERE.name, SPHERE.vertices + np.array([20, 20, 0]), SPHERE.faces)
-GRATE = Mesh(
+SPHERE = SceneMesh(SPHERE.name, SPHERE.vertices + np.array([20, 20, 0]), SPHERE.faces)
+GRATE = SceneMesh(
     "Grate",
     np.array([[0, -2, 0], [0, 2, 0], [0, 2, 2], [0, -2, 2.0]]),
     np.array([[0, 1, 2], [0, 2, 3]]),
@@ -74,7 +74,7 @@ def scenes(placed, far):
     """A ground and instances, and the same without instances."""
     offset = np.array([5e5, 4e6, 100.0]) * far
     ground = box("Ground", (60, 60, 0.2))
-    objects = [Mesh("Ground", ground.vertices + offset, ground.faces)]
+    objects = [SceneMesh("Ground", ground.vertices + offset, ground.faces)]
     # Bushes come last, because what has holes is an instance in both.
     for k, (number, (at, turn, scale)) in enumerate(sorted([*ALWAYS, *placed])):
         matrix = np.eye(4)
@@ -82,8 +82,8 @@ def scenes(placed, far):
         matrix[:3, :3] = (np.eye(3) if turned is None else turned) * scale
         # A little apart: of two faces in one place, either may be hit.
         matrix[:3, 3] = at + offset + k * np.array([0.0137, 0.0071, 0.0033])
-        objects.append(Instance(MESHES[number], matrix))
-    flat = [one.flat() if isinstance(one, Instance) else one for one in objects]
+        objects.append(SceneInstance(MESHES[number], matrix))
+    flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
     return Scene.from_meshes(objects), Scene.from_meshes(flat)
 
 
@@ -141,14 +141,14 @@ def test_instances_and_their_copies_are_scanned_alike(placed, far, actor, physic
 
 
 def test_instances_can_be_given_by_a_pose():
-    by_pose = Instance(SPHERE, Pose((1, 2, 3), 30, 20, 10), "Other")
+    by_pose = SceneInstance(SPHERE, Pose((1, 2, 3), 30, 20, 10), "Other")
     moved = SPHERE.vertices @ Pose((0, 0, 0), 30, 20, 10).rotation.T + (1, 2, 3)
     assert by_pose.name == "Other" and np.allclose(by_pose.flat().vertices, moved)
 
 
 def test_several_instances_are_refused_as_one_is():
     flat = np.tile(np.eye(4), (3, 1, 1))
-    assert [one.name for one in Instance.several(SPHERE, flat, "V")] == ["V"] * 3
+    assert [one.name for one in SceneInstance.several(SPHERE, flat, "V")] == ["V"] * 3
     flat[1, 2, 2] = 0
     with pytest.raises(LidarpoolError, match="flattens the mesh"):
-        Instance.several(SPHERE, flat, "V")
+        SceneInstance.several(SPHERE, flat, "V")

@@ -7,20 +7,21 @@ import gc
 import shutil
 import sqlite3
 from contextlib import closing
-from dataclasses import fields, make_dataclass, replace
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
-from tests.lidarpool.committing import commit
+from tests.committing import commit
 
+import lidarpool.run.remote
 import lidarpool.run.store
 from lidarpool import Campaign, Job, LidarpoolError, Planning, Scene, Sensor, Survey, remove_run
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import mark_name, part_name, probe_name
-from lidarpool.export.jobs import JobRow
+from lidarpool.datasets.job_table import JobRow
 from lidarpool.plan import run_trial
-from lidarpool.run.jobs import OneJob
+from lidarpool.run.job_source import OneJob
 from lidarpool.run.store import RunStore
 from lidarpool.scene.shapes import seed_objects
 
@@ -137,31 +138,6 @@ def test_another_run_cannot_go_on(other, unfinished):
             opened(unfinished, resume=resume, job=OTHERS[other])
     remove_run(unfinished)
     opened(unfinished, job=OTHERS[other]).db.close()
-
-
-def with_another_field(thing, value):
-    """Make the same thing of a class with one field more."""
-    later = make_dataclass("Later", [("gain", float, 1.0)], bases=(type(thing),), frozen=True)
-    kept = {field.name: getattr(thing, field.name) for field in fields(thing) if field.init}
-    return later(**kept, gain=value)
-
-
-@pytest.mark.parametrize("at", ["survey", "noise", "sensor", "scene", "planning"])
-def test_a_field_that_comes_later_is_part_of_the_identity(at, folder):
-    def job(gain):
-        base = replace(JOB, planning=PLANNING)
-        if at in ("noise", "sensor"):
-            inner = with_another_field(getattr(SURVEY, at), gain)
-            return replace(base, survey=replace(SURVEY, **{at: inner}))
-        return replace(base, **{at: with_another_field(getattr(base, at), gain)})
-
-    store = opened(folder, job=job(1.0))
-    store.cast_with("numpy", {})
-    add(store, 0, 2)
-    store.db.close()
-    with pytest.raises(LidarpoolError, match="cannot be continued"):
-        opened(folder, resume=True, job=job(2.0))
-    opened(folder, resume=True, job=job(1.0)).db.close()
 
 
 def test_another_version_cannot_go_on(unfinished, monkeypatch):
@@ -580,3 +556,117 @@ def test_a_run_that_is_going_on_is_not_dropped(folder):
     with pytest.raises(LidarpoolError, match=f"Another run is using {folder}"):
         remove_run(folder)
     assert len(store.only.points().load()) == 18
+
+
+@pytest.fixture
+def url(tmp_path, monkeypatch):
+    """URL of a run whose driver has no folder that stays."""
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    return f"memory://{tmp_path.name}/run"
+
+
+@pytest.fixture
+def remote_run(url):
+    """URL of a run whose driver died when two of six scans were in the copy of its database."""
+    store = opened(url)
+    store.cast_with("numpy", {})
+    add(store, 0, 2)
+    store.save(now=True)
+    add(store, 3, 5)
+    store.db.close()
+    return url
+
+
+def test_it_goes_on_from_the_last_copy(remote_run):
+    store = opened(remote_run, resume=True)
+    assert (store.only.resumed, store.backend, store.notes) == (4, "numpy", [])
+    assert store.only.parts.missing(0, 6) == [(2, 3), (5, 6)], "parts say what is not in the copy"
+    assert add(store, 2, 3) and add(store, 5, 6)
+    store.only.parts.frames = 6
+    store.save(now=True)
+    store.tidy()
+    mark = mark_name(store.db.meta["mark"])
+    assert left(remote_run) == {"run.db", "run.owner", mark, *store.only.points().names}
+    again = opened(remote_run, resume=True)
+    assert again.notes == [] and again.only.complete and len(again.only.points().load()) == 18
+    again.remove()
+    assert left(remote_run) == set()
+
+
+def test_it_is_refused_or_dropped(remote_run):
+    kept = f"{remote_run} holds an unfinished run, 2 of 6 scans: continue it with --resume"
+    with pytest.raises(LidarpoolError, match=kept):
+        opened(remote_run)
+    with pytest.raises(LidarpoolError, match=f"{remote_run} cannot be continued, .* another scene"):
+        opened(remote_run, resume=True, job=OTHERS["scene"])
+    remove_run(remote_run)
+    remove_run(remote_run)
+    assert left(remote_run) == set()
+    assert opened(remote_run, job=OTHERS["scene"]).only.resumed == 0
+
+
+def test_foreign_objects_stay(remote_run):
+    parts = Storage.at(f"{remote_run}/parts")
+    foreign = {"a.npz", "arch.npz.bak", ".tmp-5.npz-1a2b"}
+    for name in foreign:
+        parts.write(name, b"mine")
+    Storage.at(f"{parts}/deeper").write("a.npz", b"mine")
+    remove_run(remote_run)
+    assert left(remote_run) == foreign
+    assert Storage.at(f"{parts}/deeper").sizes() == {"a.npz": 4}
+
+
+def test_one_of_another_format(remote_run, monkeypatch):
+    monkeypatch.setattr("lidarpool.pipeline.database.FORMAT", 99)
+    with pytest.raises(LidarpoolError, match=rf"^{remote_run}/run.db is damaged \(it is of format"):
+        opened(remote_run)
+
+
+def test_copies_are_made_now_and_then(url, monkeypatch):
+    store = opened(url)
+    first = Storage.at(url).read("run.db")
+    add(store, 0, 2)
+    store.save()
+    assert Storage.at(url).read("run.db") == first
+    monkeypatch.setattr(store._remote, "_due", 0.0)
+    store.save()
+    assert Storage.at(url).read("run.db") != first
+
+
+@pytest.mark.parametrize("how", ["resumed", "dropped"])
+def test_a_run_that_is_taken_over_ends_and_leaves_all_to_the_other(how, url):
+    early = opened(url)
+    add(early, 0, 2)
+    early.save(now=True)
+    if how == "dropped":
+        remove_run(url)
+    late = opened(url, resume=True)
+    add(late, 2, 6)
+    late.save(now=True)
+    before = left(url)
+    with (
+        pytest.raises(LidarpoolError, match=f"taken over or deleted {url}") as caught,
+        early.kept_on_error(),
+    ):
+        early.save(now=True)
+    assert not hasattr(caught.value, "__notes__")
+    assert left(url) == before
+    late.save(now=True)
+    again = opened(url, resume=True)
+    assert again.only.resumed == (6 if how == "resumed" else 4)
+    with pytest.raises(LidarpoolError, match="this one has ended"), late.kept_on_error():
+        late.remove()
+    assert left(url) == before
+
+
+def test_storage_that_fails(url, monkeypatch):
+    store = opened(url)
+
+    def fail(*_):
+        raise OSError("it is full")
+
+    monkeypatch.setattr(lidarpool.run.remote.Storage, "write", fail)
+    with pytest.raises(LidarpoolError, match=f"cannot be kept in {url}: it is full"):
+        store.save(now=True)
+    with pytest.raises(LidarpoolError, match=rf"Cannot write to {url} \(it is full\)"):
+        opened(url, resume=True)

@@ -16,12 +16,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tests.lidarpool.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
+from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
 
 import lidarpool
 from lidarpool import LidarpoolError, Scene, Sweep
+from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes
-from lidarpool.export.dataset import DATA_SETS, INDEX_FILE
+from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.sweeps import Sweeps
 
 JOBS = len(SPLITS)
@@ -253,9 +254,9 @@ def torch(monkeypatch) -> types.ModuleType:
     played.distributed.is_available = played.distributed.is_initialized = lambda: False
     for module in (played, played.utils, played.utils.data, played.distributed):
         monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.delitem(sys.modules, "lidarpool.export.torch_sweeps", raising=False)
+    monkeypatch.delitem(sys.modules, "lidarpool.datasets.torch_sweeps", raising=False)
     yield played
-    sys.modules.pop("lidarpool.export.torch_sweeps", None)
+    sys.modules.pop("lidarpool.datasets.torch_sweeps", None)
 
 
 def test_torch_gets_tensors(written, torch):
@@ -301,6 +302,6 @@ def test_torch_divides_sweeps_between_ranks_and_workers(written, torch, ranks, w
 
 
 def test_without_torch(written, monkeypatch):
-    monkeypatch.setattr("lidarpool.export.loader.find_spec", lambda name: None)
+    monkeypatch.setattr("lidarpool.datasets.loader.find_spec", lambda name: None)
     with pytest.raises(LidarpoolError, match="needs PyTorch: pip install torch"):
         lidarpool.sweeps(written("kitti")).torch()

@@ -73,19 +73,6 @@ def test_plain_lines_come_seldom_and_tell_rate_and_time_left():
     ]
 
 
-def test_plain_lines_say_once_that_something_is_done():
-    stream = StringIO()
-    show = PlainLines(stream)
-    for second in range(600):
-        show(progress(float(second), 100, min(10, second // 60)))
-    text = stream.getvalue()
-    assert text.count("survey") == text.count("survey  done") == 1
-    assert text.count("planning  done") == 0 and 20 < text.count("planning") < 60
-    show(progress(600.0, 100, 10))
-    show(progress(601.0, 100, 10))
-    assert stream.getvalue().count("planning  done: 10 trials in 600.0 s") == 1
-
-
 def test_plain_lines_tell_why_nothing_goes_on():
     stream = StringIO()
     show = PlainLines(stream)

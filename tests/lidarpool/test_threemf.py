@@ -5,10 +5,10 @@ import zipfile
 
 import numpy as np
 import pytest
-from tests.lidarpool.meshes import NESTED
+from tests.meshes import NESTED
 
 from lidarpool.base.errors import LidarpoolError
-from lidarpool.scene.meshfile import load_meshes
+from lidarpool.scene.files.meshfile import load_meshes
 
 MODEL = (
     '<?xml version="1.0"?>{doctype}'

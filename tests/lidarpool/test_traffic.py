@@ -8,12 +8,12 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from tests.lidarpool.casting import cast_between
+from tests.shapes import cast_between, made
 
-from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor
+from lidarpool import LidarpoolError, Mounted, Pose, Scene, Survey, Track, load_sensor, save_cloud
 from lidarpool.columns.cloud import Cloud
 from lidarpool.export.sweeps import Sweeps
-from lidarpool.run.picture_file import Pictured
+from lidarpool.run.picture_file import PictureContent
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
@@ -23,15 +23,6 @@ from lidarpool.simulator.surfaces import Surfaces
 
 FLOOR = box("Floor", (60, 60, 0.01))
 COLUMNS = ["time", "range", "triangle", "intensity", "class"]
-
-
-def made(survey, scene, backend="numpy"):
-    """Columns of all points that a survey gives: {name: (n,)}."""
-    batches = list(Rig(scene, survey, backend).cast(0, survey.scan_count))
-    return {
-        column.name: np.concatenate([column.make(batch) for batch in batches])
-        for column in survey.stored_columns
-    }
 
 
 def passing(beyond, times=(0.02, 0.065)):
@@ -93,7 +84,7 @@ def test_labels_and_frames_are_of_actors_that_are_there(sweeps_of_three, tmp_pat
     columns = {"scan": [0, 40, 80], "object": [0] * 3, "channel": [0] * 3, "time": [0, 1e8, 2e8]}
     columns |= {"intensity": [1.0] * 3, "class": [0] * 3}
     cloud = Cloud(np.zeros((3, 3)), columns, sweeps=lambda: sweeps_of_three)
-    cloud.save(tmp_path / "nu", format="nuscenes")
+    save_cloud(cloud, tmp_path / "nu", format="nuscenes")
     tables = {path.stem: json.loads(path.read_text()) for path in tmp_path.glob("nu/v1.0-*/*")}
     (row,) = tables["sample_annotation"]
     assert row["sample_token"] == tables["sample"][1]["token"]
@@ -102,7 +93,7 @@ def test_labels_and_frames_are_of_actors_that_are_there(sweeps_of_three, tmp_pat
     rosbags = pytest.importorskip("rosbags.highlevel")
     from rosbags.typesys import Stores, get_typestore
 
-    cloud.save(tmp_path / "a.mcap", layout="velodyne")
+    save_cloud(cloud, tmp_path / "a.mcap", layout="velodyne")
     store = get_typestore(Stores.ROS2_HUMBLE)
     shown, frames = [], []
     with rosbags.AnyReader([tmp_path / "a.mcap"], default_typestore=store) as bag:
@@ -266,8 +257,8 @@ def test_vehicles_of_one_entry_share_a_mesh_also_in_the_file_of_pictures(tmp_pat
         scene=built.scene, survey=survey, hit_counts=np.arange(built.scene.counters), trials=(),
         sample_rays=np.zeros((0, 2, 3)), planning=None, plan=None,
     )  # fmt: skip
-    Pictured.of(result).save(tmp_path / "p.npz")
-    back = Pictured.load(tmp_path / "p.npz").scene.actors
+    PictureContent.of(result).save(tmp_path / "p.npz")
+    back = PictureContent.load(tmp_path / "p.npz").scene.actors
     assert back[0].mesh.vertices is back[2].mesh.vertices
     assert [actor.name for actor in back] == ["car (a.1)", "Person (p)", "car (a.1)"]
     assert back[2].trajectory.presence_ns == pytest.approx((3e9, 4e9))

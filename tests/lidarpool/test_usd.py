@@ -1,4 +1,6 @@
-"""OpenUSD scenes: what is shown is read, and nothing vanishes in silence."""
+"""OpenUSD scenes: what is shown is read, in its colours, and nothing vanishes in silence."""
+
+from __future__ import annotations
 
 import subprocess
 import sys
@@ -9,19 +11,23 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
+from lidarpool import Pose, Scanner, Scene, Sensor
 from lidarpool.base import allowance
 from lidarpool.base.errors import LidarpoolError
+from lidarpool.columns.table import COLOURS
 from lidarpool.scenario.advice import advice
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene import nodes, usd
-from lidarpool.scene.instances import Instance
-from lidarpool.scene.meshfile import load_meshes
-from lidarpool.scene.scene import Scene
+from lidarpool.scene.colours import LINEAR, as_srgb
+from lidarpool.scene.files import scene_graph as nodes
+from lidarpool.scene.files import usd
+from lidarpool.scene.files.meshfile import load_meshes
+from lidarpool.scene.scene_instances import SceneInstance
 from lidarpool.scene.transform import Transform
 
-with_library = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
+pytestmark = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
 
 METRES = 'metersPerUnit = 1\nupAxis = "Z"'
 QUAD = """
@@ -53,13 +59,6 @@ def bounds(objects):
     return Scene.from_meshes(objects).bounds
 
 
-def test_without_the_library_the_error_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setattr(usd, "find_spec", lambda name: None)
-    with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[usd\]"\.$'):
-        load_meshes(write(tmp_path / "m.usda", prim("Quad")))
-
-
-@with_library
 def test_polygons_places_and_names(tmp_path):
     text = QUAD.replace("[4]", "[5, 3, 3]").replace(
         "[0, 1, 2, 3]", "[0, 1, 2, 3, 4, 0, 1, 2, 0, 1, 3]"
@@ -73,7 +72,6 @@ def test_polygons_places_and_names(tmp_path):
     np.testing.assert_allclose(objects[0].bounds, [[1, 0, 5], [3, 3, 5]])
 
 
-@with_library
 @pytest.mark.parametrize(
     ("stage", "options", "size", "words"),
     [
@@ -89,7 +87,6 @@ def test_unit_and_axis(tmp_path, stage, options, size, words):
     assert len(lines) == len(words) and all(map(str.__contains__, lines, words))
 
 
-@with_library
 def test_basic_shapes_have_their_sizes(tmp_path):
     round_ = 'double radius = 1\ndouble height = 4\nuniform token axis = "X"'
     prims = [
@@ -115,7 +112,6 @@ def test_basic_shapes_have_their_sizes(tmp_path):
     assert lines == []
 
 
-@with_library
 def test_what_is_not_shown_is_left_out_and_counted(tmp_path):
     hidden = prim("Hidden", "Xform", 'token visibility = "invisible"\n' + prim("Quad"))
     guide = prim("Guide", "Xform", 'uniform token purpose = "guide"\n' + prim("Quad") + prim(
@@ -155,7 +151,6 @@ def vertices(path, seconds, **options):
     return {one.name: one.placed(seconds * 1e9).vertices + scene.origin for one in scene.actors}
 
 
-@with_library
 def test_moving_prims_are_actors(tmp_path):
     quad = np.array([(0, 0, 0), (2, 0, 0), (2, 3, 0), (0, 3, 0)])
     wheel = prim(
@@ -195,16 +190,6 @@ def turned_about_z(points, degrees):
     return points @ [[c, s, 0], [-s, c, 0], [0, 0, 1]]
 
 
-@with_library
-def test_up_axes_turn_paths_too(tmp_path):
-    lift = prim("Lift", text=QUAD + DRIVE.replace(", 0, 0)", ", 5, 0)"))
-    stage = STAGE.replace('"Z"', '"Y"')
-    path = write(tmp_path / "m.usda", prim("Ground"), lift, stage=stage)
-    points = vertices(path, 0)["Lift"]
-    np.testing.assert_allclose(points, [(1, 0, 5), (3, 0, 5), (3, 0, 8), (1, 0, 8)], atol=1e-9)
-
-
-@with_library
 def test_what_moves_in_instances_moves_in_each(tmp_path):
     write(tmp_path / "car.usda", prim("Top", "Xform", prim("Car", text=QUAD + DRIVE)),
           stage=STAGE + '\ndefaultPrim = "Top"')  # fmt: skip
@@ -215,7 +200,6 @@ def test_what_moves_in_instances_moves_in_each(tmp_path):
     assert low == [[5, 0, 0], [5, 10, 0]] and len(scene.names) == 1
 
 
-@with_library
 def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
     grows = sampled("scale", t2="(1, 1, 1)", t6="(2, 1, 1)") + order("scale")
     camera = prim("Rig", "Xform", DRIVE + prim("Camera", "Camera", ""))
@@ -238,7 +222,6 @@ def test_what_moves_otherwise_stands_and_is_noted(tmp_path):
         Scene.load(path, transform=uneven)
 
 
-@with_library
 def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
     scenes = tmp_path / "scenes"
     scenes.mkdir()
@@ -262,20 +245,6 @@ def test_files_elsewhere_are_read_if_their_folder_is_named(tmp_path):
         names(assets="assets")
 
 
-@with_library
-def test_prims_of_one_name_are_named_by_what_they_are_in(tmp_path):
-    def piece(name, *meshes):
-        return prim(name, "Xform", prim("Geom", "Xform", "".join(map(prim, meshes))))
-
-    kinds = "".join(piece(name, "Render") for name in ("King", "Queen"))
-    sets = [prim(side, "Xform", kinds) for side in ("Black", "White")]
-    path = write(tmp_path / "m.usda", *sets, piece("Board", "Render", "Frame"), prim("Table"))
-    assert Scene.load(path).names == (
-        "King", "Queen", "King.2", "Queen.2", "Board/Render", "Frame", "Table"
-    )  # fmt: skip
-
-
-@with_library
 def test_skeletons_bend_their_meshes_but_in_instances(tmp_path):
     still, raised = "((1,0,0,0), (0,1,0,0), (0,0,1,0), (0,0,{},1))".format, "5"
     bones = f"""uniform token[] joints = ["a"]
@@ -316,7 +285,6 @@ def copied(count, extra=""):
     return prim("Forest", "PointInstancer", text + kinds + MOVED.format((0, 0, 100)))
 
 
-@with_library
 def test_instancers_place_their_prototypes_only(tmp_path):
     path = write(tmp_path / "m.usda", copied(4, "int64[] invisibleIds = [3]"))
     objects, lines = told(path)
@@ -324,7 +292,6 @@ def test_instancers_place_their_prototypes_only(tmp_path):
     np.testing.assert_allclose(bounds(objects), [[0, 0, 100], [22, 3, 101]])
 
 
-@with_library
 def test_prims_alike_share_one_mesh(tmp_path, monkeypatch):
     monkeypatch.setattr(nodes, "SHARED_TRIANGLES", 1)
     write(
@@ -344,13 +311,12 @@ def test_prims_alike_share_one_mesh(tmp_path, monkeypatch):
         prim("Alone", "Xform", MOVED.format((50, 0, 0)), tree.format("false")),
     )
     objects, _ = told(path)
-    assert all(isinstance(one, Instance) for one in objects) and len(objects) == 7
+    assert all(isinstance(one, SceneInstance) for one in objects) and len(objects) == 7
     assert len({one.mesh for one in objects}) == 1
     found = sorted(one.matrix[:2, 3].tolist() for one in objects)
     assert found == [[0, 0], [0, 1], [0, 2], [1, 0], [1, 1], [1, 2], [50, 0]]
 
 
-@with_library
 def test_packed_scenes_are_read(tmp_path):
     inner = write(tmp_path / "in.usda", prim("Quad"))
     main = write(tmp_path / "main.usda", prim("A", "", "", "references = @./in.usda@</Quad>"))
@@ -371,7 +337,6 @@ def test_packed_scenes_are_read(tmp_path):
     assert len(objects[0].faces) == 2 and not lines
 
 
-@with_library
 def test_missing_and_foreign_files_are_named(tmp_path):
     folder = tmp_path / "scene"
     folder.mkdir()
@@ -405,7 +370,6 @@ def test_missing_and_foreign_files_are_named(tmp_path):
         )
 
 
-@with_library
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -431,7 +395,6 @@ def test_bad_files_are_refused_in_a_line(tmp_path, capfd, text, message):
     assert capfd.readouterr() == ("", "")
 
 
-@with_library
 def test_few_lines_do_not_make_millions_of_objects(tmp_path):
     count = nodes.MOST_NODES + 1
     text = f"int[] protoIndices = [{'0,' * count}]\nrel prototypes = </F/K>\n" + prim("K")
@@ -448,7 +411,6 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
         load_meshes(write(tmp_path / "m.usda", levels))
 
 
-@with_library
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
 def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkeypatch):
     monkeypatch.setattr(usd, "_BASE", 0)
@@ -469,7 +431,6 @@ def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkey
         )
 
 
-@with_library
 @settings(
     max_examples=8, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
@@ -495,3 +456,209 @@ def test_garbled_files_give_errors_or_meshes(tmp_path, changes):
         assert load_meshes(binary)
     except LidarpoolError as error:
         assert str(error).count("\n") < 2
+
+
+SENSOR = Sensor.grid(rays_per_revolution=4, layers=1, vertical_fov_deg=10, step_deg=90)
+# Four places on the quad: lower left, lower right, upper left, upper right.
+SPOTS = [(0.5, 0.75), (1.5, 0.75), (0.5, 2.25), (1.5, 2.25)]
+RED, GREEN, BLUE, DARK, GREY = [200, 0, 0], [0, 200, 0], [0, 0, 200], [90, 90, 90], [188] * 3
+PIXELS = np.array([[[*RED, 255], [*GREEN, 0]], [[*BLUE, 255], [*DARK, 0]]], np.uint8)
+PICTURE = [BLUE, DARK, RED, GREEN]  # at the spots
+
+BIND = 'prepend apiSchemas = ["MaterialBindingAPI"]'
+ST = """texCoord2f[] primvars:st = [(0, 0), (1, 0), (1, 1), (0, 1)] (interpolation = "vertex")
+rel material:binding = </M>
+"""
+IMAGE = "color3f inputs:diffuseColor.connect = </M/T.outputs:rgb>\n"
+HOLES = "float inputs:opacity.connect = </M/T.outputs:a>\nfloat inputs:opacityThreshold = 0.5\n"
+
+
+def material(inputs, image="", place="", name="M", kind="UsdPreviewSurface"):
+    """A material whose texture T has coordinates from P, or from X, which takes them from P."""
+    shaders = f"""
+    token outputs:surface.connect = </{name}/S.outputs:surface>
+    def Shader "S" {{
+        uniform token info:id = "{kind}"
+        token outputs:surface
+        {inputs}
+    }}
+    def Shader "T" {{
+        uniform token info:id = "UsdUVTexture"
+        asset inputs:file = @./picture.png@
+        float2 inputs:st.connect = </M/{"X" if place else "P"}.outputs:result>
+        {image}
+        float3 outputs:rgb
+        float outputs:a
+    }}
+    def Shader "P" {{
+        uniform token info:id = "UsdPrimvarReader_float2"
+        string inputs:varname = "st"
+        float2 outputs:result
+    }}
+    def Shader "X" {{
+        uniform token info:id = "UsdTransform2d"
+        float2 inputs:in.connect = </M/P.outputs:result>
+        {place}
+        float2 outputs:result
+    }}
+    """
+    return prim(name, "Material", shaders)
+
+
+def seen(path, **options):
+    """Colours below the spots, None where light passes; and notes."""
+    objects, lines = told(path, colours=True, up_axis="z", **options)
+    scanner = Scanner(Scene.from_meshes(objects), SENSOR, columns=list(COLOURS), backend="numpy")
+    found = []
+    for x, y in SPOTS:
+        cloud = scanner.sweep(Pose((x, y, 5), pitch_deg=90))
+        colour = np.stack([cloud[name] for name in COLOURS], axis=1).tolist()
+        found.append(colour[0] if colour else None)
+    return found, lines
+
+
+@pytest.fixture
+def folder(tmp_path):
+    Image.fromarray(PIXELS).save(tmp_path / "picture.png")
+    return tmp_path
+
+
+def shifted(light):
+    return as_srgb(np.clip(light, 0, 1)).tolist()
+
+
+@pytest.mark.parametrize(
+    ("image", "place", "expected"),
+    [
+        ("", "", PICTURE),
+        # Half the image to the right: what is beyond repeats, is black, or goes on.
+        ('token inputs:wrapS = "repeat"', "float2 inputs:translation = (0.5, 0)",
+         [DARK, BLUE, GREEN, RED]),
+        ("", "float2 inputs:translation = (0.5, 0)", [DARK, [0] * 3, GREEN, [0] * 3]),
+        ('token inputs:wrapS = "clamp"', "float2 inputs:translation = (0.5, 0)",
+         [DARK, DARK, GREEN, GREEN]),
+        ('token inputs:wrapS = "mirror"', "float2 inputs:translation = (1, 0)",
+         [DARK, BLUE, GREEN, RED]),
+        ('token inputs:wrapS = "repeat"\ntoken inputs:wrapT = "repeat"',
+         "float inputs:rotation = 90", [DARK, GREEN, BLUE, RED]),
+        ('token inputs:sourceColorSpace = "raw"', "",
+         [shifted(np.array(c) / 255) for c in PICTURE]),
+        ("float4 inputs:scale = (0.5, 1, 1, 1)\nfloat4 inputs:bias = (0, 0.1, 0, 0)", "",
+         [shifted(LINEAR[c] * [0.5, 1, 1] + [0, 0.1, 0]) for c in PICTURE]),
+    ],
+)  # fmt: skip
+def test_images_are_where_texture_coordinates_put_them(folder, image, place, expected):
+    path = write(folder / "m.usda", material(IMAGE, image, place), prim("Q", text=QUAD + ST))
+    assert seen(path) == (expected, [])
+
+
+def test_masks_let_light_pass(folder):
+    quad = prim("Q", text=QUAD + ST, meta=BIND)
+    path = write(folder / "m.usda", material(IMAGE + HOLES), quad)
+    assert seen(path) == ([BLUE, None, RED, None], [])
+    assert seen(path, opacity="ignore")[0] == PICTURE
+    assert Scene.load(path).masked == ("Q",)  # also where no colours are asked for
+    assert not Scene.load(path, opacity="ignore").instances
+    glass = write(folder / "m.usda", material("float inputs:opacity = 0.2"), quad)
+    assert "without holes, taken as solid: M;" in seen(glass)[1][0]
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ('= [(0.2, 0.4, 0.6)] (interpolation = "constant")', [(0.2, 0.4, 0.6)] * 4),
+        ('= [(1, 0, 0), (0, 0, 1)] (interpolation = "uniform")',
+         [(1, 0, 0), (1, 0, 0), (0, 0, 1), (0, 0, 1)]),
+        ('= [(0, 0, 0), (0.8, 0, 0)] (interpolation = "vertex")\n'
+         "int[] primvars:displayColor:indices = [0, 1, 1, 0, 1, 0]",
+         [(0.2, 0, 0), (0.6, 0, 0)] * 2),
+        (f"= [{'(0, 0, 0), ' * 5} (0.8, 0, 0), (0.8, 0, 0), (0, 0, 0)]"
+         '(interpolation = "faceVarying")', [(0, 0, 0)] * 2 + [(0.2, 0, 0), (0.6, 0, 0)]),
+    ],
+)  # fmt: skip
+def test_display_colours_are_linear_light(tmp_path, values, expected):
+    halves = QUAD.replace("[4]", "[4, 4]").replace("[0, 1, 2, 3]", "[0, 1, 4, 5, 5, 4, 2, 3]")
+    halves = halves.replace("(0, 3, 0)]", "(0, 3, 0), (2, 1.5, 0), (0, 1.5, 0)]")
+    quad = prim("Q", text=halves + f"color3f[] primvars:displayColor {values}\n")
+    found, lines = seen(write(tmp_path / "m.usda", quad))
+    np.testing.assert_allclose(found, [shifted(light) for light in expected], atol=1)
+    assert lines == []
+
+
+def test_materials_of_subsets_parents_collections_and_instances(folder):
+    plain = "color3f inputs:diffuseColor = (0, 1, 0)"
+    halves = QUAD.replace("[4]", "[3, 3]").replace("[0, 1, 2, 3]", "[0, 1, 2, 0, 2, 3]")
+    subset = prim(
+        "Part", "GeomSubset",
+        "uniform token elementType = \"face\"\nuniform token familyName = \"materialBind\"\n"
+        "int[] indices = [1]\nrel material:binding = </G>", BIND,
+    )  # fmt: skip
+    two = [material(IMAGE), material(plain, name="G")]
+    path = write(folder / "m.usda", *two, prim("Q", text=halves + ST + subset, meta=BIND))
+    lower, upper = seen(path)[0][1], seen(path)[0][2]
+    assert (lower, upper) == (DARK, [0, 255, 0])
+    world = f"rel material:binding = </G>\n{prim('Q')}"
+    assert seen(write(folder / "m.usda", *two, prim("W", "Xform", world, BIND)))[0][0] == upper
+    bound = (
+        'prepend apiSchemas = ["MaterialBindingAPI", "CollectionAPI:some"]\n) {\n'
+        "rel collection:some:includes = </W/Q>\n"
+        "rel material:binding:collection:some = [</W.collection:some>, </G>]\n"
+    )
+    text = f'def Xform "W" ({bound}{prim("Q")}}}\n'
+    assert seen(write(folder / "m.usda", *two, text))[0][0] == upper
+    # Instances share a mesh, and have the colours that are bound outside of them.
+    write(folder / "quad.usda", prim("A", "Xform", prim("Q")), stage=METRES + '\ndefaultPrim = "A"')
+    place = "double3 xformOp:translate = ({}, 0, 0)\nuniform token[] xformOpOrder = "
+    place += '["xformOp:translate"]\n'
+    meta = "references = @./quad.usda@\ninstanceable = true\n"
+    one = prim("I", "Xform", place.format(0) + "rel material:binding = </G>", meta + BIND)
+    other = prim("J", "Xform", place.format(9), meta)
+    objects, _ = told(write(folder / "m.usda", *two, one, other), colours=True)
+    colours = [one.colours and one.colours.images[0].ravel().tolist() for one in objects]
+    assert colours == [upper, None]
+
+
+def test_packed_images_and_shapes(folder):
+    sphere = prim(
+        "Ball", "Cube", "double size = 10\nrel material:binding = </M>", BIND
+    )  # its colour is even
+    red = material("color3f inputs:diffuseColor = (1, 0, 0)")
+    assert seen(write(folder / "ball.usda", red, sphere))[0] == [[255, 0, 0]] * 4
+    main = write(folder / "main.usda", material(IMAGE), prim("Q", text=QUAD + ST, meta=BIND))
+    path = folder / "m.usdz"
+    with zipfile.ZipFile(path, "w") as archive:
+        for file in (main, folder / "picture.png"):
+            info = zipfile.ZipInfo(file.name)  # content begins at multiples of 64 bytes
+            pad = -(archive.fp.tell() + 34 + len(file.name)) % 64
+            info.extra = b"\x99\x99" + pad.to_bytes(2, "little") + bytes(pad)
+            archive.writestr(info, file.read_bytes())
+    main.unlink(), (folder / "picture.png").unlink()
+    assert seen(path) == (PICTURE, [])
+
+
+@pytest.mark.parametrize(
+    ("inputs", "image", "kind", "colour", "why"),
+    [
+        (IMAGE, "asset inputs:file = @no.png@", "UsdPreviewSurface", GREY, "'no.png' is not there"),
+        (IMAGE, "asset inputs:file = @m.usda@", "UsdPreviewSurface", GREY, "is no PNG"),
+        (IMAGE, "asset inputs:file = @no.png@\nfloat4 inputs:fallback = (1, 0, 0, 1)",
+         "UsdPreviewSurface", [255, 0, 0], "is not there"),
+        (IMAGE, "asset inputs:file = @../out.png@", "UsdPreviewSurface", GREY,
+         "is not in the scene's folder, see assets in scene.files"),
+        (IMAGE, "asset inputs:file = @t.<UDIM>.png@", "UsdPreviewSurface", GREY, "several tiles"),
+        ("", "", "MyShader", GREY, "M (its shader is MyShader)"),
+        (IMAGE.replace("T.outputs:rgb", "X.outputs:result"), "", "UsdPreviewSurface", GREY,
+         "computed by UsdTransform2d"),
+    ],
+)  # fmt: skip
+def test_what_cannot_be_read_is_noted(folder, inputs, image, kind, colour, why):
+    Image.fromarray(PIXELS).save(folder.parent / "out.png")
+    text = material(inputs, image, kind=kind)
+    if image:
+        text = text.replace("asset inputs:file = @./picture.png@", "")
+    path = write(folder / "m.usda", text, prim("Q", text=QUAD + ST, meta=BIND))
+    found, lines = seen(path)
+    assert found == [colour] * 4 and len(lines) == 1 and why in lines[0]
+    assert told(path)[1] == []  # colours are not asked for
+    if "out.png" in image:
+        assert seen(path, assets=folder.parent) == (PICTURE, [])

@@ -3,60 +3,41 @@
 from __future__ import annotations
 
 import math
+from functools import partial
 
 import numpy as np
 import pytest
 import trimesh
-from tests.lidarpool.casting import Cart, cast_between, tally_of
+from tests import shapes
+from tests.shapes import CPU, Cart, ball, box, cast_between, tally_of
 
 from lidarpool import (
     Actor,
     Beams,
-    Instance,
     LidarpoolError,
     Material,
     Noise,
     Pose,
     Returns,
     Scene,
+    SceneInstance,
     Sensor,
     Spin,
     Survey,
     Track,
 )
-from lidarpool.scene.mesh import Mesh
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.leaves import NAMES, brightness, density, projection
-from lidarpool.simulator.media import depths
 from lidarpool.simulator.rig import Rig
-from raybeam import available_backends
 
-CPU = [name for name in ("numpy", "embree") if not available_backends()[name]]
 GROUND = Material("*", 0.3)
+cast = partial(shapes.cast, backend="embree")
 MANY = 60_000
-
-
-def box(name, low, high):
-    made = trimesh.creation.box(bounds=[low, high])
-    return Mesh(name, np.array(made.vertices), np.array(made.faces))
-
-
-def ball(name, radius, centre=(0, 0, 0), fineness=4):
-    made = trimesh.creation.icosphere(fineness, radius)
-    return Mesh(name, np.array(made.vertices) + centre, np.array(made.faces))
 
 
 def rays(count=MANY, nadir_deg=90.0, **options):
     """A sensor that fires once, so many rays into one direction of the xz plane."""
     return Sensor(Beams(np.full(count, math.radians(nadir_deg - 90))), Spin(1, 360), **options)
-
-
-def cast(meshes, sensor, at=(0, 0, 0), backend="embree", steps=1, **options):
-    """Points of one scan of some meshes, by column."""
-    options = {"columns": ("ray", "range", "intensity", "returns"), **options}
-    survey = Survey(sensor, poses=[at], steps=steps, **options)
-    rig = Rig(Scene.from_meshes(meshes), survey, backend)
-    (batch,) = rig.cast(0, steps)
-    return {c.name: c.make(batch) for c in survey.stored_columns} | {"batch": batch}
 
 
 def gap(found, rays=MANY, leaves=0):
@@ -93,14 +74,6 @@ def test_projections_of_known_leaves():
     assert projection(20.0, cosine[1:]) == pytest.approx(cosine[1:], rel=0.15), "nearly flat"
 
 
-def test_optical_depths_are_exponentially_distributed():
-    bits = np.arange(2**20, dtype=np.uint64) * np.uint64(2**44) + np.uint64(2**43)
-    found = np.sort(depths(bits))
-    share = 1 - (np.arange(len(found)) + 0.5) / len(found)
-    assert np.abs(np.exp(-found) - share).max() < 2e-5
-    assert found.mean() == pytest.approx(1, abs=1e-4)
-
-
 # -- Beer and Lambert ----------------------------------------------------------------------------
 
 
@@ -122,61 +95,6 @@ def test_gaps_of_a_canopy_are_those_of_its_leaf_area_index(leaf_angle, nadir_deg
     share = (1 - np.exp(-tau * depth)) / (1 - math.exp(-tau))
     off = np.abs(share - (np.arange(len(depth)) + 0.5) / len(depth)).max()
     assert off < 1.63 / math.sqrt(len(depth)), "99 % of Kolmogorov and Smirnov's test"
-
-
-def test_a_crown_lets_through_what_its_chords_do():
-    """Parallel light on a sphere: 2 (1 - (1 + τ) exp(-τ)) / τ², where τ is that of the middle."""
-    places = np.sqrt((np.arange(MANY) + 0.5) / MANY)
-    turn = np.pi * (1 + math.sqrt(5)) * np.arange(MANY)
-    origin = 2 * np.stack([np.zeros(MANY), places * np.cos(turn), places * np.sin(turn)], axis=1)
-    sensor = Sensor(Beams(np.zeros(MANY), origin=origin), Spin(1, 360))
-    crown = Material("Crown", leaf_area_density=1.2)
-    wall = box("Wall", (9, -9, -9), (10, 9, 9))
-    found = cast([ball("Crown", 2.0), wall], sensor, (-5, 0, 0), materials=[GROUND, crown])
-    tau = 0.5 * 1.2 * 4
-    assert gap(found) == pytest.approx(2 * (1 - (1 + tau) * math.exp(-tau)) / tau**2, rel=0.01)
-
-
-@pytest.mark.parametrize("backend", CPU)
-def test_a_sensor_within_a_crown(backend):
-    """From the middle of a sphere all rays go through its radius."""
-    sensor = Sensor(Beams(np.radians(np.linspace(-80, 80, 60))), Spin(2000, 360))
-    materials = [GROUND, Material("Crown", leaf_area_density=0.7)]
-    meshes = [ball("Crown", 3.0), ball("Sky", 30.0, fineness=2)]
-    found = cast(meshes, sensor, backend=backend, materials=materials)
-    assert len(found["range"]) == 120_000
-    assert gap(found, 120_000) == pytest.approx(math.exp(-0.35 * 3), rel=0.015)
-    near = Sensor(sensor.beams, sensor.head, min_range_m=2.0, max_range_m=2.5)
-    beyond = cast(meshes, near, backend=backend, materials=materials)
-    assert 2 <= beyond["range"].min() <= beyond["range"].max() <= 2.5
-    assert len(beyond["range"]) / 120_000 == pytest.approx(1 - math.exp(-0.35 * 0.5), rel=0.02)
-
-
-def test_crowns_that_overlap_and_the_trunk_in_them():
-    """Where two media overlap, their leaves add up; a trunk ends light as anywhere."""
-    meshes = [
-        box("Oak", (5, -9, -9), (9, 9, 9)),
-        box("Ivy", (7, -8, -8), (11, 8, 8)),
-        box("Trunk", (8, -2, -2), (8.5, 2, 0)),
-        box("Wall", (20, -9, -9), (21, 9, 9)),
-    ]
-    leaves = [Material("Oak", leaf_area_density=0.2), Material("Ivy", leaf_area_density=0.6)]
-    up, down = (rays(nadir_deg=90 + tilt) for tilt in (3, -1))
-    found = cast(meshes, up, materials=[GROUND, *leaves])
-    slant = 1 / math.cos(math.radians(3))
-    oak, both, ivy = (np.array([0.1, 0.4, 0.3]) * [2, 2, 2]) * slant
-    stops = [
-        1 - math.exp(-oak) + math.exp(-oak) * 0.25 * (1 - math.exp(-both)),
-        math.exp(-oak) * 0.75 * (1 - math.exp(-both))
-        + math.exp(-oak - both) * (1 - math.exp(-ivy)),
-    ]
-    for number, stop in enumerate(stops):
-        assert (found["object"] == number).mean() == pytest.approx(stop, rel=0.015)
-    assert gap(found) - stops[1] == pytest.approx(math.exp(-oak - both - ivy), rel=0.02)
-    found = cast(meshes, down, materials=[GROUND, *leaves])
-    assert {*found["object"].tolist()} == {0, 1, 2}
-    slant = 1 / math.cos(math.radians(1))
-    assert (found["object"] == 2).mean() == pytest.approx(math.exp(-0.6 * slant), rel=0.01)
 
 
 def test_leaves_are_as_bright_as_they_face_the_light():
@@ -202,16 +120,16 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
     """Instances, mirrored ones too, and actors; and meshes whose triangles wind inwards."""
     crown, wall = ball("Crown", 1.0), box("Wall", (9, -9, -9), (10, 9, 9))
     materials = [GROUND, Material("Crown", leaf_area_density=0.8)]
-    inwards = Mesh("Crown", crown.vertices * 2 + (4, 0, 0), crown.faces[:, ::-1])
+    inwards = SceneMesh("Crown", crown.vertices * 2 + (4, 0, 0), crown.faces[:, ::-1])
     mirrored = np.diag([2.0, -2, 2, 1])
     mirrored[0, 3] = 4
-    for meshes in ([inwards, wall], [Instance(crown, mirrored), wall]):
+    for meshes in ([inwards, wall], [SceneInstance(crown, mirrored), wall]):
         found = cast(meshes, rays(), materials=materials)
         number = Scene.from_meshes(meshes).all_names.index("Crown")
         assert gap(found, leaves=number) == pytest.approx(math.exp(-0.4 * 4), rel=0.015)
     way = Track([0.0, 10.0], [(4, 0, 0), (4, 0, 0)])
     scene = Scene.from_meshes([wall]).with_actors(
-        [Actor(Mesh("Crown", crown.vertices * 2, crown.faces), way)]
+        [Actor(SceneMesh("Crown", crown.vertices * 2, crown.faces), way)]
     )
     survey = Survey(rays(), poses=[(0, 0, 0)], steps=1, materials=materials)
     (batch,) = Rig(scene, survey, "embree").cast(0, 1)
@@ -220,7 +138,7 @@ def test_moved_and_turned_crowns_hold_the_same_leaves():
 
 def test_a_surface_with_gaps_is_refused():
     open_box = box("Crown", (1, -1, -1), (2, 1, 1))
-    gappy = Mesh("Crown", open_box.vertices, open_box.faces[1:])
+    gappy = SceneMesh("Crown", open_box.vertices, open_box.faces[1:])
     with pytest.raises(LidarpoolError, match="'Crown' has a leaf_area_density, but its surface"):
         cast([gappy], rays(1), materials=[Material("*", leaf_area_density=1.0)])
 
@@ -285,17 +203,6 @@ def test_batches_chunks_and_backends_leave_no_trace(path, monkeypatch):
     assert tally_of([*rig.cast(0, 24)]).sum() > 0
 
 
-def test_another_seed_is_another_tree():
-    materials = [GROUND, Material("Crown", leaf_area_density=0.8)]
-    meshes = [ball("Crown", 2.0, (4, 0, 0)), box("Wall", (9, -9, -9), (10, 9, 9))]
-    one, same, other = (
-        cast(meshes, rays(500), materials=materials, noise=Noise(seed=seed))["range"]
-        for seed in (1, 1, 2)
-    )
-    assert np.array_equal(one, same)
-    assert not np.array_equal(one[:100], other[:100])
-
-
 @pytest.mark.parametrize("backend", CPU)
 @pytest.mark.parametrize("order", [1, -1])
 def test_layers_that_touch_each_other(backend, order):
@@ -323,7 +230,7 @@ def test_a_wood_of_crowns_that_overlap_anyhow():
     for number in range(24):
         centre, radii = rng.uniform(-5, 5, 3), rng.uniform(0.8, 3, 3)
         inwards = np.array(unit.faces)[:, :: -1 if number % 4 == 0 else 1]
-        meshes.append(Mesh(f"C{number}", np.array(unit.vertices) * radii + centre, inwards))
+        meshes.append(SceneMesh(f"C{number}", np.array(unit.vertices) * radii + centre, inwards))
         thick, kind = float(rng.uniform(0.05, 0.4)), kinds[number % 3]
         materials.append(Material(f"C{number}", leaf_area_density=thick, leaf_angle=kind))
         crowns.append((centre, radii, thick, kind))

@@ -1,22 +1,31 @@
+"""Pictures of a survey: scene, hits, cloud and path."""
+
+from __future__ import annotations
+
 import base64
 import io
 import re
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from lxml import html
 from matplotlib.figure import Figure
 from PIL import Image
+from tests.shapes import block, quad
 
 from lidarpool import Cloud, LidarpoolError
 from lidarpool.plan import Planning, best, run_trial
-from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene
-from lidarpool.render.shot import take_shot
+from lidarpool.render.hit_density import hit_density
+from lidarpool.render.pictures import draw_cloud, draw_hits, draw_scene, with_points
+from lidarpool.render.shot import GROUND, SKY, take_shot
+from lidarpool.render.stage import make_axis, nice_step
 from lidarpool.render.theme import object_colours
-from lidarpool.report.pictures import draw_path
+from lidarpool.report.result_pictures import draw_path
 from lidarpool.scene.actors import box
-from lidarpool.scene.mesh import Mesh
 from lidarpool.scene.scene import Scene
+from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 
 SIZE = (320, 200)
@@ -72,19 +81,9 @@ def test_hits_colour_what_was_hit_and_only_that(pixels, scene):
     assert colourful(plot[:, int(right) + 20 :]) == 0, "the five other objects stay grey"
 
 
-def test_shares_of_hits_are_counted_whole(scene):
-    """Counts of instances are shared among their triangles, so their sum may be just below."""
-    shot = take_shot(scene, [], size=SIZE, backend="numpy")
-    hits = np.zeros(len(scene.faces))
-    hits[:3] = 1 / 3 - 1e-12
-    texts = [text.get_text() for text in draw_hits(shot, hits, NOWHERE, NONE).figure.texts]
-    assert any(text.startswith("1 hit ") for text in texts)
-
-
 def test_hits_on_a_wall_of_two_triangles_are_told_apart(pixels):
     """A floor of 8 by 4 metres, with hits on its left half alone: no diagonal between colours."""
-    corners = np.array([[0, 0, 0], [8, 0, 0], [8, 4, 0], [0, 4, 0]], float)
-    scene = Scene.from_meshes([Mesh("Floor", corners, np.array([[0, 1, 2], [0, 2, 3]]))])
+    scene = Scene.from_meshes([quad("Floor", (0, 0, 0), (8, 0, 0), (8, 4, 0), (0, 4, 0))])
     shot = take_shot(scene, [], size=SIZE, backend="numpy")
     points = np.random.default_rng(0).uniform((0, 0, 0), (4, 4, 0), (2000, 3))
     image = pixels(draw_hits, shot, np.array([1000, 3000]), points, NONE)
@@ -159,7 +158,7 @@ def test_cloud_points_have_the_colour_of_their_height(pixels, scene, shot):
     ],
 )
 def test_any_scene_and_poses_can_be_drawn(pixels, corners, poses):
-    scene = Scene.from_meshes([Mesh("T", np.array(corners, float), np.array([[0, 1, 2]]))])
+    scene = Scene.from_meshes([SceneMesh("T", np.array(corners, float), np.array([[0, 1, 2]]))])
     shot = take_shot(scene, poses, size=SIZE, backend="numpy")
     assert colourful(pixels(draw_scene, shot, 9)) > 100
     assert colourful(pixels(draw_hits, shot, np.array([7]), scene.vertices, NONE)) > 100
@@ -173,33 +172,9 @@ def solid(k):
     return vertices + place, np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
 
 
-def test_many_objects_fit_the_legend():
-    meshes = [Mesh(f"site_{k}_object_with_a_long_name", *solid(k)) for k in range(60)]
-    shot = take_shot(Scene.from_meshes(meshes), [], size=SIZE, backend="numpy")
-    (legend,) = draw_scene(shot, 9).figure.legends
-    names = [text.get_text() for text in legend.get_texts()]
-    assert len(names) == 32 and names[-1] == "and 30 more"
-    assert max(map(len, names)) <= 18
-
-
-def test_copies_share_a_row_of_the_legend_and_a_colour():
-    """But actors have one each."""
-    names = ["Hall", *["Crate"] * 57, "Crate", "Van"]
-    meshes = [Mesh(name, *solid(k)) for k, name in enumerate(names)]
-    shot = take_shot(Scene.from_meshes(meshes), [], actors=2, size=SIZE, backend="numpy")
-    (legend,) = draw_scene(shot, 9).figure.legends
-    rows = [text.get_text() for text in legend.get_texts()]
-    assert rows == ["Crate.58", "Van", "Hall", "Crate (57)", "Sensor"]
-    houses = [f"House {k}" for k in range(50)]
-    meshes = [Mesh(name, *solid(k)) for k, name in enumerate([*houses, *["Oak"] * 9, "Van"])]
-    shot = take_shot(Scene.from_meshes(meshes), [], actors=1, size=SIZE, backend="numpy")
-    rows = [text.get_text() for text in draw_scene(shot, 9).figure.legends[0].get_texts()]
-    assert rows[:3] == ["Van", "Oak (9)", "House 0"] and rows[-1] == "and 22 more"
-
-
 @pytest.mark.parametrize("name", ["$\\frac{x$", "_hidden", "a\x1b]0;b\x07\nc", "\u202egnp", " "])
 def test_names_from_files_are_words_and_nothing_else(name):
-    scene = Scene.from_meshes([Mesh(name, *solid(0)), Mesh("plain", *solid(1))])
+    scene = Scene.from_meshes([SceneMesh(name, *solid(0)), SceneMesh("plain", *solid(1))])
     page = draw_scene(take_shot(scene, [], size=SIZE, backend="numpy"), 9)
     assert html.fromstring(page.svg()).tag == "svg"
     first, second, _ = (text.get_text() for text in page.figure.legends[0].get_texts())
@@ -239,3 +214,160 @@ def test_a_picture_that_cannot_be_written_is_named(tmp_path, shot, monkeypatch):
     monkeypatch.setattr(Figure, "savefig", full_disk)
     with pytest.raises(LidarpoolError, match=r"scene\.png.*No space left"):
         draw_scene(shot, 9).save(tmp_path / "scene.png")
+
+
+def sheet(n):
+    """A square of n x n cells, one metre wide."""
+    x, y = np.meshgrid(np.linspace(0, 1, n + 1), np.linspace(0, 1, n + 1))
+    vertices = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    number = np.arange(x.size).reshape(n + 1, n + 1)
+    a, b, c, d = (
+        q.ravel() for q in (number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1])
+    )
+    faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([a, c, d], axis=1)])
+    return Scene.from_meshes([SceneMesh("Sheet", vertices, faces)])
+
+
+SHEET = sheet(6)
+AREA = 1 / len(SHEET.faces)
+
+
+@given(st.lists(st.integers(0, 40), min_size=72, max_size=72))
+def test_sharing_hits_keeps_their_number(counts):
+    density = hit_density(SHEET, np.array(counts))
+    assert (density >= 0).all()
+    assert (density * AREA).sum() == pytest.approx(sum(counts))
+
+
+def test_many_hits_a_triangle_are_not_smeared():
+    hits = np.zeros(72)
+    hits[10] = 500
+    density = hit_density(SHEET, hits)
+    assert density[10] == pytest.approx(500 / AREA)
+    assert not density[np.arange(72) != 10].any()
+
+
+@given(
+    low=st.floats(-1e4, 1e4), width=st.floats(0.01, 1e4), origin=st.integers(-6_000_000, 6_000_000)
+)
+def test_labels_and_offset_give_the_world_coordinate(low, width, origin):
+    step = nice_step(width / 6)
+    one = make_axis("x", low, low + width, step, float(origin))
+    slack = 1e-2 * step
+    said = re.fullmatch(r"x(?: ([−+]) ([\d\u2009]+))? \(m\)", one.title)
+    offset = float((said[2] or "0").replace("\u2009", "")) * (-1 if said[1] == "+" else 1)
+    assert ((one.ticks >= low - slack) & (one.ticks <= low + width + slack)).all()
+    for tick, label in zip(one.ticks, one.labels, strict=True):
+        assert float(label.replace("−", "-")) + offset == pytest.approx(
+            tick + origin, abs=1e-5 + 1e-9 * abs(origin)
+        )
+        assert len(label) <= 8
+
+
+@pytest.fixture(scope="module")
+def row():
+    """A near, a middle and a far box, one behind the other along the camera's view."""
+    towards = np.array([np.cos(np.radians(-62)), np.sin(np.radians(-62)), 0.0])
+    return Scene.from_meshes(
+        [
+            block(name, (2, 2, 2), k * 2.2 * towards)
+            for name, k in (("near", 1), ("middle", 0), ("far", -1))
+        ]
+    )
+
+
+@pytest.fixture(scope="module")
+def row_shot(row):
+    return take_shot(row, [], size=SIZE, backend="numpy")
+
+
+def closest_hit(scene, eye, ray):
+    """Distance and triangle by the textbook: every triangle's plane, then three half-planes."""
+    best = (np.inf, -1)
+    for number, (a, b, c) in enumerate(scene.vertices[scene.faces]):
+        normal = np.cross(b - a, c - a)
+        if abs(normal @ ray) < 1e-12:
+            continue
+        t = normal @ (a - eye) / (normal @ ray)
+        p = eye + t * ray
+        inside = all(np.cross(q - o, p - o) @ normal >= -1e-9 for o, q in ((a, b), (b, c), (c, a)))
+        if t > 0 and inside and t < best[0]:
+            best = (t, number)
+    return best
+
+
+def test_each_pixel_shows_the_nearest_thing(row, row_shot):
+    camera, stage = row_shot.camera, row_shot.stage
+    rng = np.random.default_rng(3)
+    columns, rows = rng.integers(0, SIZE[0], 150), rng.integers(0, SIZE[1], 150)
+    kinds = set()
+    for column, line in zip(columns, rows, strict=True):
+        ray = camera.rays([[column + 0.5, line + 0.5]])[0]
+        distance, triangle = closest_hit(row, camera.eye, ray)
+        flat = (stage.level - camera.eye[2]) / ray[2]
+        place = camera.eye[:2] + flat * ray[:2]
+        if flat < distance and ((place > stage.ground[0]) & (place < stage.ground[1])).all():
+            distance, triangle = flat, GROUND
+        kinds.add(row.face_object[triangle] if triangle >= 0 else int(triangle))
+        assert row_shot.depth[line, column] == pytest.approx(distance, rel=1e-5)
+    assert kinds == {0, 1, 2, GROUND, SKY}
+
+
+def test_points_behind_a_box_are_hidden_and_before_it_seen(row, row_shot):
+    near = row.object_bounds[0].mean(axis=0)
+    back = -row_shot.camera.axes[2]
+    _, seen = row_shot.visible(np.stack([near + 3 * back, near - 3 * back, near]))
+    assert seen.tolist() == [True, False, False]
+
+
+def drawn(row_shot, points):
+    """Whether points, each by itself, leave something in the picture."""
+    blank = np.ones((*SIZE[::-1], 4), np.float32)
+    return np.array(
+        [(with_points(blank, row_shot, p[None], np.zeros((1, 3))) < 1).any() for p in points]
+    )
+
+
+def room():
+    """A closed hall with thick walls and a roof, a crate and a lamp in it."""
+    shell = [
+        block("Hall outside", (12, 20, 4), (0, 0, 2)),
+        block("Hall inside", (11.4, 19.4, 3.4), (0, 0, 2)),
+    ]
+    return [*shell, block("Crate", (1.5, 1.5, 1.5), (2, -4, 1.05))]
+
+
+def test_triangles_that_share_no_vertices_do_not_come_apart():
+    """A block as .stl files have it, turned inside out: no ray of the camera gets into it."""
+    made = block("Block", (12, 20, 4), (0, 0, 2))
+    whole = SceneMesh("Block", made.vertices, made.faces[:, ::-1])
+    corners = whole.vertices[whole.faces].reshape(-1, 3)
+    loose = SceneMesh("Block", corners, np.arange(len(corners)).reshape(-1, 3))
+    depths = [
+        take_shot(Scene.from_meshes([one]), [], size=SIZE, backend="numpy").depth
+        for one in (whole, loose)
+    ]
+    inside = np.isfinite(depths[0])
+    assert np.allclose(depths[0][inside], depths[1][inside], rtol=1e-4)
+
+
+def test_the_inside_of_a_closed_hall_is_shown():
+    scene = Scene.from_meshes(room())
+    poses = np.array([[0, 0.5, 1.5], [1, 6, 1.5]])
+    row_shot = take_shot(scene, poses, size=SIZE, backend="numpy")
+    _, seen = row_shot.visible(np.concatenate([poses, [[2, -4, 1.85], [-3, -5, 0.35]]]))
+    assert seen.all(), "sensors, the crate's top and the floor"
+    far_wall, near_wall = row_shot.camera.axes[2] * 5, -row_shot.camera.axes[2] * 5
+    wall = (
+        np.array([np.sign(far_wall[0]) * 5.69, 3.0, 1.5]),
+        np.array([np.sign(near_wall[0]) * 5.69, 3.0, 1.5]),
+    )
+    assert drawn(row_shot, np.array(wall)).tolist() == [True, False]
+
+
+def test_the_hall_stays_closed_where_the_sensor_is_outside():
+    scene = Scene.from_meshes(room())
+    row_shot = take_shot(scene, [[0, 30, 1.5]], size=SIZE, backend="numpy")
+    roof_seen = row_shot.visible([[0, 0, 4.0]])[1]
+    floor_seen = row_shot.visible([[-3, -5, 0.3]])[1]
+    assert roof_seen.all() and not floor_seen.any()

@@ -7,13 +7,14 @@ import pytest
 from lidarpool import LidarpoolError
 from lidarpool.run import watch
 from lidarpool.run.watch import Watch
-from poolpart import Whereabouts
+from poolpart import TaskLocations
 
 
 @pytest.fixture
 def look(monkeypatch):
     """Looks at workers, given as partition and status, so many seconds after the first look."""
-    monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 1000.0))
+    clock = SimpleNamespace(now=0.0)
+    monkeypatch.setattr(watch, "time", SimpleNamespace(monotonic=lambda: 1000.0 + clock.now))
     told: list[str] = []
     watching = Watch(None, ["GPU", "OTHER"], lasting=["LIDAR"], tell=told.append)
 
@@ -28,11 +29,13 @@ def look(monkeypatch):
             for number, (name, status) in enumerate(workers)
         }
         monkeypatch.setattr(watch, "worker_identities", lambda client: identities)
-        there = Whereabouts(coming=look.coming)
+        there = TaskLocations(coming=look.coming)
         monkeypatch.setattr(watch, "look_for_tasks", lambda client, name: there)
-        watching.look(1000.0 + seconds)
+        clock.now = seconds
+        watching.look()
 
     look.watching, look.told, look.coming = watching, told, 0
+    look(0)
     return look
 
 
@@ -50,15 +53,6 @@ def test_a_partition_may_be_empty_for_a_while(look):
         look(124, *ALL[1:])
 
 
-def test_jobs_in_the_queue_are_told_of_but_may_have_died(look):
-    look.coming = 2
-    look(50, *ALL[1:])
-    words = "waiting for workers of partition GPU, for another 10 s: 2 jobs in the queue"
-    assert look.told == [f"{words}, or starting"]
-    with pytest.raises(LidarpoolError, match="'GPU' has had no workers"):
-        look(62, *ALL[1:])
-
-
 def test_workers_that_are_paused_take_no_tasks(look):
     paused = [("GPU", "paused"), *ALL[1:]]
     look(59, *paused)
@@ -72,14 +66,6 @@ def test_one_that_is_not_paused_will_do_and_the_other_is_named_once(look):
     [note] = look.watching.notes
     assert look.told == [note]
     assert "paused worker w0 of partition GPU, whose memory limit is 150.00 MiB" in note
-
-
-def test_while_all_are_paused_it_says_what_to_do(look):
-    look(30, ("GPU", "paused"), *ALL[1:])
-    assert look.told[-1] == (
-        "waiting for paused workers of partition GPU, for another 30 s: give them a larger "
-        "--memory-limit"
-    )
 
 
 def test_what_runs_already_goes_on_where_workers_are_paused(look):

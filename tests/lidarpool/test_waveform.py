@@ -8,14 +8,23 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.lidarpool.casting import cast_between
-from tests.lidarpool.test_echoes import beam_along_x, cast, wall
+from tests.shapes import beam_along_x, cast, cast_between, quad, wall
 
-from lidarpool import Beams, LidarpoolError, Material, Noise, Returns, Scene, Sensor, Spin, Survey
+from lidarpool import (
+    Beams,
+    LidarpoolError,
+    Material,
+    Noise,
+    Returns,
+    Scene,
+    Sensor,
+    Spin,
+    Survey,
+    save_cloud,
+)
 from lidarpool.columns.table import AXES, CAUSES, SCAN
 from lidarpool.columns.waveforms import WAVEFORM
 from lidarpool.report.report import CountedCloud
-from lidarpool.scene.mesh import Mesh
 from lidarpool.sensor.optics import FWHM, LIGHT_M_NS, Optics
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.hits import Hits
@@ -67,37 +76,6 @@ def test_hits_close_together_are_one_echo_in_closed_form():
         assert width == pytest.approx([5 * math.sqrt(1 + share * 0.2**2)])
 
 
-def test_the_closed_form_goes_over_into_the_samples():
-    """Just below and just above the width of what is one echo in closed form."""
-    for decomposes in (False, True):
-        below, above = (np.concatenate(found(d, decomposes)) for d in (0.2499, 0.2501))
-        assert above == pytest.approx(below, rel=2e-3, abs=1e-3)
-
-
-@pytest.mark.parametrize("decomposes", [False, True])
-def test_any_batch_gives_the_same_bits(decomposes):
-    random = np.random.default_rng(1)
-    pulses, each = 200, 19
-    distance = 100 + np.sort(random.uniform(0, 1, (pulses, each)), axis=1) * 10
-    distance *= random.uniform(0.01, 1, (pulses, 1))
-    energy = random.uniform(0.1, 1, (pulses, each))
-    rays, receiver = np.arange(each), Digitizer(SIGMA_NS, 1.0, decomposes)
-
-    def made(some):
-        ray = (rays + each * np.arange(len(some))[:, None]).ravel()
-        surface = np.zeros(len(ray), np.int32)
-        hits = Hits(ray, distance[some].ravel(), surface, energy[some].ravel())
-        out = returns_in(hits, receiver, each)
-        assert np.bincount(out.ray, out.energy) == pytest.approx(energy[some].mean(axis=1), rel=0.3)
-        return out
-
-    whole = made(np.arange(pulses))
-    alone = [made(np.array([pulse])) for pulse in range(pulses)]
-    for name in ("distance", "energy", "width"):
-        joined = np.concatenate([getattr(one, name) for one in alone])
-        assert np.array_equal(getattr(whole, name), joined)
-
-
 # -- surfaces ------------------------------------------------------------------------------------
 
 
@@ -109,7 +87,7 @@ def tilted(degrees):
     corners = [
         middle + s * 30 * across + t * 30 * up for s, t in ((-1, -1), (1, -1), (1, 1), (-1, 1))
     ]
-    return Mesh("W", np.array(corners), np.array([[0, 1, 2], [0, 2, 3]]))
+    return quad("W", *corners)
 
 
 @pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
@@ -130,14 +108,6 @@ def test_a_slanted_wall_stretches_the_echo(waveform, degrees):
     energy = math.cos(math.radians(degrees)) / 4
     assert echo["intensity"] == pytest.approx([energy], rel=0.03)
     assert echo["amplitude"] == pytest.approx(echo["intensity"] * 5 / echo["pulse_width"], rel=1e-5)
-
-
-@pytest.mark.parametrize("waveform", ["peaks", "gaussian"])
-def test_a_road_that_the_beam_grazes_is_one_echo(waveform):
-    returns = Returns("all", subrays=19, divergence_mrad=20, pulse_ns=2, waveform=waveform)
-    echo = cast([tilted(85)], returns=returns, columns=COLUMNS)
-    assert len(echo["range"]) == 1
-    assert echo["pulse_width"] > 10
 
 
 @pytest.mark.parametrize(
@@ -257,16 +227,6 @@ def test_a_recorded_waveform_is_the_sum_of_the_echoes():
     assert waves.samples[0] == pytest.approx(model, abs=step + 2e-3 * model.max())
 
 
-def test_returns_that_are_far_apart_have_windows_of_their_own():
-    meshes = [wall("Near", 20, y=(0, 50)), wall("Far", 60)]
-    returns = Returns("all", subrays=61, pulse_ns=5, divergence_mrad=1)
-    made = Survey(beam_along_x(), poses=[(0, 0, 0)], steps=1, returns=returns, waveform_samples=40)
-    waves = cloud_of(made, Scene.from_meshes(meshes)).waveforms
-    assert waves.times_ns[1, 0] - waves.times_ns[0, 0] == pytest.approx(40 * 2 / LIGHT_M_NS, abs=1)
-    peaks = waves.times_ns[[0, 1], waves.samples.argmax(axis=1)]
-    assert peaks == pytest.approx(waves.location_ns, abs=0.51)
-
-
 def test_recorded_noise_is_a_fifth_of_the_threshold():
     noise = Noise(detection_range_m=30)
     made = survey(noise=noise, waveform_samples=100)
@@ -324,7 +284,7 @@ def test_las_files_hold_waveforms_that_lead_to_the_points(tmp_path, ending):
     made = survey(waveform_samples=48, columns=columns, precision_m=1e-4)
     cloud = cloud_of(made)
     path = tmp_path / f"cloud.{ending}"
-    cloud.save(path, precision_m=1e-4)
+    save_cloud(cloud, path, precision_m=1e-4)
     las = laspy.read(path)
     data, start = read_packets(path)
     assert las.header.point_format.id == 10
@@ -375,7 +335,7 @@ def test_samples_that_are_no_whole_picoseconds_apart_are_refused():
 
 def test_other_formats_leave_waveforms_out(tmp_path):
     cloud = cloud_of(survey(waveform_samples=48))
-    cloud.save(tmp_path / "cloud.ply")
+    save_cloud(cloud, tmp_path / "cloud.ply")
     assert b"waveform" not in (tmp_path / "cloud.ply").read_bytes()[:2000]
     assert "waveform" not in cloud.to_dataframe().columns
     numbers = CountedCloud(cloud, objects=60)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 import uuid
 from collections import Counter
 from contextlib import ExitStack
@@ -10,10 +9,12 @@ from contextlib import ExitStack
 import pytest
 from distributed import Client, Nanny, Scheduler
 from distributed.comm import tcp
-from tests.clusters import QUIET, cluster_of
+from tests.clusters import QUIET, cluster_of, import_jobqueue
+from tests.daemons import wait_until
+from tests.poolpart.job_queue import Queue
 
 from poolpart import Partition, Pipe, Pool, local_cluster
-from poolpart.internals import FixedCluster
+from poolpart.internals.local_cluster import FixedCluster
 
 
 def thread_cluster(workers):
@@ -125,6 +126,17 @@ def own_nannies(patient):
 
 
 @pytest.fixture
+def queue(monkeypatch):
+    """A queue in place of Slurm's; partitions look often what has become of their jobs."""
+    jobs, queue = import_jobqueue().slurm.SLURMJob, Queue()
+    monkeypatch.setattr(jobs, "_submit_job", lambda job, path: queue.submit(job, path))
+    monkeypatch.setattr(jobs, "_close_job", lambda job, *what: queue.close(job, *what))
+    monkeypatch.setattr("poolpart.clusters._ADAPT_EVERY_S", 0.05)
+    monkeypatch.setattr("poolpart.clusters._LOOK_EVERY_S", 0.05)
+    return queue
+
+
+@pytest.fixture
 def make_pipe():
     """Make pipes with names of their own; those that a test leaves are deleted."""
     made = []
@@ -149,14 +161,6 @@ def received(monkeypatch):
 
     monkeypatch.setattr(tcp, "read_bytes_rw", count)
     return counts
-
-
-def wait_until(condition, timeout_s=120.0):
-    """Wait for something that happens by itself; fail the test when it does not."""
-    deadline = time.monotonic() + timeout_s
-    while not condition():
-        assert time.monotonic() < deadline, "what was waited for did not happen"
-        time.sleep(0.01)
 
 
 @pytest.fixture(name="wait_until")

@@ -4,87 +4,25 @@ The queue is made up, and its jobs are workers of this process; `tests/system/te
 real one.
 """
 
-from __future__ import annotations
-
-import asyncio
 import itertools
-import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from typing import Any
 
 import dask
 import pytest
-from distributed import Client, Event, Worker, get_client, secede, wait
+from distributed import Client, Event, get_client, secede, wait
 from tests.clusters import import_jobqueue
 from tests.poolpart.helpers import LONG_S, here, twice, wait_for
+from tests.poolpart.job_queue import SCHEDULER
 
 import poolpart.adapting
 import poolpart.clusters
 from poolpart import Partition, Pool, PoolError, n_workers, per_host, rest, start_partitions
 from poolpart.task_locations import look_for_tasks
 
-SCHEDULER = {"host": "127.0.0.1", "port": 0, "dashboard": False, "dashboard_address": "127.0.0.1:0"}
 IDLE_S = 0.2
-
-
-class Queue:
-    """A queue whose jobs begin at once, unless it is held."""
-
-    def __init__(self) -> None:
-        self.held = self.full = False
-        self.submitted: list[str] = []  # names of the jobs
-        self.waiting: dict[str, str] = {}  # {number: name of a job that has not begun}
-        self.workers: dict[str, list[Worker]] = {}  # {number: of a job that has begun}
-        self.cancelled: list[str] = []  # names of jobs that had not begun
-        self._numbers = map(str, itertools.count())
-        self._scripts: dict[str, str] = {}
-
-    async def submit(self, job: Any, path: str) -> str:
-        if self.full:
-            raise RuntimeError("the queue is full")
-        number, text = next(self._numbers), Path(path).read_text()
-        name = re.search(r"--name (\S+)", text)[1]
-        self.submitted.append(name)
-        self.waiting[number] = name
-        self._scripts[number] = text
-        self._scheduler = job._command_template.split("dask_worker ")[1].split()[0]
-        if not self.held:
-            await self.begin(number)
-        return f"Submitted batch job {number}"
-
-    async def begin(self, number: str) -> None:
-        """Let a job begin."""
-        name, text = self.waiting.pop(number), self._scripts[number]
-        partition, slots = re.search(r"--resources (\w+)=(\d+)", text).groups()
-        count = re.search(r"--nworkers (\d+)", text)
-        names = [f"{name}-{n}" for n in range(int(count[1]))] if count else [name]
-        options = {"nthreads": 2, "resources": {partition: int(slots)}, "dashboard": False}
-        self.workers[number] = [
-            await Worker(self._scheduler, name=one, host="127.0.0.1", **options) for one in names
-        ]
-
-    async def close(self, job: Any, number: str, command: str) -> None:
-        if number in self.waiting:
-            self.cancelled.append(self.waiting.pop(number))
-        for worker in self.workers.get(number, []):
-            await asyncio.sleep(0.05)  # for its own end, or it logs an error
-            await worker.close(timeout=1)  # a second call waits for the first
-        self.workers.pop(number, None)
-
-
-@pytest.fixture
-def queue(monkeypatch: pytest.MonkeyPatch) -> Queue:
-    jobs, queue = import_jobqueue().slurm.SLURMJob, Queue()
-    monkeypatch.setattr(jobs, "_submit_job", lambda job, path: queue.submit(job, path))
-    monkeypatch.setattr(
-        jobs, "_close_job", lambda job, number, command: queue.close(job, number, command)
-    )
-    monkeypatch.setattr(poolpart.clusters, "_ADAPT_EVERY_S", 0.05)
-    monkeypatch.setattr(poolpart.clusters, "_LOOK_EVERY_S", 0.05)
-    return queue
 
 
 @contextmanager
@@ -123,20 +61,6 @@ def test_jobs_are_of_the_partition_that_has_work_and_go_when_it_is_done(queue, w
         # Later ones have names of their own.
         assert gpu.submit(here).result(LONG_S) == "GPU-3"
         assert Pool.from_client(client).partitions().keys() == {"FIX", "GPU", "IO"}
-
-
-def test_no_more_jobs_than_tasks(queue, wait_until):
-    with cluster_of({"GPU": adaptive(0, 9)}) as client:
-        gpu = Partition("GPU", client)
-        for number in range(1, 4):
-            tasks = [gpu.submit(wait_for, f"go-{number}") for _ in range(2)]
-            wait_until(lambda: len(gpu) == 2)
-            time.sleep(3 * IDLE_S)
-            assert len(queue.submitted) == 2 * number
-            Event(f"go-{number}", client).set()
-            client.gather(tasks)
-            del tasks
-            wait_until(lambda: len(gpu) == 0)
 
 
 def test_the_minimum_stays_and_the_range_can_be_changed(queue, wait_until):
@@ -393,6 +317,9 @@ WRONG = {
     "a time": ({"adapt": [0, 1], "idle_s": "1m"}, "idle_s of partition 'GPU' is '1m'"),
     "a time alone": ({"idle_s": 60}, "idle_s without adapt"),
     "an option": ({"adapt": [0, 1], "mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
+    "another option": ({"mem": "1GB"}, "'GPU' cannot be started.*'mem'"),
+    "slots": ({"slots": 0}, "slots of partition 'GPU' is 0"),
+    "workers": ({"workers": "2"}, "workers of partition 'GPU' is '2'"),
 }
 
 

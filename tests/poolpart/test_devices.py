@@ -20,9 +20,6 @@ probe.visible_gpus = lambda: ("x", "y")
 """
 
 
-# -- the choice, without a cluster -----------------------------------------------------
-
-
 def scheduler_of(**partitions):
     """What the choice needs of a scheduler; the workers' partitions by address."""
     workers = {
@@ -70,9 +67,6 @@ def test_shared_evenly_whatever_the_order_of_the_lists_and_whoever_is_restarted(
     counts = [used[gpu] for gpu in names]
     assert sum(counts) == n
     assert max(counts) - min(counts) <= 1
-
-
-# -- on clusters -----------------------------------------------------------------------
 
 
 def test_without_a_driver_nobody_is_asked(start, monkeypatch):

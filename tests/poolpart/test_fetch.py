@@ -91,9 +91,6 @@ def test_a_worker_that_does_not_answer_keeps_only_its_own_results(nannies, wait_
     assert len(fetch_available(nannies, keys, LONG_S)) == 2
 
 
-# -- from a worker that is known -------------------------------------------------------
-
-
 def test_results_come_from_the_worker_that_has_them(client):
     part = Partition("A", client)
     one, two = (worker.address for worker in part.workers)
@@ -104,8 +101,6 @@ def test_results_come_from_the_worker_that_has_them(client):
     assert fetch_available(client, keys, LONG_S, at=two) == {elsewhere.key: 8}
     assert fetch_available(client, [], LONG_S, at=one) == {}
 
-
-# -- bytes that a long task leaves with its worker -------------------------------------
 
 SIZE = 8 * 2**20
 

@@ -32,22 +32,10 @@ def nested():
 
 def test_nothing_else_reaches_into_dask():
     inside = re.compile(rf"\.(_state|_worker|_cluster)\b|\b({INSIDE})\b")
-    for path in PACKAGE.glob("*.py"):
-        if path.name != "internals.py":
-            code = "".join(re.split(r'""".*?"""|#.*', path.read_text(), flags=re.DOTALL | re.M))
-            ours = re.compile("valid_workers_downscaling")
-            assert not inside.findall(ours.sub("", code)), path
-
-
-def test_the_tests_that_the_documentation_names_are_there():
-    root = Path(__file__).parents[2]
-    page = (root / "docs/pool-partitions.md").read_text(encoding="utf-8")
-    for file, name in set(re.findall(r"(test_\w+\.py)::(test_\w+)", page)):
-        sources = [path.read_text(encoding="utf-8") for path in root.glob(f"tests/*/{file}")]
-        assert any(f"def {name}(" in source for source in sources), (file, name)
-
-
-# -- another Dask ----------------------------------------------------------------------
+    for path in PACKAGE.glob("*.py"):  # those of `internals` are in a folder
+        code = "".join(re.split(r'""".*?"""|#.*', path.read_text(), flags=re.DOTALL | re.M))
+        ours = re.compile("valid_workers_downscaling")
+        assert not inside.findall(ours.sub("", code)), path
 
 
 def rename(monkeypatch, old, new, *methods):

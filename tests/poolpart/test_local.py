@@ -77,8 +77,7 @@ def test_no_dashboard_and_nothing_left_after_an_error(wait_until):
     with (
         pytest.raises(ZeroDivisionError),
         local_cluster(
-            {"GPU": (2, 1), "IO": (1, 3), "OTHER": (0, 1)},
-            dashboard_port=None,
+            {"GPU": (2, 1), "IO": (1, 3), "OTHER": (0, 1)}, dashboard_port=None
         ) as cluster,
         Client(cluster) as client,
     ):
@@ -143,7 +142,7 @@ def test_no_worker_outlives_a_driver_that_is_killed(driver, wait_until):
     assert not gone(pids)
     process.send_signal(signal.SIGKILL)
     process.wait()
-    wait_until(lambda: gone(pids), timeout_s=120)
+    wait_until(lambda: gone(pids))
 
 
 def test_a_script_needs_no_main_guard_and_what_it_defines_reaches_the_workers(tmp_path):

@@ -85,9 +85,6 @@ def test_while_the_only_worker_is_started_again(nannies):
     assert part.submit(twice, 2, slots=2).result(LONG_S) == 4
 
 
-# -- workers by name or address --------------------------------------------------------------
-
-
 def test_workers_by_name_address_or_both(start):
     client = start({"a": {}, "b": {}, "c": {}, "stranger": {}})
     part, _ = Pool.from_client(client).partition("A", workers=["a", "b", "c"])
@@ -110,9 +107,6 @@ def test_an_address_that_has_just_left_is_no_error(start, wait_until):
     future = part.submit(here, workers=address)
     wait_until(lambda: client.cluster.scheduler.unrunnable)
     assert future.status == "pending"
-
-
-# -- what it costs, and what is said -----------------------------------------------------------
 
 
 def test_many_tasks_take_few_requests(start, monkeypatch):

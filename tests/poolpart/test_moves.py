@@ -158,9 +158,6 @@ async def _send_all(send, messages):
     send(*messages)
 
 
-# -- what is refused -------------------------------------------------------------------
-
-
 def test_never_below_the_minimum(start):
     client = start({name: {} for name in "abcd"})
     rules = {"A": n_workers(2, minimum=2), "B": n_workers(1), "C": rest(minimum=1)}
@@ -202,9 +199,6 @@ def test_a_cluster_that_was_divided_when_it_was_started(start):
     assert Pool.from_client(client).dissolve() == ["A", "B"]
     assert declared(client) == {"a": {"A": 1}, "b": {"B": 2}, "c": {"B": 2}}
     assert set(client.cluster.scheduler.plugins) == plugins
-
-
-# -- whoever dies in between -----------------------------------------------------------
 
 
 def test_a_worker_that_is_killed_while_it_moves(nannies, wait_until, monkeypatch):

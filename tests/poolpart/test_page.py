@@ -44,10 +44,7 @@ def broken():
 def client(request):
     workers = {NASTY: {"resources": {"A": 2}}, "plain": {"nthreads": 2}}
     options = {"dashboard": request.param}
-    with (
-        cluster_of(workers, options, host="127.0.0.1") as cluster,
-        Client(cluster) as client,
-    ):
+    with cluster_of(workers, options, host="127.0.0.1") as cluster, Client(cluster) as client:
         yield client
 
 

@@ -49,9 +49,6 @@ def test_higher_priority_runs_first(b, client, wait_until):
     assert max(future.result() for future in high) < min(future.result() for future in low)
 
 
-# -- from inside tasks, again, and by clients that cannot ------------------------------
-
-
 def submit_to(part, number):
     secede()
     return part.submit(here).result(), sum(part.map(twice, range(number)))
@@ -84,22 +81,6 @@ def test_items_that_fail_are_tried_again(a, chunk):
     assert list(a.map(call, range(12), retries=2, chunk=chunk)) == list(range(12))
 
 
-def refuse_three(item):
-    if item == 3:
-        raise ValueError("three")
-    return item
-
-
-def test_an_item_that_goes_on_failing_is_named(a):
-    results = a.map(refuse_three, range(1, 12), retries=2, chunk=4)
-    assert [next(results), next(results)] == [1, 2]
-    with pytest.raises(ValueError, match="three") as error:
-        next(results)
-    assert "this was item 2 of a map: 3" in error.value.__notes__[-1]
-    with pytest.raises(ValueError, match="retries is -1; give a whole number, 0 or more"):
-        a.map(twice, [1], retries=-1)
-
-
 def test_a_client_that_cannot_be_asked(_threads):
     with Client(_threads, set_as_default=False) as client:
         part = Partition("A", client)
@@ -120,9 +101,6 @@ def test_an_asynchronous_client_is_refused(_threads):
                 Partition("A", client).stats()
 
     _threads.sync(ask)
-
-
-# -- several slots, collections, data --------------------------------------------------
 
 
 def test_a_task_may_take_several_slots(a, client, wait_until):

@@ -7,17 +7,12 @@ from collections import deque
 from concurrent.futures import ThreadPoolExecutor
 
 import pytest
-from distributed import Client, Variable
+from distributed import Client
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tests.poolpart.helpers import LONG_S
 
-from poolpart import (
-    Pipe,
-    PipeClosed,
-    PipeFailed,
-    take_news,
-)
+from poolpart import Pipe, PipeClosed, PipeFailed, take_news
 from poolpart import pipe as pipe_module
 from poolpart.pipe import pipes_of
 
@@ -46,9 +41,6 @@ def produce(pipe, items):
 def pool():
     with ThreadPoolExecutor(16) as pool:
         yield pool
-
-
-# -- order and bound -------------------------------------------------------------------
 
 
 OPERATIONS = st.lists(
@@ -118,9 +110,6 @@ def test_several_producers_and_consumers_lose_and_double_nothing(
         assert shared or mine == sorted(mine)  # in order, unless threads take turns
 
 
-# -- the end ---------------------------------------------------------------------------
-
-
 def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
     pipe = make_pipe(client)
     pipe.put(1)
@@ -135,9 +124,6 @@ def test_consumers_drain_a_closed_pipe_and_end(client, make_pipe):
     with pytest.raises(PipeClosed, match="is closed and empty"):
         end.get_all()
     assert end.poll() == []
-
-
-# -- failure ---------------------------------------------------------------------------
 
 
 def test_failing_wakes_both_ends_with_the_reason(client, make_pipe, pool):
@@ -162,9 +148,6 @@ def test_advice_can_return_to_what_it_was(client, make_pipe):
     assert again(pipe).advice == 1
 
 
-# -- many items ------------------------------------------------------------------------
-
-
 def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
     pipe, source = make_pipe(client, capacity=2), itertools.count()
     pipe.put_many([])
@@ -185,8 +168,6 @@ def test_of_many_items_those_before_an_error_are_in_the_pipe(client, make_pipe):
     with pytest.raises(PipeFailed, match="no more"):
         failed.put_many(range(5))
 
-
-# -- what is left ----------------------------------------------------------------------
 
 USES = {
     "put": lambda pipe: pipe.put(1),
@@ -238,23 +219,6 @@ def test_two_pipes_of_one_name(client, make_pipe):
     assert again(pipe).create().depth == 0
 
 
-def test_a_pipe_is_a_queue_and_a_variable_of_dask(client, make_pipe):
-    pipe = make_pipe(client, capacity=3)
-    pipe.put_many([1, 2])
-    queues = client.cluster.scheduler.extensions["queues"].queues
-    assert queues[pipe.name].qsize() == 2
-    state = Variable(pipe.name, client=client)
-    assert (state.get()["capacity"], state.get()["closed"]) == (3, False)
-    pipe.close()
-    assert state.get()["closed"] is True
-    pipe.delete()
-    assert pipe.name not in queues
-    Variable(pipe.name, client=client).set("somebody's own")
-    with pytest.raises(ValueError, match="has a queue or variable"):
-        again(pipe).create()
-    state.delete()
-
-
 @pytest.mark.parametrize(
     ("change", "outcome"),
     [
@@ -281,8 +245,6 @@ def test_a_put_that_waits_for_room_hears_at_once(client, make_pipe, monkeypatch,
     if outcome is None:
         assert pipe.poll() == ["second"]
 
-
-# -- waiting for news, and taking it ---------------------------------------------------
 
 ENDS = [Pipe.close, Pipe.delete, lambda pipe: pipe.fail("why not")]
 

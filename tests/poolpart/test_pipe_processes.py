@@ -76,9 +76,8 @@ def test_a_pipe_ends_with_the_process_that_made_it(processes, make_pipe):
 
     before = processes.run_on_scheduler(plugins)
     maker = subprocess.Popen(
-        [sys.executable, "-c", MAKER, processes.scheduler.address], stdout=subprocess.PIPE,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-    )  # fmt: skip
+        [sys.executable, "-c", MAKER, processes.scheduler.address], stdout=subprocess.PIPE
+    )
     assert maker.stdout.readline() == b"made\n"
     other = make_pipe(processes)
     consumer = Partition("OTHER", processes).submit(consume, Pipe("of-a-process", 3))

@@ -114,9 +114,6 @@ def test_a_worker_that_has_left_is_not_chosen(start, wait_until):
         pool.partition("Q", workers=["a"])
 
 
-# -- GPUs ------------------------------------------------------------------------------
-
-
 def test_one_worker_for_each_gpu_of_a_host(start, monkeypatch):
     monkeypatch.setattr(probe, "visible_gpus", lambda: ("x", "y"))
     pool = Pool.from_client(start({name: {} for name in "abcde"}))
@@ -134,9 +131,6 @@ def test_without_gpus_the_fall_back_is_seen(start, caplog):
     assert gpu.note in repr(gpu)
     assert f"Partition 'GPU': {gpu.note}" in caplog.text
     assert len(gpu) == 1
-
-
-# -- require ---------------------------------------------------------------------------
 
 
 def test_slots_that_are_missing_are_named_with_their_purpose(start):

@@ -31,9 +31,6 @@ def names(rules, pool):
     return {name: [w.name for w in group] for name, group in divide(rules, pool)[0].items()}
 
 
-# -- whom they choose ------------------------------------------------------------------
-
-
 def test_each_rule_takes_of_what_those_before_it_have_left():
     pool = [worker("a"), worker("b", "x"), worker("c", "x"), worker("d"), worker("e", host="2")]
     rules = {"GPU": per_gpu(1), "IO": per_host(1), "REST": rest()}
@@ -44,16 +41,6 @@ def test_workers_that_a_rule_names_are_kept_for_it():
     pool = [worker("a"), worker("b"), worker("c")]
     rules = {"P": n_workers(1), "Q": named("a", "tcp://b")}
     assert names(rules, pool) == {"P": ["c"], "Q": ["a", "b"]}
-
-
-def test_workers_that_declare_something_else_are_left_alone():
-    pool = [worker("a", DISK=1), worker("b"), worker("c", Q=0)]
-    assert names({"P": rest()}, pool) == {"P": ["b", "c"]}
-
-
-def test_the_same_rules_again_make_the_same_partitions():
-    pool = [worker("a"), worker("b", P=1), worker("c", R=1)]
-    assert names({"P": n_workers(1), "R": rest()}, pool) == {"P": ["b"], "R": ["c", "a"]}
 
 
 def test_fewer_than_the_minimum():
@@ -67,8 +54,6 @@ def test_fewer_than_the_minimum():
     with pytest.raises(PoolError, match="would have 2 of the 3 workers"):
         divide({"P": rest(minimum=3)}, pool)
 
-
-# -- whom a worker that joins belongs to -----------------------------------------------
 
 RULES = {"GPU": per_gpu(1), "IO": per_host(2), "OTHER": rest()}
 
@@ -129,9 +114,6 @@ def test_whoever_joins_finds_a_place_and_no_rule_gets_more_than_it_wants(gpus, o
     for one in members["REST"]:
         others = {name: group for name, group in members.items() if name != "REST"}
         assert partition_for(one, {n: rules[n] for n in others}, others) is None
-
-
-# -- on a cluster ----------------------------------------------------------------------
 
 
 def test_workers_that_join_later(start, wait_until):

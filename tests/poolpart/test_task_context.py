@@ -1,7 +1,5 @@
 """A task's client, also where several ask at the same moment; tasks whose worker leaves."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 
@@ -76,9 +74,6 @@ def test_tasks_of_a_worker_share_its_client(start):
     told = client.gather(client.map(identity, [str(number) for number in range(8)]))
     assert len({name for name, _ in told}) == 1
     assert {status for _, status in told} == {"running"}
-
-
-# -- a worker that leaves under its task ------------------------------------------------
 
 
 class ClosingWorker:

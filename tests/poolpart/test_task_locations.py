@@ -2,7 +2,7 @@
 
 from distributed import Event, secede
 
-from poolpart import Partition, Pool, Whereabouts, look_for_tasks
+from poolpart import Partition, Pool, look_for_tasks
 
 
 def hold(name):
@@ -53,10 +53,6 @@ def test_slots_are_free_whatever_dask_counts_after_work_stealing(client):
         assert look_for_tasks(client, "A").free == {one: 2, two: 2}
     finally:
         client.run_on_scheduler(miscount, -5)
-
-
-def test_a_partition_that_is_not_there_has_no_slots(client):
-    assert look_for_tasks(client, "C", ["no-such-key"]) == Whereabouts()
 
 
 def test_workers_that_take_no_tasks_have_no_slots(start):

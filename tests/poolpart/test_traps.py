@@ -4,8 +4,6 @@ Those that have their tests elsewhere are listed in docs/pool-partitions.md. Whe
 fails in its first half, Dask has got better, and something here may be left out.
 """
 
-from __future__ import annotations
-
 import time
 
 from tests.poolpart.helpers import LONG_S, addresses, kill

@@ -1,8 +1,5 @@
 """Which backend is taken, and what is said when it cannot be."""
 
-from __future__ import annotations
-
-import os
 import re
 import subprocess
 import sys
@@ -20,11 +17,6 @@ from raybeam.instances import plain
 from raybeam.mesh import local_mesh
 
 MESH = [[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]]
-
-
-def test_names_in_order_of_speed():
-    assert list(available_backends()) == ["cuda", "embree", "numpy"]
-    assert available_backends()["numpy"] == ""
 
 
 def test_auto_takes_the_first_that_can_be_used(monkeypatch):
@@ -52,8 +44,7 @@ def test_what_cannot_be_had_says_why(monkeypatch):
 
 
 def run_python(code):
-    path = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, env=path)
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
 
 

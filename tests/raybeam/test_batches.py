@@ -1,7 +1,5 @@
 """The same ray has the same bits in every batch, and with every backend that decides exactly."""
 
-from __future__ import annotations
-
 import tracemalloc
 
 import numpy as np

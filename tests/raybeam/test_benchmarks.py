@@ -1,10 +1,7 @@
 """Benchmarks at toy size: the rates mean nothing, that they run and agree does."""
 
-from __future__ import annotations
-
 import json
 import re
-import sys
 from pathlib import Path
 
 import pytest
@@ -84,33 +81,6 @@ def test_a_section_that_fails_leaves_the_others(played_cuda, tmp_path, capsys, m
     said = capsys.readouterr().out
     assert "wrong: moving: MemoryError: no room" in said
     assert "left out: peers, because benchmarks.gpu_of_nobody is not installed" in said
-
-
-# Stands for the interpreter that runs a section: without a device, or with one that is played.
-PYTHON = """#!{python}
-import sys
-sys.path[:0] = {path}
-from benchmarks import gpu
-from tests.cuda_on_host import SourceBackend
-if "device" in sys.argv:
-    gpu.choose = lambda name: SourceBackend
-    gpu.available_backends = lambda: {{"cuda": ""}}
-if "moving" in sys.argv:
-    sys.exit(-9)
-sys.exit(gpu.main(sys.argv[3:]))
-"""
-
-
-def test_sections_are_processes_of_their_own(played_cuda, tmp_path, monkeypatch):  # noqa: F811
-    script = tmp_path / "python"
-    script.write_text(PYTHON.format(python=sys.executable, path=sys.path))
-    script.chmod(0o755)
-    monkeypatch.setattr(sys, "executable", str(script))
-    code, found = results_of(tmp_path, "--only", "device", "moving", "leaks")
-    assert code == 1
-    assert found["device"]["device"]["name"] == "g++"
-    assert found["moving"] == {"error": "its process ended with 247"}
-    assert found["leaks"] == {"error": "its process ended with 2"}
 
 
 def test_the_page_has_the_rows_of_the_table():

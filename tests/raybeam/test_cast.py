@@ -1,7 +1,5 @@
 """Closest hits against an independent oracle and against shapes whose answer is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks.gpu_scenes import grid_faces

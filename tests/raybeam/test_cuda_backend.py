@@ -1,7 +1,5 @@
 """Around the walk on a device: hits closed up in order, arrays kept until they were read."""
 
-from __future__ import annotations
-
 import weakref
 
 import numpy as np

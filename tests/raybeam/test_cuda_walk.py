@@ -1,7 +1,5 @@
 """Where intersect.cu decides late: triangles that wait must not be lost or win wrongly."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Hits that stay on a device, against those that a scan returns."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

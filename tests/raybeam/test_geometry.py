@@ -1,7 +1,5 @@
 """Meshes and rays on a grid of small integers, where exact arithmetic says what is right."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

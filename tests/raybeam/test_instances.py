@@ -1,7 +1,5 @@
 """Instances against the same triangles in one mesh, and the backends against each other."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -237,8 +235,5 @@ def test_refused(transform, words):
     mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0]], [[0, 1, 2]])
     with pytest.raises(ValueError, match=words):
         RayCaster.of([Instance(mesh), Instance(mesh, transform)], "numpy")
-
-
-def test_no_instances_are_refused():
     with pytest.raises(ValueError, match="at least one"):
         RayCaster.of([], "numpy")

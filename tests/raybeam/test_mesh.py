@@ -1,12 +1,9 @@
 """Meshes are checked, moved near zero and scaled without losing anything."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from raybeam import RayCaster
-from raybeam.mesh import local_mesh
 
 POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 
@@ -33,28 +30,3 @@ POINTS = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0]])
 def test_refused(vertices, faces, words):
     with pytest.raises(ValueError, match=words):
         RayCaster(vertices, faces, "numpy")
-
-
-def test_local_coordinates():
-    rng = np.random.default_rng(0)
-    vertices = rng.uniform(-300, 300, (30, 3)) + np.array([5e5, 4e6, 100])
-    faces = rng.integers(0, 30, (40, 3))
-    mesh = local_mesh(vertices, faces)
-    assert np.abs(mesh.corners).max() <= 1
-    assert np.abs(mesh.corners).max() > 0.5
-    assert np.log2(mesh.frame.scale) % 1 == 0
-    assert mesh.face_count == 40
-    back = mesh.corners / mesh.frame.scale + mesh.frame.centre
-    np.testing.assert_allclose(back, vertices[faces[mesh.index]], rtol=0, atol=1e-9)
-
-
-def test_unused_vertices_do_not_count():
-    far = np.concatenate([POINTS, [[1e9, 0, 0]]])
-    far_scale = local_mesh(far, [[0, 1, 2]]).frame.scale
-    assert far_scale == local_mesh(POINTS, [[0, 1, 2]]).frame.scale
-
-
-def test_triangles_without_area_are_left_out():
-    mesh = local_mesh([*POINTS, [2, 0, 0]], [[0, 1, 1], [0, 1, 2], [0, 1, 3], [2, 2, 2]])
-    assert mesh.index.tolist() == [1]
-    assert mesh.face_count == 4

@@ -1,7 +1,5 @@
 """Masks: a ray passes where they are false, and is stopped elsewhere as without a mask."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

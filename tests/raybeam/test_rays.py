@@ -1,7 +1,5 @@
 """Rays that are none are refused with a message that names the first; the rest are unit vectors."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

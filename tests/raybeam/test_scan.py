@@ -1,7 +1,5 @@
 """Scans against rays that are made one by one and cast: many poses, windows, thinning, counts."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np
@@ -179,8 +177,6 @@ def test_pattern_shorter_than_a_chunk(caster, shapes, name, rays, first):
     same(got, hits_of(vase, *made(case, (first, 2100))))
 
 
-# ---- thinning and counts ----
-
 GROUPS = [[0], [0, 1000, 2000], [0, 0, 13, 13, 14, 1999, 2390, 2400]]
 
 
@@ -253,9 +249,6 @@ def test_nothing_to_scan(caster, shapes):
     assert (len(away), away.hits.tolist(), away.tally.sum()) == (0, [0], 0)
 
 
-# ---- what is refused ----
-
-
 @pytest.mark.parametrize(
     ("change", "words"),
     [
@@ -287,9 +280,6 @@ def test_scan_refused(change, words):
     caster = RayCaster(*TRIANGLE, "numpy")
     with pytest.raises(ValueError, match=words):
         caster.scan(**{"pattern": Pattern(np.eye(3)), "positions": [0, 0, 0], **change})
-
-
-# ---- the pattern itself ----
 
 
 def test_pattern_refused():

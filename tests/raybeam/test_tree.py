@@ -1,7 +1,5 @@
 """The trees: each triangle once, every box around what is under it, and none is deep."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Closed meshes do not leak where it is hardest: at shared edges and corners."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from benchmarks import seams

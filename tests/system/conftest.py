@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 from distributed import Client, Worker, WorkerPlugin
 from tests.clusters import thread_cluster
+from tests.daemons import wait_until
 
 import lidarpool.base.fork_server
 import lidarpool.pipeline.long_stages
-import lidarpool.report.pictures
+import lidarpool.report.result_pictures
 from lidarpool import Cloud
 from lidarpool.base.tracing import trace_to
 from lidarpool.cli.commands import main
@@ -49,7 +50,7 @@ def client(local_client: Client) -> Client:
         answers = local_client.run(os.getpid, on_error="return").values()
         return len(answers) == 4 and all(isinstance(pid, int) for pid in answers)
 
-    _wait(all_answer)
+    wait_until(all_answer)
     return local_client
 
 
@@ -142,7 +143,9 @@ class OutsideCluster:
             "scheduler", "--port", "0", "--no-dashboard",
             "--scheduler-file", str(file), "--host", "127.0.0.1", **environment,
         )  # fmt: skip
-        _wait(lambda: file.exists() and file.read_text().endswith("}"))  # it is written in pieces
+        wait_until(
+            lambda: file.exists() and file.read_text().endswith("}")
+        )  # it is written in pieces
         self.address = json.loads(file.read_text())["address"]
 
     def _start(self, command: str, *arguments: str, name: str = "", **environment: str) -> None:
@@ -209,13 +212,6 @@ def outside(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Callable[..., 
         cluster.close()
 
 
-def _wait(condition: Callable[[], bool]) -> None:
-    stop = time.monotonic() + 300
-    while not condition():
-        assert time.monotonic() < stop, "waited in vain"
-        time.sleep(0.05)
-
-
 @dataclass(frozen=True)
 class Outcome:
     """How a command ended."""
@@ -256,9 +252,9 @@ class BlankPage:
 @pytest.fixture
 def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Leave the drawing out, which takes longer than a small survey."""
-    monkeypatch.setattr(lidarpool.report.pictures, "take_shot", lambda *_, **__: None)
+    monkeypatch.setattr(lidarpool.report.result_pictures, "take_shot", lambda *_, **__: None)
     for name in ("draw_scene", "draw_hits", "draw_cloud", "draw_path"):
-        monkeypatch.setattr(lidarpool.report.pictures, name, lambda *_, **__: BlankPage())
+        monkeypatch.setattr(lidarpool.report.result_pictures, name, lambda *_, **__: BlankPage())
 
 
 @pytest.fixture

@@ -1,7 +1,5 @@
 """The benchmarks at toy size, so that they cannot rot; no figure is judged here."""
 
-from __future__ import annotations
-
 import json
 from contextlib import contextmanager
 
@@ -90,7 +88,7 @@ def test_formats(capsys):
 
 def test_a_survey_on_a_device(played_cuda, tmp_path, monkeypatch):  # noqa: F811
     @contextmanager
-    def threads(**options):
+    def threads(*_needed, **_options):
         with (
             thread_cluster({"GPU": 1}, {"LIDAR": 4}, {"OTHER": 1}) as cluster,
             Client(cluster) as c,

@@ -1,7 +1,5 @@
 """A city block, a robot, hills and traffic in one scenario: examples/block.yaml."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`lidarpool check` of a campaign: what varies, and some of its jobs."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
@@ -103,8 +101,3 @@ def test_the_example_can_run(lidarpool, tmp_path):
     outcome = lidarpool("check", tmp_path / "campaign.yaml")
     assert (outcome.code, outcome.out.count("\njob ")) == (0, 5)
     assert "note:" not in outcome.out
-
-
-def test_the_schema_is_printed(lidarpool):
-    schema = json.loads(lidarpool("schema", "--campaign").out)
-    assert schema["title"] == "lidarpool campaign" and "vary" in schema["properties"]

@@ -1,16 +1,12 @@
 """Campaigns: many jobs into one data set, whatever happens to workers, drivers and single jobs."""
 
-from __future__ import annotations
-
 import json
-import os
 import re
 import shutil
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
@@ -21,14 +17,16 @@ import numpy as np
 import pytest
 from distributed import Client
 from tests.clusters import thread_cluster
+from tests.daemons import wait_until
+from tests.killed_drivers import drive
 
 import lidarpool.run.cluster
 import lidarpool.run.writer
 from lidarpool import Campaign, Job, LidarpoolError, Scene, Sensor, Survey, simulate
 from lidarpool.base.errors import explained
 from lidarpool.base.storage import Storage
-from lidarpool.export.dataset import DataSet
-from lidarpool.export.jobs import JobRow
+from lidarpool.datasets.dataset import DataSet
+from lidarpool.datasets.job_table import JobRow
 from lidarpool.run.progress import Progress
 
 BASE = """
@@ -79,14 +77,20 @@ def bytes_of(dataset: Path) -> dict[str, bytes]:
 
 
 @pytest.fixture(scope="module")
-def whole(slots: str, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
-    """The jobs' files, of a run that nobody disturbs."""
+def finished(slots: str, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The data set of a run that nobody disturbs, to be copied."""
     folder = tmp_path_factory.mktemp("whole")
     (folder / "base.yaml").write_text(BASE)
     (folder / "c.yaml").write_text(CAMPAIGN)
     with Client(slots, set_as_default=False) as client:
         assert Campaign.load(folder / "c.yaml").run(folder / "ds", client=client).done == 6
-    return bytes_of(folder / "ds")
+    return folder / "ds"
+
+
+@pytest.fixture(scope="module")
+def whole(finished: Path) -> dict[str, bytes]:
+    """The jobs' files in it."""
+    return bytes_of(finished)
 
 
 SENSOR = Sensor.grid(rays_per_revolution=90, layers=2, step_deg=4)
@@ -107,7 +111,7 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
 
 def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots, no_pictures):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
-    for number in range(0, 6, 2):
+    for number in (1, 5):
         out = files / f"job-{number}"
         done = lidarpool(*run, "--job", number, "--out", out)
         assert (done.code, done.err) == (0, "")
@@ -309,10 +313,12 @@ HARM = {
 
 
 @pytest.mark.parametrize("harm", HARM)
-def test_a_damaged_job_is_named_and_made_again(files, whole, lidarpool, slots, no_pictures, harm):
+def test_a_damaged_job_is_named_and_made_again(
+    files, finished, whole, lidarpool, slots, no_pictures, harm
+):
     change, name = HARM[harm]
     run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
-    assert lidarpool(*run, "-q").code == 0
+    shutil.copytree(finished, files / "ds")
     sound = lidarpool("run", "--verify", files / "ds")
     assert (sound.code, sound.out) == (0, f"{files / 'ds'} is whole: 6 jobs\n")
     change(files / "ds" / name)
@@ -345,8 +351,9 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
     for place in (files, files / "none"):
         refused = lidarpool("run", "--verify", place)
         assert refused.code == 2 and "is no data set of lidarpool" in refused.err
-    refused = lidarpool("run", files / "base.yaml", "--verify")
-    assert refused.code == 2 and "are for campaigns" in refused.err
+    for option in (["--verify"], ["--job", 1], ["--retry-failed"]):
+        refused = lidarpool("run", files / "base.yaml", "--out", files / "ds", *option)
+        assert refused.code == 2 and "are for campaigns" in refused.err
 
 
 SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
@@ -405,12 +412,12 @@ def test_one_slot_too_few_names_what_it_is_for(files, lidarpool, tmp_path):
     assert "kept in" not in refused.err and not (files / "ds").exists()
 
 
-def test_other_content_or_software_is_refused(files, lidarpool, slots, no_pictures):
+def test_other_content_or_software_is_refused(files, finished, lidarpool, slots, no_pictures):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
     (files / "c.yaml").write_text(CAMPAIGN.replace("[2, 3, 4]", "[2, 3, 4.5]"))
     assert lidarpool(*run).code == 2 and not (files / "ds").exists()
     (files / "c.yaml").write_text(CAMPAIGN)
-    assert lidarpool(*run).code == 0
+    shutil.copytree(finished, files / "ds")
     again = lidarpool(*run)
     assert again.code == 2 and "needs a folder of its own" in again.err
     assert lidarpool(*run, "--resume").code == 0, "it is complete"
@@ -433,9 +440,12 @@ def all_of(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in found}
 
 
-@pytest.fixture
-def unwritten(client, tmp_path, monkeypatch):
-    """A campaign of three jobs, of which one is in the data set when the disk is full."""
+@pytest.fixture(scope="module")
+def full_disk(slots, tmp_path_factory):
+    """A campaign of three jobs, of which one is in the data set when the disk is full; its place.
+
+    Its run is known by that place, where its copy is put for each test.
+    """
     write = DataSet.write_job
 
     def fail(self: DataSet, row: JobRow, *arguments: Any, **more: Any) -> JobRow:
@@ -445,15 +455,34 @@ def unwritten(client, tmp_path, monkeypatch):
                 raise OSError(28, "No space left on device")
         return made
 
-    campaign = Campaign(make, 3, keep="folder")
+    campaign, ds = Campaign(make, 3, keep="folder"), tmp_path_factory.mktemp("full") / "ds"
     with (
-        monkeypatch.context() as patched,
+        Client(slots, set_as_default=False) as client,
+        pytest.MonkeyPatch.context() as patched,
         pytest.raises(LidarpoolError, match=r"Job 000\d .*No space left") as ended,
     ):  # the others would fail, too
         patched.setattr(DataSet, "write_job", fail)
-        campaign.run(tmp_path / "ds", client=client)
-    assert "of 3 jobs are kept in" in ended.value.__notes__[0] and bytes_of(tmp_path / "ds")
-    return campaign
+        campaign.run(ds, client=client)
+    assert "of 3 jobs are kept in" in ended.value.__notes__[0] and bytes_of(ds)
+    shutil.copytree(ds, ds.with_name("copy"))
+    return campaign, ds.parent
+
+
+@pytest.fixture
+def here(full_disk, tmp_path):
+    """The folder with such a data set and nothing else."""
+    folder = full_disk[1]
+    (folder / "copy").rename(tmp_path / "copy")
+    shutil.rmtree(folder)
+    shutil.copytree(tmp_path / "copy", folder / "ds")
+    yield folder
+    (tmp_path / "copy").rename(folder / "copy")
+
+
+@pytest.fixture
+def unwritten(full_disk):
+    """Such a campaign."""
+    return full_disk[0]
 
 
 def lead_away(link: Path, stranger: Path) -> dict[str, bytes]:
@@ -470,39 +499,45 @@ def lead_away(link: Path, stranger: Path) -> dict[str, bytes]:
     return all_of(stranger)
 
 
+@pytest.fixture(scope="module")
+def three(slots, full_disk, tmp_path_factory):
+    """What it gives on an empty disk."""
+    folder = tmp_path_factory.mktemp("three")
+    with Client(slots, set_as_default=False) as client:
+        full_disk[0].run(folder, client=client)
+    return bytes_of(folder)
+
+
 @pytest.mark.parametrize("where", ["run", "run/parts", "jobs", "jobs/0001", ".jobs"])
-def test_nothing_behind_a_link_is_touched(client, tmp_path, unwritten, where):
-    link, stranger = tmp_path / "ds" / where, tmp_path / "stranger"
+def test_nothing_behind_a_link_is_touched(client, here, unwritten, three, where):
+    link, stranger = here / "ds" / where, here / "stranger"
     before = lead_away(link, stranger)
     for how in ("resume", "fresh"):
         with pytest.raises(LidarpoolError) as caught:
-            unwritten.run(tmp_path / "ds", client=client, **{how: True})
+            unwritten.run(here / "ds", client=client, **{how: True})
         assert f"{where} is a link" in str(caught.value)
         assert len(str(caught.value).splitlines()) == 1
     assert all_of(stranger) == before
     link.unlink()
-    if (tmp_path / "kept").exists():
-        (tmp_path / "kept").rename(link)
-    run = unwritten.run(tmp_path / "ds", client=client, resume=True)
-    assert (run.done, run.failed) == (3, ()) and not (tmp_path / "ds" / "run").exists()
-    unwritten.run(tmp_path / "whole", client=client)
-    assert bytes_of(tmp_path / "ds") == bytes_of(tmp_path / "whole")
+    if (here / "kept").exists():
+        (here / "kept").rename(link)
+    run = unwritten.run(here / "ds", client=client, resume=True)
+    assert (run.done, run.failed) == (3, ()) and not (here / "ds" / "run").exists()
+    assert bytes_of(here / "ds") == three
 
 
 @pytest.mark.parametrize("harm", ["jobs/*/cloud.ply", ".jobs/*.json"])
-def test_a_campaign_whose_only_job_was_harmed_goes_on(
-    client, tmp_path, unwritten, monkeypatch, harm
-):
-    for path in (tmp_path / "ds").glob(harm):
+def test_a_campaign_whose_only_job_was_harmed_goes_on(client, here, unwritten, monkeypatch, harm):
+    for path in (here / "ds").glob(harm):
         path.unlink()
     for _ in range(2):  # what is to be done again is forgotten first, and nothing else is there
         with monkeypatch.context() as patched, pytest.raises(LidarpoolError, match="no cluster"):
             patched.setattr(lidarpool.run.cluster, "client_of", refuse)
-            unwritten.run(tmp_path / "ds", client=client, resume=True)
-    assert unwritten.run(tmp_path / "ds", client=client, resume=True).done == 3
-    (tmp_path / "ds" / "run").mkdir()  # a run that was killed as it removed itself
-    assert unwritten.run(tmp_path / "ds", client=client, resume=True).done == 3
-    assert not (tmp_path / "ds" / "run").exists()
+            unwritten.run(here / "ds", client=client, resume=True)
+    assert unwritten.run(here / "ds", client=client, resume=True).done == 3
+    (here / "ds" / "run").mkdir()  # a run that was killed as it removed itself
+    assert unwritten.run(here / "ds", client=client, resume=True).done == 3
+    assert not (here / "ds" / "run").exists()
 
 
 def refuse(*_: Any, **__: Any) -> None:
@@ -517,8 +552,8 @@ LOST = {
 
 
 @pytest.mark.parametrize("lost", LOST)
-def test_finished_jobs_are_known_without_the_database(client, tmp_path, unwritten, lost):
-    ds = tmp_path / "ds"
+def test_finished_jobs_are_known_without_the_database(client, here, unwritten, lost):
+    ds = here / "ds"
     before, known = bytes_of(ds), len([*(ds / ".jobs").iterdir()])
     LOST[lost](ds / "run")
     with pytest.raises(LidarpoolError, match=r"run\.db is damaged|needs a folder of its own"):
@@ -530,8 +565,8 @@ def test_finished_jobs_are_known_without_the_database(client, tmp_path, unwritte
     assert cast.get("intersect", 0) == 45 * (3 - known)
 
 
-def test_a_run_removes_its_own_files_only(client, tmp_path, unwritten):
-    ds = tmp_path / "ds"
+def test_a_run_removes_its_own_files_only(client, here, unwritten):
+    ds = here / "ds"
     for name in ("thesis.txt", "jobs/thesis.txt", "jobs/0000/thesis.txt", "README.md", "x/cloud"):
         (ds / name).parent.mkdir(exist_ok=True)
         (ds / name).write_text("mine")
@@ -544,13 +579,13 @@ def test_a_run_removes_its_own_files_only(client, tmp_path, unwritten):
     (ds / "x").rmdir()
     assert unwritten.run(ds, client=client, fresh=True).resumed == 0
     # An empty folder that is called run says nothing, nor does one that is called points.
-    (tmp_path / "other" / "run").mkdir(parents=True)
-    (tmp_path / "mine").mkdir()
-    (tmp_path / "other" / "jobs").symlink_to(tmp_path / "mine")
+    (here / "other" / "run").mkdir(parents=True)
+    (here / "mine").mkdir()
+    (here / "other" / "jobs").symlink_to(here / "mine")
     for how in ("resume", "fresh", "overwrite"):
         with pytest.raises(LidarpoolError, match=r"holds jobs: a data set|jobs is a link"):
-            unwritten.run(tmp_path / "other", client=client, **{how: True})
-    assert [*(tmp_path / "mine").iterdir()] == []
+            unwritten.run(here / "other", client=client, **{how: True})
+    assert [*(here / "mine").iterdir()] == []
 
 
 @pytest.mark.parametrize("kept", ["folder", "kitti", "nuscenes", "mcap", "parquet", "images"])
@@ -564,6 +599,11 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
             other.run(ds, client=client, **options)
         assert all_of(ds) == before
     (ds / "run").mkdir()
+    (ds / "notes.txt").write_text("mine")
+    with pytest.raises(LidarpoolError, match=r"holds notes\.txt: a data set needs a folder"):
+        other.run(ds, client=client, overwrite=True)
+    (ds / "notes.txt").unlink()
+    assert all_of(ds) == before
     assert len(other.run(ds, client=client, fresh=True, overwrite=True).failed) == 1
     assert {name.split("/")[0] for name in all_of(ds)} == {
         "run", ".jobs", "jobs", "campaign.json", "dataset.json", "jobs.csv", "jobs.parquet",
@@ -571,29 +611,6 @@ def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept)
     }  # fmt: skip
     with pytest.raises(LidarpoolError, match="holds a finished data set"):
         other.run(ds, client=client, fresh=True)
-
-
-def test_foreign_files_are_not_touched(files, lidarpool, slots, no_pictures):
-    (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", "count: 1"))
-    run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
-    (files / "ds").mkdir()
-    (files / "ds" / "notes.txt").write_text("mine")
-    for option in ((), ("--resume",), ("--fresh",), ("--retry-failed",)):
-        refused = lidarpool(*run, *option)
-        assert refused.code == 2 and "notes.txt" in refused.err, option
-        assert [path.name for path in (files / "ds").iterdir()] == ["notes.txt"]
-    (files / "ds" / "notes.txt").rename(files / "notes.txt")
-    assert lidarpool(*run).code == 0
-    (files / "notes.txt").rename(files / "ds" / "notes.txt")
-    before = bytes_of(files / "ds")
-    refused = lidarpool(*run, "--overwrite")
-    assert (
-        refused.code == 2 and "holds notes.txt: a data set needs a folder of its own" in refused.err
-    )
-    assert bytes_of(files / "ds") == before
-    (files / "ds" / "notes.txt").unlink()
-    assert lidarpool(*run, "--fresh").code == 2
-    assert lidarpool(*run, "--overwrite").code == 0
 
 
 @pytest.mark.parametrize(
@@ -616,12 +633,6 @@ def test_options_that_do_not_go_together(files, lidarpool, options, words, slots
     assert not (files / "ds").exists()
 
 
-def test_options_of_campaigns_with_a_survey(files, lidarpool):
-    for option in (["--job", 1], ["--retry-failed"]):
-        refused = lidarpool("run", files / "base.yaml", "--out", files / "ds", *option)
-        assert refused.code == 2 and "are for campaigns" in refused.err
-
-
 def test_several_scenarios_are_a_campaign(files, lidarpool, slots, no_pictures):
     (files / "other.yaml").write_text(BASE.replace("steps: 45", "steps: 30"))
     two = [files / "base.yaml", files / "other.yaml"]
@@ -636,52 +647,6 @@ def test_several_scenarios_are_a_campaign(files, lidarpool, slots, no_pictures):
 
 # -- workers and drivers that die -----------------------------------------------------------------
 
-# Each driver is a process of its own, forked from one that has imported everything. It is killed
-# when it calls something for the n-th time.
-DRIVERS = """
-import json, os, signal, sys, traceback
-import lidarpool.cli.run_command, lidarpool.report.campaign_output as output
-import lidarpool.report.campaign_report
-from lidarpool.__main__ import main
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.export.dataset import DataSet
-from lidarpool.run.store import RunStore
-
-def drive(point, times):
-    left = [times]
-    def before(owner, name, label):
-        function = getattr(owner, name)
-        def call(*arguments, **options):
-            left[0] -= label == point and arguments[1:] != ([],)
-            if not left[0]:
-                os.kill(os.getpid(), signal.SIGKILL)
-            return function(*arguments, **options)
-        setattr(owner, name, call)
-    before(RunDatabase, "__init__", "OPEN")
-    before(RunDatabase, "commit", "COMMIT")
-    before(RunStore, "end", "END")
-    before(output, "write_table", "TABLE")
-    before(DataSet, "finish", "FINISH")
-    before(RunStore, "remove", "REMOVE")
-    sys.argv = ["lidarpool", *json.loads(sys.argv[1])]
-    main()
-
-for point, times in json.loads(sys.argv[2]):
-    if not (child := os.fork()):
-        try:
-            drive(point, times)
-        except SystemExit as ended:
-            sys.stderr.flush()
-            sys.stdout.flush()
-            os._exit(ended.code or 0)
-        except BaseException:
-            traceback.print_exc()
-        os._exit(70)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    print(json.dumps(["ended", code]), flush=True)
-    if code >= 0:
-        break
-"""
 KILLS = [
     ("OPEN", 1),
     ("COMMIT", 4),
@@ -695,23 +660,11 @@ KILLS = [
 forks = pytest.mark.skipif(sys.platform == "win32", reason="forks")
 
 
-def drive(folder: Path, address: str, kills: list[tuple[str, int]], *options: str) -> list[int]:
-    """Run the campaign of a folder again and again, each killed at a point; how they ended."""
-    arguments = ["run", "c.yaml", "--resume", "-q", "--scheduler", address, *options]
-    done = subprocess.run(
-        [sys.executable, "-c", DRIVERS, json.dumps(arguments), json.dumps(kills)],
-        cwd=folder,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        capture_output=True, text=True, check=True,
-    )  # fmt: skip
-    assert "Traceback" not in done.stderr and "lidarpool:" not in done.stderr, done.stderr
-    return [json.loads(line)[1] for line in done.stdout.splitlines() if '"ended"' in line]
-
-
 @forks
 def test_killed_drivers_leave_the_same_bytes_and_no_remains(files, slots, whole, client, left_over):
     parts = files / "parts"
-    ended = drive(files, slots, KILLS, "--out", "ds", "--parts", str(parts))
+    options = ["--resume", "-q", "--scheduler", slots, "--out", "ds", "--parts", str(parts)]
+    ended = drive(files, KILLS, "c.yaml", *options)
     assert ended == [-9] * (len(KILLS) - 1) + [0]
     assert bytes_of(files / "ds") == whole
     rows = (files / "ds" / "jobs.csv").read_text().splitlines()
@@ -727,23 +680,14 @@ def test_an_interrupted_driver_says_how_to_go_on(files, slots, client):
     command = ["run", "c.yaml", "-q", "--scheduler", slots, "--out", "ds"]
     with subprocess.Popen(
         [sys.executable, "-m", "lidarpool", *command],
-        cwd=files,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-        stderr=subprocess.PIPE, text=True,
+        cwd=files, stderr=subprocess.PIPE, text=True,
     ) as run:  # fmt: skip
-        wait_for(lambda: [*(files / "ds" / ".jobs").glob("*")])
+        wait_until(lambda: [*(files / "ds" / ".jobs").glob("*")])
         run.send_signal(signal.SIGINT)
         _, err = run.communicate(timeout=300)
     assert run.returncode == 130
     assert err.startswith("\nlidarpool: interrupted; everything was stopped")  # behind the ^C
     assert re.search(r" of 300 jobs are kept in .*ds/run: continue with --resume .*\.\n$", err)
-
-
-def wait_for(condition: Callable[[], Any]) -> None:
-    stop = time.monotonic() + 300
-    while not condition():
-        assert time.monotonic() < stop, "waited in vain"
-        time.sleep(0.02)
 
 
 @pytest.mark.slow
@@ -821,4 +765,5 @@ def test_workers_that_do_not_see_the_data_set(files, whole, monkeypatch, client)
     monkeypatch.setattr(Storage, "sees", lambda *_: not in_worker())
     run = Campaign.load(files / "c.yaml").run(files / "ds", client=client)
     assert run.done == 6 and bytes_of(files / "ds") == whole
-    assert any("the driver wrote the data set" in note for note in run.notes)
+    for words in ("cannot see", "the driver wrote the data set"):
+        assert any(words in note for note in run.notes)

@@ -1,7 +1,5 @@
 """The command as a user sees it when all goes well: files, report, what is printed."""
 
-from __future__ import annotations
-
 import json
 import logging
 import os
@@ -26,7 +24,6 @@ from lidarpool.cli.terminal import Terminal
 from lidarpool.report.output import FILES
 
 COMMAND = [sys.executable, "-c", "from lidarpool.cli.commands import main; main()"]
-ENVIRONMENT = {**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)}
 SHORT = "sensor: {layers: 8}\nplanning: {trials: 4, iterations: 20}\n"
 
 
@@ -61,7 +58,7 @@ def demo(tmp_path_factory) -> Demo:
     with subprocess.Popen(
         [python, option, PATIENT + code, "demo", "--out", out],
         stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
-        env={**ENVIRONMENT, "MPLCONFIGDIR": "/dev/null/config"},
+        env={**os.environ, "MPLCONFIGDIR": "/dev/null/config"},
     ) as process:  # fmt: skip
         while True:
             try:
@@ -138,9 +135,6 @@ def test_the_demo_listens_on_loopback_only(demo):
     assert all(ip_address(one).is_loopback for addresses in demo.sockets for one in addresses)
 
 
-# -- on a cluster that is there -----------------------------------------------------------------
-
-
 @pytest.fixture
 def run(tmp_path, lidarpool, cluster, no_pictures) -> Callable[..., Any]:
     """Run a scenario on the threads' cluster, into the folder `out`."""
@@ -213,7 +207,7 @@ def test_verbose_shows_what_driver_and_workers_log(tmp_path):
     # In a process of its own: the workers of the tests' cluster log elsewhere.
     ended = subprocess.run(
         [*COMMAND, "run", "s.yaml", "-v", "-q", "--only", "cloud"],
-        cwd=tmp_path, env=ENVIRONMENT, check=True, capture_output=True, text=True,
+        cwd=tmp_path, check=True, capture_output=True, text=True,
     )  # fmt: skip
     assert {"scheduler", "worker"} <= set(re.findall(r"distributed\.(\w+) - INFO", ended.stderr))
 
@@ -228,12 +222,6 @@ def test_info_tells_versions_backends_and_gpus(lidarpool):
     assert told["backends"]["numpy"] == "ready" and told["workers"] == []
     assert lidarpool("-h").out == lidarpool().out == lidarpool("--help").out
     assert lidarpool("--version").out.startswith("lidarpool, version ")
-
-
-# -- on a terminal ------------------------------------------------------------------------------
-
-
-# -- drawn again ---------------------------------------------------------------------------------
 
 
 def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
@@ -264,7 +252,7 @@ def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
     (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nplanning: {enabled: false}\n")
     with subprocess.Popen(
         [sys.executable, "-m", "lidarpool", *arguments],
-        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=ENVIRONMENT,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=tmp_path,
     ) as command:  # fmt: skip
         assert command.stdout and command.stderr
         command.stdout.close()  # as `head` does after its last line

@@ -1,7 +1,5 @@
 """The command `lidarpool compare`."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

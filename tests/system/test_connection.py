@@ -1,7 +1,5 @@
 """A local cluster starts and stops whole, whenever its user interrupts; others are waited for."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -81,18 +79,3 @@ def test_a_scheduler_that_never_starts_is_named_with_the_time(address, monkeypat
     ):
         pytest.fail("it is connected")
     assert told[0].startswith(f"waiting for the scheduler at {address}, for another ")
-
-
-@pytest.mark.parametrize(
-    ("address", "message"),
-    [
-        ("foo://127.0.0.1:8786", "unknown address scheme 'foo'"),
-        ("tcp://::1:x", "ipv6 needs brackets"),
-        ("tcp://127.0.0.1", "has no port"),
-        ("tcp://:8786", "has no host"),
-        ("tcp://127.0.0.1:87860", "port of 1 to 65535, but 87860"),
-    ],
-)
-def test_waiting_does_not_mend_a_malformed_address(address, message):
-    with pytest.raises(LidarpoolError, match=message), connected(address, waiting=Waiting(3600)):
-        pytest.fail("it is connected")

@@ -1,7 +1,5 @@
 """lidarpool, raybeam and poolpart as distributions: what they hold, alone and together."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import os
 import re
@@ -44,9 +42,18 @@ def test_a_part_wants_what_the_whole_wants(name):
     assert licence == (ROOT / "LICENSE").read_bytes()
 
 
+def outside() -> dict[str, str]:
+    """Environment variables with which nothing is imported from the checkout."""
+    return {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+
+
 def python(*arguments: object, **options) -> str:
     done = subprocess.run(
-        [sys.executable, *map(str, arguments)], stdout=subprocess.PIPE, text=True, **options
+        [sys.executable, *map(str, arguments)],
+        env=outside(),
+        stdout=subprocess.PIPE,
+        text=True,
+        **options,
     )
     assert not done.returncode, done.stdout
     return done.stdout
@@ -152,10 +159,9 @@ class Environment:
         return found
 
     def run(self, *command: str, cwd: Path) -> str:
-        environment = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
         done = subprocess.run(
             [self.bin / command[0], *command[1:]],
-            cwd=cwd, env=environment, stdout=subprocess.PIPE, text=True,
+            cwd=cwd, env=outside(), stdout=subprocess.PIPE, text=True,
         )  # fmt: skip
         return done.stdout if done.returncode == 0 else f"exit {done.returncode}: {done.stdout}"
 

@@ -4,8 +4,6 @@ What cannot run says so in a comment before it, `<!-- not run: the reason -->`; 
 can be looked at without running it is. Files, links and tests that documents name exist.
 """
 
-from __future__ import annotations
-
 import ast
 import doctest
 import importlib.util
@@ -32,11 +30,15 @@ import yaml
 from distributed.cli import dask_scheduler, dask_worker
 
 import lidarpool.run.cluster
-from lidarpool import Cloud
+from lidarpool import Cloud, save_cloud
 from lidarpool.cli.commands import cli
-from lidarpool.scenario.choices import CampaignSection
+from lidarpool.datasets.dataset import DATA_SETS
+from lidarpool.export.format_table import EXPORTS, LAYOUTS
+from lidarpool.scenario.campaign_sections import CampaignSection
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.sensor.models import SensorModel
+from lidarpool.scene import point_scene as points
+from lidarpool.scene.files import meshfile, rasters
+from lidarpool.sensor.models import SensorModel, model_names, read_model
 
 ROOT = Path(__file__).parents[2]
 DOCUMENTS = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -109,7 +111,7 @@ def in_threads(monkeypatch, cluster_client):
 
 
 @pytest.mark.parametrize("block", PROGRAMS, ids=lambda block: block.where)
-def test_python_runs(tmp_path, block, in_threads, monkeypatch, capsys):
+def test_python_runs(tmp_path, block, in_threads, capsys):
     compile(block.code, block.where, "exec")
     if block.reason:
         return
@@ -117,11 +119,10 @@ def test_python_runs(tmp_path, block, in_threads, monkeypatch, capsys):
     folder.mkdir()
     one = np.ones(1, np.int32)
     columns = {"scan": one, "channel": one, "object": one}
-    Cloud(np.ones((1, 3), np.float32), columns).save(folder / "cloud.ply")
+    save_cloud(Cloud(np.ones((1, 3), np.float32), columns), folder / "cloud.ply")
     script = tmp_path / "example.py"
     fewer = block.code.replace("trials=100", "trials=4")  # all are in `make sample`
     script.write_text(fewer, encoding="utf-8")
-    monkeypatch.chdir(tmp_path)
     runpy.run_path(str(script), run_name="__main__")
     printed = capsys.readouterr().out.splitlines()
     # What a comment beside a print promises is what is printed.
@@ -146,11 +147,10 @@ def test_the_first_program_of_the_readme_runs_as_a_script(tmp_path):
 
 
 @of(*_SHELL)
-def test_commands_are_there(block, tmp_path, monkeypatch):
+def test_commands_are_there(block, tmp_path):
     # Dask asks whether files of certificates are there while it parses.
     for name in ("ca.pem", "me.pem", "me.key"):
         (tmp_path / name).touch()
-    monkeypatch.chdir(tmp_path)
     lines = commands(block)
     assert lines
     known = [look(words) for words in lines]
@@ -232,8 +232,7 @@ def leaves(data: dict[str, Any], above: str = "") -> Iterator[str]:
 
 
 @pytest.mark.slow
-def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool):
     told, ran = "", 0
     for block in blocks_of(ROOT / "docs/tutorial.md"):
         if block.reason or block.language == "python":
@@ -256,14 +255,17 @@ def test_the_tutorial_from_beginning_to_end(tmp_path, lidarpool, monkeypatch):
         assert (tmp_path / "hall/result" / name).stat().st_size > 1000
 
 
-@pytest.mark.parametrize("page", ["openusd", "cityjson"])
-def test_a_scene_is_checked_as_shown(tmp_path, lidarpool, monkeypatch, page):
-    if page == "openusd":
-        pytest.importorskip("pxr", reason="usd-core is an extra")
-    monkeypatch.chdir(tmp_path)
+@pytest.mark.parametrize(
+    ("page", "package"), [("openusd", "pxr"), ("cityjson", "json"), ("terrain", "rasterio")]
+)
+def test_a_scene_is_checked_as_shown(lidarpool, page, package):
+    pytest.importorskip(package)
     blocks = blocks_of(ROOT / f"docs/how-to/{page}.md")
-    [scene] = [block for block in blocks if block.title]
-    Path(scene.title).write_text(scene.code, encoding="utf-8")
+    for block in blocks:
+        if block.title:
+            Path(block.title).write_text(block.code, encoding="utf-8")
+        elif block.language == "python":
+            exec(block.code, {})
     [shown] = [block for block in blocks if block.language == "console"]
     [words] = commands(shown)
     outcome = lidarpool(*words[1:])
@@ -271,31 +273,15 @@ def test_a_scene_is_checked_as_shown(tmp_path, lidarpool, monkeypatch, page):
     assert {*shown.code.splitlines()[1:]} <= {*outcome.out.splitlines(), *outcome.err.splitlines()}
 
 
-def test_a_raster_is_checked_as_shown(tmp_path, lidarpool, monkeypatch):
-    pytest.importorskip("rasterio", reason="rasterio is an extra")
-    monkeypatch.chdir(tmp_path)
-    blocks = blocks_of(ROOT / "docs/how-to/terrain.md")
-    [program] = [block for block in blocks if block.language == "python"]
-    exec(program.code, {})
-    [shown] = [block for block in blocks if block.language == "console"]
-    [words] = commands(shown)
-    outcome = lidarpool(*words[1:])
-    assert outcome.code == 0
-    assert {*shown.code.splitlines()[1:]} <= {*outcome.out.splitlines()}
-
-
 def counts(line: str) -> list[int]:
     """Numbers of rays, hits and the like, which are the same on all machines, nearly."""
     nouns = "triangles|objects|scans|rays|hits|points"
-    return [int(n.replace(",", "")) for n in re.findall(rf"([\d,]+) (?:{nouns})\b", line)]
+    return [int(n.replace(",", "")) for n in re.findall(rf"(\d[\d,]*) (?:{nouns})\b", line)]
 
 
 def plain(line: str) -> str:
     """A line without its numbers, units of memory and spaces, which differ between machines."""
     return " ".join(re.sub(r"[\d,.]+(?: [kMG]?B\b)?", "N", line).split())
-
-
-# -- what documents name --------------------------------------------------------------------------
 
 
 def test_the_readme_shows_the_example_as_it_is():
@@ -327,6 +313,46 @@ def test_tests_that_the_documents_name_exist():
     assert named - written == set()
 
 
+def tables_of(page: str, head: str) -> list[list[str]]:
+    """Names in the first column of each table of a page whose heading begins with `head`."""
+    text = (ROOT / page).read_text("utf-8")
+    found = re.findall(rf"^\| {head} \|.*\n\|[-:|]+\n((?:\|.*\n)+)", text, re.M)
+    return [re.findall(r"`(\w+)`", "".join(re.findall(r"^\|([^|]*)", t, re.M))) for t in found]
+
+
+def test_tables_of_formats_are_those_of_the_code():
+    of_clouds, with_boxes = tables_of("docs/how-to/formats.md", "format")
+    assert sorted(of_clouds) == sorted(EXPORTS)
+    assert {*with_boxes} < {*EXPORTS}
+    assert tables_of("docs/how-to/formats.md", "layout") == [[*LAYOUTS]]
+    of_jobs, of_loader = tables_of("docs/how-to/datasets.md", "format")
+    assert sorted(of_jobs) == sorted(of_loader) == sorted(DATA_SETS)
+
+
+def test_numbers_of_formats_and_models_are_those_of_the_code():
+    words = ("four", "five", "six", "seven", "eight", "nine")
+    page = (ROOT / "docs/how-to/datasets.md").read_text("utf-8")
+    [count] = re.findall(r"the (\w+) formats", page)
+    assert words.index(count) + 4 == len(DATA_SETS)
+    names = model_names()
+    assert f"lists {len(names)} models" in (ROOT / "README.md").read_text("utf-8")
+    stated = sum(read_model(name).performance is not None for name in names)
+    assert f"[{stated} models]" in (ROOT / "docs/how-to/noise.md").read_text("utf-8")
+
+
+@pytest.mark.parametrize(
+    ("pages", "suffixes"),
+    [
+        (("tutorial", "how-to/terrain", "how-to/cityjson", "how-to/openusd"), meshfile.SUFFIXES),
+        (("how-to/terrain",), rasters.SUFFIXES),
+        (("how-to/point-clouds",), points.SUFFIXES),
+    ],
+)
+def test_files_that_can_be_read_are_on_their_pages(pages, suffixes):
+    text = "".join((ROOT / f"docs/{page}.md").read_text("utf-8") for page in pages)
+    assert [suffix for suffix in suffixes if not re.search(rf"\{suffix}\b", text)] == []
+
+
 def test_files_that_the_architecture_names_exist():
     text = (ROOT / "ARCHITECTURE.md").read_text(encoding="utf-8")
     tree = {
@@ -347,7 +373,3 @@ def test_the_docstring_of_simulate_says_what_is_printed(in_threads, capsys):
     for example in examples:
         exec(example.source, names)
     assert capsys.readouterr().out == "".join(example.want for example in examples) != ""
-
-
-def test_completion_offers_what_is_public():
-    assert dir(lidarpool) == sorted(lidarpool.__all__)

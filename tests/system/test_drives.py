@@ -1,7 +1,5 @@
 """Surveys from carriers that move, and what users get wrong with them."""
 
-from __future__ import annotations
-
 import json
 import re
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 from lidarpool import Mounted, Pose, Scene, Sensor, Survey, Track, read_cloud, simulate
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
-from lidarpool.scene.city import city
+from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_file import write_scene
 from lidarpool.simulator.rig import Rig
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from lidarpool import Cloud, Scene, Survey, read_cloud
+from lidarpool import Cloud, Scene, Survey, read_cloud, save_cloud
 from lidarpool.base.storage import Storage
 from lidarpool.export import pieces
 from lidarpool.export.folder import result_folder
@@ -97,6 +97,7 @@ def test_instruments_have_files_and_topics_of_the_same_numbers(cluster, lidarpoo
     (tmp_path / "again" / "imu.csv").write_text("of a user")
     scenario.write_text(text)
     assert "another survey" in lidarpool(*run).err
+    assert f"note: {out} holds the result of another" in lidarpool("check", *run[1:4]).out
     assert lidarpool(*run, "--overwrite").code == 0
     assert not measured & {path.name for path in out.iterdir()}
     other = tmp_path / "again"
@@ -128,7 +129,7 @@ def test_an_interrupt_says_which_formats_are_written(lidarpool, tmp_path, monkey
     scene, survey = Scene.seed(), Survey(poses=[(0, 0, 1)], columns=["intensity"])
     Sweeps.of(survey, scene).save(tmp_path / "sweeps.npz")
     columns = {name: np.zeros(3) for name in ("scan", "channel", "object", "intensity")}
-    Cloud(np.zeros((3, 3)), columns).save(tmp_path / "cloud.ply")
+    save_cloud(Cloud(np.zeros((3, 3)), columns), tmp_path / "cloud.ply")
     (tmp_path / "report.json").write_text("{}")
     write = Format.write
 

@@ -1,7 +1,5 @@
 """Runs that are interrupted, killed, or lose their cluster: how they end and what they leave."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal
@@ -41,7 +39,7 @@ distributed.Client.register_worker_callbacks = lambda *_: time.sleep(600)
 """
 STAYS_WRITING = """
 import time
-import lidarpool.report.pictures as pictures
+import lidarpool.report.result_pictures as pictures
 pictures.draw_scene = lambda *_, **__: time.sleep(600)
 """
 
@@ -153,7 +151,6 @@ def test_ctrl_c_when_the_result_is_whole(lidarpool, cluster, tmp_path, monkeypat
         return replace(path, to)
 
     (tmp_path / "s.yaml").write_text(SHORT)
-    monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(Path, "replace", interrupted)
     run = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster, "-q", "--no-plan")
     assert run.code == 130

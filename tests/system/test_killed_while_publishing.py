@@ -1,9 +1,6 @@
 """A driver that is killed before any one file operation while its result goes into place."""
 
-from __future__ import annotations
-
 import json
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -55,11 +52,9 @@ def killed(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     """Folders as each of the killed left them; the last was left to do its work."""
     root = tmp_path_factory.mktemp("killed")
     subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", SCRIPT, root, json.dumps(NEW),
-         json.dumps(FILES)],
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+        [sys.executable, "-W", "ignore", "-c", SCRIPT, root, json.dumps(NEW), json.dumps(FILES)],
         check=True,
-    )  # fmt: skip
+    )
     folders = sorted(root.iterdir(), key=lambda folder: int(folder.name))
     assert len(folders) > len(NEW)
     return folders

@@ -1,13 +1,10 @@
 """The notebook among the examples, executed as a user would."""
 
-import re
 from pathlib import Path
 
 import nbformat
 import pytest
 from nbclient import NotebookClient
-
-from lidarpool.export.formats import Format
 
 EXAMPLE = Path(__file__).parents[2] / "examples/drive.ipynb"
 
@@ -30,13 +27,3 @@ def test_the_notebook_shows_progress_a_result_a_table_and_a_picture(tmp_path):
     assert result.count("data:image/png;base64") == 2
     assert result.count("max-width:800px") == 2  # as drawn: smaller, letters could not be read
     assert "<iframe src=" in shown[-1].data["text/html"]
-
-
-def test_the_notebook_needs_no_package_that_readme_does_not_install():
-    """Formats and dataframes have packages of their own, which `pip install .` leaves out."""
-    notebook = nbformat.read(EXAMPLE, 4)
-    code = "\n".join(cell.source for cell in notebook.cells if cell.cell_type == "code")
-    for format_ in re.findall(r'formats=\["(\w+)"', code):
-        Format(format_)  # LidarpoolError if there is none
-        assert format_ in ("kitti", "nuscenes")
-    assert not re.search(r"to_dataframe|to_dask|pandas|pyarrow|polars", code)

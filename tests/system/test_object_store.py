@@ -1,10 +1,6 @@
 """Parts, runs and results in an object store that speaks S3."""
 
-from __future__ import annotations
-
 import json
-import os
-import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from hashlib import sha256
@@ -15,17 +11,19 @@ import numpy as np
 import pytest
 from fsspec.registry import _registry
 from tests.clusters import thread_cluster
-from tests.lidarpool.drives import the_scene, the_sweeps, write_set
+from tests.drives import the_scene, the_sweeps, write_set
+from tests.killed_drivers import drive
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
-from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of, drive
-from tests.system.test_resume import DRIVERS, SCANS
+from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of
+from tests.system.test_resume import SCANS
 from tests.system.test_resume import SCENARIO as RESUMED
 
 import lidarpool as package
 from lidarpool.base.storage import Storage
 from lidarpool.columns.parts import PartColumns, unpack
-from lidarpool.export.dataset import DATA_SETS, job_file
-from lidarpool.export.jobs import JobRow
+from lidarpool.datasets.dataset import job_file
+from lidarpool.datasets.job_table import JobRow
+from lidarpool.export.format_table import DATA_SETS
 from lidarpool.export.sweeps import SWEEPS_FILE
 from lidarpool.run.store import RunStore
 
@@ -93,9 +91,6 @@ def test_parts_go_to_the_bucket_until_the_result_is_whole(run, tmp_path, monkeyp
     assert (parts[0].first, parts[-1].stop) == (0, 108)
     assert sum(len(part) for part in parts) == 995
     assert not (out / "run").exists()
-
-
-# -- runs and results ----------------------------------------------------------------------------
 
 
 @pytest.mark.slow
@@ -251,30 +246,13 @@ def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
     (here / "s.yaml").write_text(RESUMED)
     whole = ["--out", tmp_path / "whole", "--only", "cloud", "-q", "--scheduler", cluster]
     assert lidarpool("run", here / "s.yaml", *whole).code == 0
-    commit = 'before(RunDatabase, "commit", "COMMIT")'
-    put = 'before(lidarpool.cli.run_command.Storage, "put", "PUT")'
-    often = "\n    import lidarpool.run.remote as r, lidarpool.run.run as run"
-    often += "\n    r.COPY_EVERY_S = r.COPY_REST = run.SAVE_EVERY_S = 0"
-    script = DRIVERS.replace(commit, f"{commit}\n    {put}{often}")
-
-    def drive(*kills: tuple[str, int]) -> list[int]:
-        done = subprocess.run(
-            [
-                sys.executable, "-c", script,
-                json.dumps(["run", "s.yaml", "--out", url, "--resume", "--scheduler", cluster]),
-                json.dumps(kills),
-            ],
-            cwd=here,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-            capture_output=True, text=True, check=True,
-        )  # fmt: skip
-        assert "Traceback" not in done.stderr, done.stderr
-        return [json.loads(line)[1] for line in done.stdout.splitlines() if '"ended"' in line]
-
+    often = "import lidarpool.run.remote as r, lidarpool.run.run as run\n"
+    often += "r.COPY_EVERY_S = r.COPY_REST = run.SAVE_EVERY_S = 0\n"
+    run = ["s.yaml", "--out", url, "--resume", "--scheduler", cluster]
     moments = [("COMMIT", 1), ("driver.frame", 100), ("COMMIT", 4), ("OPEN", 1), ("SAVE", 1)]
-    assert drive(*moments, ("PUT", 3)) == [-9] * 6
+    assert drive(here, [*moments, ("PUT", 3)], *run, prelude=often) == [-9] * 6
     assert "report.json" not in Storage.at(url).sizes()
-    assert drive(("REMOVE", 1), ("", 1)) == [-9, 0]
+    assert drive(here, [("REMOVE", 1), ("", 1)], *run, prelude=often) == [-9, 0]
     out = Storage.at(url)
     assert out.read("cloud.ply") == (tmp_path / "whole" / "cloud.ply").read_bytes()
     report = json.loads(out.read("report.json"))
@@ -295,7 +273,8 @@ def test_a_campaign_goes_to_the_bucket_though_its_driver_is_killed(
         run = ["run", tmp_path / "c.yaml", "-q", "--scheduler", address, "--out"]
         assert lidarpool(*run, tmp_path / "here").code == 0
         kills = [("COMMIT", 2), ("END", 2), ("FINISH", 1), ("REMOVE", 1), ("", 1)]
-        assert drive(tmp_path, address, kills, "--out", url) == [-9] * 4 + [0]
+        options = ["--resume", "-q", "--scheduler", address, "--out", url]
+        assert drive(tmp_path, kills, "c.yaml", *options) == [-9] * 4 + [0]
     system, folder = fsspec.url_to_fs(url)
     system.invalidate_cache()
     found = {name.removeprefix(f"{folder}/"): system.cat(name) for name in system.find(folder)}

@@ -1,7 +1,5 @@
 """The command on a cluster that somebody else started: same bytes, right places."""
 
-from __future__ import annotations
-
 import json
 from hashlib import sha256
 from pathlib import Path
@@ -10,8 +8,9 @@ import pytest
 from distributed import Client
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 
-from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
+from lidarpool import LidarpoolError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 
+SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0, 0, 1)], steps=72)
 EXAMPLE = Path(__file__).parents[2] / "examples" / "seed.yaml"
 
 
@@ -50,10 +49,7 @@ def test_an_outside_cluster_gives_the_same_bytes(
 
 def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_client, same_cloud):
     """Another instruction set, for example: workers like most others cast."""
-    survey = Survey(
-        Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0, 0, 1)], steps=72
-    )
-    expected = simulate(Scene.seed(), survey, client=cluster_client, backend="numpy")
+    expected = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="numpy")
     cluster = outside()
     ours = [cluster.add(("GPU", 1)), cluster.add(("GPU", 1))]
     preload = "import lidarpool.base.software as s; s.backend_build = lambda name: 'by hand'"
@@ -61,7 +57,7 @@ def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_c
     cluster.add(("LIDAR", 4))
     cluster.wait()
     with Client(cluster.address, set_as_default=False) as client:
-        result = simulate(Scene.seed(), survey, client=client, backend="numpy")
+        result = simulate(Scene.seed(), SURVEY, client=client, backend="numpy")
     assert same_cloud(result.cloud, expected.cloud)
     [note] = [note for note in result.notes if note.startswith(f"worker {other} ")]
     assert note.endswith("has numpy by hand, the run numpy: it cast nothing")
@@ -71,9 +67,6 @@ def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_c
 @pytest.mark.parametrize("partition", ["LIDAR", pytest.param("OTHER", marks=pytest.mark.slow)])
 def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(outside, partition):
     """Those that are there when it begins are refused; this one joins late."""
-    survey = Survey(
-        Sensor.grid(rays_per_revolution=360, layers=4, step_deg=5), [(0, 0, 1)], steps=72
-    )
     planning = Planning((25, 25), (-30, -20), trials=200, particles=60, iterations=60)
     cluster = outside()
     cluster.add(("GPU", 1))
@@ -82,7 +75,7 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
     cluster.wait()
     preload = "import lidarpool.base.software as s; s.sources = lambda: '12345678'"
 
-    def on_frame(frame: Frame) -> None:
+    def on_frame(frame: ScanFrame) -> None:
         if frame.scan == 10:
             cluster.add((partition, 4), preload=preload)
             cluster.wait()
@@ -93,4 +86,4 @@ def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(
         Client(cluster.address, set_as_default=False) as client,
         pytest.raises(LidarpoolError, match=r"sources 12345678\), the run .*: install the same"),
     ):
-        simulate(Scene.seed(), survey, planning, client=client, backend="numpy", on_frame=on_frame)
+        simulate(Scene.seed(), SURVEY, planning, client=client, backend="numpy", on_frame=on_frame)

@@ -1,7 +1,5 @@
 """Columns and sensors of a user's own: from their module to the files of the result."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, field
 
@@ -9,7 +7,7 @@ import laspy
 import numpy as np
 import pytest
 
-from lidarpool import Beams, Column, Scene, Sensor, Survey, read_cloud, simulate
+from lidarpool import Beams, Column, Scene, Sensor, Survey, read_cloud, save_cloud, simulate
 
 
 @dataclass(frozen=True)
@@ -106,13 +104,13 @@ def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result
 
 
 def test_points_and_cloud_are_saved_alike_with_every_column(result, tmp_path):
-    result.points.save(tmp_path / "points.laz")
-    result.cloud.save(tmp_path / "cloud.laz")
+    save_cloud(result.points, tmp_path / "points.laz")
+    save_cloud(result.cloud, tmp_path / "cloud.laz")
     assert (tmp_path / "points.laz").read_bytes() == (tmp_path / "cloud.laz").read_bytes()
     las = laspy.read(tmp_path / "cloud.laz")
     np.testing.assert_allclose(las.xyz, result.cloud.positions, atol=1e-9)
     np.testing.assert_array_equal(las["brightness"], result.cloud["brightness"])
-    result.points.save(tmp_path / "pcd", format="pcd")
+    save_cloud(result.points, tmp_path / "pcd", format="pcd")
     assert len(list((tmp_path / "pcd").iterdir())) == len(result.cloud.sweeps())
 
 

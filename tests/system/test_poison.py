@@ -1,7 +1,5 @@
 """Scans that kill whatever worker takes them."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time
@@ -14,7 +12,7 @@ from distributed import Client, Worker, WorkerPlugin
 import lidarpool.pipeline.long_stages
 import lidarpool.pipeline.rigs
 import lidarpool.run.trials
-from lidarpool import Frame, LidarpoolError, Planning, Scene, Sensor, Survey, simulate
+from lidarpool import LidarpoolError, Planning, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.pipeline.failures import words_on_memory
 
 SURVEY = Survey(Sensor.grid(rays_per_revolution=360, layers=8, step_deg=2), [(0, 0, 1)], steps=180)
@@ -35,7 +33,7 @@ def test_a_scan_that_kills_its_worker_is_named_and_all_others_are_kept(
     armed = sabotage("intersect.cast", POISON)
     frames: list[int] = []
 
-    def on_frame(frame: Frame) -> None:
+    def on_frame(frame: ScanFrame) -> None:
         frames.append(frame.scan)
 
     def run(**options: Any):

@@ -1,12 +1,8 @@
 """Runs whose workers are jobs of a real Slurm, or processes that a real SSH server starts."""
 
-from __future__ import annotations
-
 import json
-import os
 import re
 import signal
-import sys
 from collections.abc import Iterator
 from hashlib import sha256
 from pathlib import Path
@@ -45,7 +41,6 @@ def empty_queue(queue: Slurm, monkeypatch: pytest.MonkeyPatch) -> Iterator[Slurm
     """Give a queue, for this process too, that has no jobs before the test and after it."""
     for name, value in queue.environment.items():
         monkeypatch.setenv(name, value)
-    monkeypatch.setenv("PYTHONPATH", os.pathsep.join(filter(None, sys.path)))
     yield queue
     queue.ask("scancel", "--state=PENDING", "--me")
     queue.ask("scancel", "--me")

@@ -1,14 +1,21 @@
 """What a result makes of itself in Python, and that another survey's is not replaced unasked."""
 
-from __future__ import annotations
-
 import json
 import urllib.request
 from dataclasses import replace
 
 import pytest
 
-from lidarpool import LidarpoolError, Mesh, Planning, Scene, Sensor, Survey, read_cloud, simulate
+from lidarpool import (
+    LidarpoolError,
+    Planning,
+    Scene,
+    SceneMesh,
+    Sensor,
+    Survey,
+    read_cloud,
+    simulate,
+)
 from lidarpool.api.result import Result
 from lidarpool.scene.shapes import seed_objects
 
@@ -18,7 +25,7 @@ SENSOR = Sensor.grid(rays_per_revolution=90, layers=6)
 @pytest.fixture(scope="module")
 def scene() -> Scene:
     shapes = seed_objects(rings=6, segments=8)[:2]  # any triangles will do, those of trimesh too
-    return Scene.from_meshes(Mesh(one.name, one.vertices, one.faces) for one in shapes)
+    return Scene.from_meshes(SceneMesh(one.name, one.vertices, one.faces) for one in shapes)
 
 
 @pytest.fixture(scope="module")
@@ -101,20 +108,6 @@ def test_a_folder_of_a_format_with_a_file_of_the_user_is_not_replaced(result, tm
     own.unlink()
     result.report(tmp_path, only_cloud=True, overwrite=True)
     assert not own.parent.exists()
-
-
-def test_the_command_does_not_either(tmp_path, cluster, lidarpool, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nsteps: 1\nplanning: {enabled: false}\n")
-    run = ("run", "s.yaml", "--scheduler", cluster, "--only", "cloud", "--quiet")
-    assert lidarpool(*run).code == 0
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 3}\nsteps: 1\nplanning: {enabled: false}\n")
-    refused = lidarpool(*run)
-    assert refused.code == 2 and "another survey: give another folder with --out" in refused.err
-    assert (
-        "note: lidarpool-out holds the result of another survey" in lidarpool("check", "s.yaml").out
-    )
-    assert lidarpool(*run, "--overwrite").code == 0
 
 
 def test_its_page_and_that_of_its_run(result, scene, cluster_client, monkeypatch, capsys):

@@ -1,14 +1,10 @@
 """Runs whose driver is killed: the next goes on, and its result has the same bytes."""
 
-from __future__ import annotations
-
 import json
-import os
 import re
 import shutil
 import signal
 import sqlite3
-import subprocess
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,8 +13,18 @@ from typing import Any
 import pytest
 import yaml
 from distributed import Client
+from tests import killed_drivers
 
-from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, remove_run, simulate
+from lidarpool import (
+    LidarpoolError,
+    ScanFrame,
+    Scene,
+    Sensor,
+    Survey,
+    remove_run,
+    save_cloud,
+    simulate,
+)
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
@@ -35,64 +41,6 @@ pool: {backend: numpy, gpu: 1, other: 1}
 SCANS = 2 * 180
 KEPT = r"holds an unfinished run, [\d,]+ of \d+ scans: continue it with"
 
-# Each driver is a process of its own, forked from one that has imported everything. It is killed
-# when it passes a point for the n-th time; a point in capitals stands for a call.
-DRIVERS = """
-import json, os, signal, sys, traceback
-import lidarpool.cli.run_command, lidarpool.pipeline.policies, lidarpool.report.output
-import lidarpool.report.pictures as pictures
-from lidarpool.__main__ import main
-from lidarpool.pipeline.database import RunDatabase
-from lidarpool.run.store import RunStore
-from lidarpool.base.tracing import trace_to
-
-pictures.take_shot = lambda *_, **__: None
-class BlankPage:
-    def __init__(self, *_, **__): pass
-    def save(self, path): path.write_bytes(b"x")
-    def svg(self): return "<svg></svg>"
-pictures.draw_scene = pictures.draw_hits = BlankPage
-pictures.draw_cloud = pictures.draw_path = BlankPage
-lidarpool.pipeline.policies.scans_per_batch = lambda *_: 10
-
-def drive(point, times):
-    left = [times]
-    def strike(passed, fields=None):
-        left[0] -= passed == point
-        if not left[0]:
-            os.kill(os.getpid(), signal.SIGKILL)
-    def before(owner, name, label):
-        function = getattr(owner, name)
-        def call(*arguments, **options):
-            if arguments[1:] != ([],):  # something
-                strike(label)
-            return function(*arguments, **options)
-        setattr(owner, name, call)
-    trace_to(strike)
-    before(RunDatabase, "commit", "COMMIT")
-    before(RunDatabase, "__init__", "OPEN")
-    before(lidarpool.report.output.Format, "write", "SAVE")
-    before(RunStore, "remove", "REMOVE")
-    sys.argv = ["lidarpool", *json.loads(sys.argv[1])]
-    main()
-
-for point, times in json.loads(sys.argv[2]):
-    if not (child := os.fork()):
-        try:
-            drive(point, times)
-        except SystemExit as ended:
-            sys.stderr.flush()
-            sys.stdout.flush()
-            os._exit(ended.code or 0)
-        except BaseException:
-            traceback.print_exc()
-        os._exit(70)
-    code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
-    print(json.dumps(["ended", code]), flush=True)
-    if code >= 0:
-        break
-"""
-
 
 @pytest.fixture(scope="module")
 def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes:
@@ -101,29 +49,16 @@ def undisturbed(cluster: str, tmp_path_factory: pytest.TempPathFactory) -> bytes
     with Client(cluster, set_as_default=False) as client:
         result = simulate(built.scene, built.survey, client=client, backend="numpy")
     path = tmp_path_factory.mktemp("undisturbed") / "cloud.ply"
-    result.points.save(path)
+    save_cloud(result.points, path)
     return path.read_bytes()
 
 
 @pytest.fixture
-def drive(tmp_path: Path, cluster: str) -> Callable[..., list[int]]:
+def drive(tmp_path: Path, cluster: str) -> Callable[[list[tuple[str, int]]], list[int]]:
     """Run the scenario again and again, each killed at a point; how they ended."""
-
-    def drive(kills: list[tuple[str, int]], *options: str) -> list[int]:
-        (tmp_path / "s.yaml").write_text(SCENARIO)
-        arguments = ["run", "s.yaml", "--out", "out", "--resume", "--scheduler", cluster, *options]
-        done = subprocess.run(
-            [sys.executable, "-c", DRIVERS, json.dumps(arguments), json.dumps(kills)],
-            cwd=tmp_path,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
-            capture_output=True,
-            text=True,
-            check=True,
-        )
-        assert "Traceback" not in done.stderr, done.stderr
-        return [json.loads(line)[1] for line in done.stdout.splitlines() if '"ended"' in line]
-
-    return drive
+    (tmp_path / "s.yaml").write_text(SCENARIO)
+    arguments = ["s.yaml", "--out", "out", "--resume", "--scheduler", cluster]
+    return lambda kills: killed_drivers.drive(tmp_path, kills, *arguments)
 
 
 def committed(folder: Path) -> list[tuple[int, int]]:
@@ -197,21 +132,6 @@ def test_an_unfinished_run_is_refused_resumed_or_dropped(
     assert f"{part.name} was missing" in note
 
 
-def test_a_run_deletes_nothing_behind_a_link(cluster, lidarpool, tmp_path, no_pictures):
-    (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {enabled: false}\n")
-    archive, out = tmp_path / "archive", tmp_path / "out"
-    for folder in (archive, out):
-        folder.mkdir()
-    (archive / "run.db").write_text("mine")
-    (out / "run").symlink_to(archive)
-    for options in ([], ["--resume"], ["--fresh"]):
-        refused = lidarpool(
-            "run", tmp_path / "s.yaml", "--out", out, "--scheduler", cluster, "-q", *options
-        )
-        assert refused.code == 2 and f"{out}/run is a link, and" in refused.err
-    assert [path.name for path in archive.iterdir()] == ["run.db"]
-
-
 def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     (tmp_path / "s.yaml").write_text("sensor: {layers: 4}\nplanning: {trials: 2}\n")
     arguments = ["run", tmp_path / "s.yaml", "--out", tmp_path / "out", "--scheduler", cluster]
@@ -219,8 +139,6 @@ def test_nothing_to_resume_is_no_error(cluster, lidarpool, tmp_path):
     assert (done.code, done.err) == (0, "")
     assert f"note: there was nothing to resume in {tmp_path / 'out'}" in done.out
 
-
-# -- from Python ---------------------------------------------------------------------------------
 
 SURVEY = Survey(
     Sensor.grid(rays_per_revolution=360, layers=8, step_deg=5), [(0, 0, 1), (0, 0, 2)], 72
@@ -235,7 +153,7 @@ def test_frames_go_on_where_they_were(cluster_client, tmp_path, monkeypatch, sam
     def run(**options: Any):
         return simulate(Scene.seed(), SURVEY, client=cluster_client, folder=folder, **options)
 
-    def on_frame(frame: Frame) -> None:
+    def on_frame(frame: ScanFrame) -> None:
         if not first:
             with pytest.raises(LidarpoolError, match=f"Another run is using {folder}"):
                 run()

@@ -1,7 +1,5 @@
 """Runs with all columns and all that comes back of a pulse: the same bytes, whatever dies."""
 
-from __future__ import annotations
-
 import os
 import signal
 from dataclasses import replace
@@ -10,17 +8,16 @@ import numpy as np
 import pytest
 
 from lidarpool import (
-    Frame,
     Material,
     Mounted,
     Noise,
     Pose,
     Returns,
+    ScanFrame,
     Scene,
     Sensor,
     Survey,
     Track,
-    load_sensor,
     simulate,
 )
 from lidarpool.columns.table import TABLE
@@ -104,7 +101,7 @@ def test_another_cluster_other_batches_and_a_killed_worker_give_the_same_bytes(
     """Threads and one caster; processes and two, of which one is killed."""
     killed: list[int] = []
 
-    def kill(frame: Frame) -> None:
+    def kill(frame: ScanFrame) -> None:
         if frame.scan == 50:
             workers = worker_identities(client).items()
             gpu = [address for address, worker in workers if "GPU" in worker["resources"]]
@@ -119,8 +116,3 @@ def test_another_cluster_other_batches_and_a_killed_worker_give_the_same_bytes(
     assert causes == ({0} if survey is SURVEY else {0, 1, 2, 3, 4})
     other = simulate(Scene.seed(), survey, client=client, on_frame=kill)
     assert killed and same_cloud(other.cloud, cloud)
-
-
-def test_a_sensor_says_how_finely_points_are_rounded():
-    assert Survey(load_sensor("velodyne/vlp16"), [(0, 0, 1)]).precision_m == 0.002
-    assert Survey(poses=[(0, 0, 1)]).precision_m == 0.01

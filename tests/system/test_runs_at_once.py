@@ -1,7 +1,5 @@
 """Several runs at once on a cluster that has slots for one."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -11,7 +9,7 @@ from distributed import Client, Queue
 from tests.chaos.traces import scheduler_state, settled_differences
 from tests.clusters import thread_cluster
 
-from lidarpool import Frame, LidarpoolError, Planning, Result, Scene, Sensor, Survey, simulate
+from lidarpool import LidarpoolError, Planning, Result, ScanFrame, Scene, Sensor, Survey, simulate
 from lidarpool.run.progress import Progress
 from poolpart import Pool, placement_violations
 
@@ -29,7 +27,7 @@ def test_they_run_one_after_the_other(cluster, left_over, same_cloud):
         if progress.waits_for:
             refused.set()
 
-    def hold(_: Frame) -> None:
+    def hold(_: ScanFrame) -> None:
         """Do not end before another has found the slots taken."""
         assert refused.wait(300)
 
@@ -78,7 +76,7 @@ def test_two_surveys_and_a_foreign_user_do_not_see_each_other(same_cloud):
     def run(survey: Survey) -> Result:
         met: list[int] = []
 
-        def meet(_: Frame) -> None:
+        def meet(_: ScanFrame) -> None:
             if not met:  # none is done before all have begun
                 met.append(all_there.wait(300))
 

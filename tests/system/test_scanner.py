@@ -1,7 +1,5 @@
 """A scanner and a run over a cluster: the same survey, the same bytes."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from lidarpool import (

@@ -1,7 +1,5 @@
 """What helps before the first run: init, schema, help, words for mistakes."""
 
-from __future__ import annotations
-
 import re
 
 import pytest
@@ -32,8 +30,7 @@ def test_init_overwrites_nothing(tmp_path, lidarpool):
     assert [path.read_text() for path in tmp_path.iterdir()] == ["mine"]
 
 
-def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpool, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpool):
     for name in ("my room.stl", "#1: é.glb"):
         (tmp_path / name).write_bytes(trimesh.creation.box().export(file_type=name[-3:]))
     options = ["--mesh", "my room.stl", "--mesh", "#1: é.glb", "--unit", "mm"]
@@ -59,16 +56,12 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
     ],
 )
-def test_init_with_what_is_no_mesh_writes_nothing(options, says, tmp_path, lidarpool, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_init_with_what_is_no_mesh_writes_nothing(options, says, tmp_path, lidarpool):
     (tmp_path / "notes.txt").write_text("")
     outcome = lidarpool("init", "new", *options)
     assert (outcome.code, outcome.out) == (2, "")
     assert says in outcome.err
     assert not (tmp_path / "new").exists()
-
-
-# -- help and mistakes ---------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("name", sorted(cli.commands))
@@ -96,8 +89,7 @@ def test_what_is_misspelt_is_answered_with_what_was_meant(arguments, meant, lida
     assert re.search(rf"Did you mean (one of: )?.*{meant}", outcome.err), outcome.err
 
 
-def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_sensors_lists_models_and_draws_the_beams_of_one(tmp_path, lidarpool):
     outcome = lidarpool("sensors")
     assert outcome.code == 0
     rows = {line.split()[0]: " ".join(line.split()[1:]) for line in outcome.out.splitlines()}

@@ -1,7 +1,5 @@
 """What a survey gives, against what it must give by geometry."""
 
-from __future__ import annotations
-
 import logging
 import re
 import urllib.error
@@ -10,9 +8,9 @@ import urllib.request
 import numpy as np
 import pytest
 from distributed import Client
+from tests.shapes import room
 
-from lidarpool import LidarpoolError, Planning, ScanSpec, Scene, Sensor, Survey, simulate
-from lidarpool.scene.mesh import Mesh
+from lidarpool import LidarpoolError, Planning, ScanSpec, Sensor, Survey, simulate
 from lidarpool.simulator.rig import Rig
 from poolpart import PoolError
 
@@ -20,25 +18,6 @@ from poolpart import PoolError
 @pytest.fixture
 def client(cluster_client):
     return cluster_client
-
-
-def room(offset=(0.0, 0.0, 0.0)) -> Scene:
-    """A closed room of 10 by 8 by 6 metres around the offset, each side an object."""
-    low, high = np.array([-5.0, -4.0, -3.0]), np.array([5.0, 4.0, 3.0])
-    corners = np.array([[x, y, z] for x in (0, 1) for y in (0, 1) for z in (0, 1)])
-    corners = low + corners * (high - low) + offset
-    quads = {
-        "west": (0, 1, 3, 2),
-        "east": (4, 6, 7, 5),
-        "south": (0, 4, 5, 1),
-        "north": (2, 3, 7, 6),
-        "floor": (0, 2, 6, 4),
-        "ceiling": (1, 5, 7, 3),
-    }
-    return Scene.from_meshes(
-        Mesh(name, corners, np.array([[a, b, c], [a, c, d]]))
-        for name, (a, b, c, d) in quads.items()
-    )
 
 
 SENSOR = Sensor.grid(rays_per_revolution=90, layers=8, vertical_fov_deg=80, step_deg=7)
@@ -105,13 +84,6 @@ def test_a_run_has_a_page_of_partitions_as_long_as_it_lasts(client, caplog):
     assert all(f"<td>{name}</td>" in pages[-1] for name in ("GPU", "LIDAR", "OTHER", "intersect"))
     with pytest.raises(urllib.error.HTTPError, match="404"):
         urllib.request.urlopen(pages[0], timeout=120)
-
-
-def test_a_precision_too_fine_for_the_scene_is_refused(client):
-    with pytest.raises(LidarpoolError, match="precision_m 1e-06 is too fine"):
-        simulate(
-            room((3000.0, 0, 0)), Survey(SENSOR, [(0, 0, 0)], 5, precision_m=1e-6), client=client
-        )
 
 
 def test_a_client_that_has_given_its_scheduler_up_is_told_of_in_one_sentence(client):

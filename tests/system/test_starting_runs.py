@@ -1,7 +1,5 @@
 """Runs whose workers die in the moment in which they are asked what they can do."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading
@@ -9,14 +7,14 @@ from collections.abc import Callable
 
 import dask
 import pytest
-from distributed import Client, Future
+from distributed import Client
 from tests.clusters import import_jobqueue
 
 import lidarpool.run.checks
 import poolpart.clusters
-from lidarpool import Frame, LidarpoolError, Scene, Sensor, Survey, simulate
-from lidarpool.pipeline import GPU, LIDAR
-from lidarpool.pipeline.workers import CastingWorkers
+from lidarpool import LidarpoolError, ScanFrame, Scene, Sensor, Survey, simulate
+from lidarpool.pipeline.casting_workers import CastingWorkers
+from lidarpool.pipeline.names import GPU, LIDAR
 from lidarpool.run.checks import common_backend
 from poolpart import Pool, start_partitions, worker_identities
 
@@ -91,15 +89,17 @@ def test_workers_that_die_when_a_run_starts_are_waited_for(client, lose_gpu):
 def test_a_worker_that_stops_when_it_has_prepared_itself_is_done_without(client, monkeypatch):
     """Its answer cannot be had for longer than Dask's own calls wait for one."""
     stopped: list[int] = []
+    ready: list[str] = []  # the first has the scene, so that it need not ask the second for it
     take = CastingWorkers._take
 
-    def stop_and_take(workers: CastingWorkers, address: str, future: Future) -> None:
-        if not stopped:
+    def stop_and_take(workers: CastingWorkers, address: str, *answer: object) -> None:
+        ready.append(address)
+        if len(ready) == 2:
             stopped.append(client.run(os.getpid, workers=[address])[address])
             os.kill(stopped[0], signal.SIGSTOP)
-        take(workers, address, future)
+        take(workers, address, *answer)
 
-    def go_on(frame: Frame) -> None:
+    def go_on(frame: ScanFrame) -> None:
         os.kill(stopped[0], signal.SIGCONT)
 
     monkeypatch.setattr(CastingWorkers, "_take", stop_and_take)

@@ -1,7 +1,5 @@
 """`lidarpool stations`: what it prints and writes for a hall with a column, and its errors."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -10,13 +8,13 @@ import trimesh
 import yaml
 from PIL import Image
 
-from lidarpool.report.pictures import COLOURS, COVERED, UNCOVERED
+from lidarpool.report.result_pictures import COLOURS, COVERED, UNCOVERED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
 
 @pytest.fixture
-def hall(tmp_path, monkeypatch):
+def hall(tmp_path):
     """Write hall.glb, two rooms with a door between them and a column, and go to its folder."""
     boxes = {
         "Floor": ((12, 6, 0.2), (0, 0, -0.1)),
@@ -33,7 +31,6 @@ def hall(tmp_path, monkeypatch):
         scene.add_geometry(mesh, node_name=name, geom_name=name)
     (tmp_path / "hall.glb").write_bytes(scene.export(file_type="glb"))
     (tmp_path / "hall.yaml").write_text("scene: {files: [{file: hall.glb, up_axis: z}]}")
-    monkeypatch.chdir(tmp_path)
     return tmp_path
 
 

@@ -1,7 +1,5 @@
 """Encrypted clusters: who may connect, and what the others are told."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Each casting worker builds its tree once, whatever Dask's memory manager drops meanwhile."""
 
-from __future__ import annotations
-
 from lidarpool import Scene, Sensor, Survey, simulate
 from poolpart import worker_identities
 

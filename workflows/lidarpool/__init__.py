@@ -4,7 +4,6 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 from ._version import __version__
-from .base import ports
 
 if TYPE_CHECKING:
     from .api.result import Result
@@ -12,20 +11,22 @@ if TYPE_CHECKING:
     from .base.errors import LidarpoolError
     from .columns.cloud import Cloud
     from .columns.table import Column
-    from .export.loader import Sweep, sweeps
+    from .compare.comparison import Comparison, compare
+    from .datasets.loader import sweeps
+    from .datasets.sweep_data import Sweep
+    from .export.formats import save_cloud
     from .export.ply import read_cloud
-    from .pipeline import Frame
+    from .pipeline.messages import ScanFrame
     from .plan import Plan, Planning
-    from .report.comparison import Comparison, compare
-    from .run.result import CampaignRun
+    from .run.run_result import CampaignRun
     from .run.store import remove_run
     from .scenario.build import Job
     from .scene.actors import Actor
-    from .scene.instances import Instance
-    from .scene.mesh import Mesh
+    from .scene.files.urdf import load_robot
     from .scene.robot import Robot
     from .scene.scene import Scene
-    from .scene.urdf import load_robot
+    from .scene.scene_instances import SceneInstance
+    from .scene.scene_mesh import SceneMesh
     from .sensor import (
         Beams,
         Gnss,
@@ -55,14 +56,11 @@ __all__ = [
     "Cloud",
     "Column",
     "Comparison",
-    "Frame",
     "Gnss",
     "Imu",
-    "Instance",
     "Job",
     "LidarpoolError",
     "Material",
-    "Mesh",
     "Mounted",
     "Navigation",
     "Noise",
@@ -73,9 +71,12 @@ __all__ = [
     "Result",
     "Returns",
     "Robot",
+    "ScanFrame",
     "ScanSpec",
     "Scanner",
     "Scene",
+    "SceneInstance",
+    "SceneMesh",
     "Sensor",
     "Spin",
     "Survey",
@@ -89,6 +90,7 @@ __all__ = [
     "load_trajectory",
     "read_cloud",
     "remove_run",
+    "save_cloud",
     "simulate",
     "sweeps",
 ]
@@ -101,20 +103,22 @@ _MODULES = {
     "base.errors": ("LidarpoolError",),
     "columns.cloud": ("Cloud",),
     "columns.table": ("Column",),
-    "export.loader": ("Sweep", "sweeps"),
+    "datasets.loader": ("sweeps",),
+    "datasets.sweep_data": ("Sweep",),
+    "export.formats": ("save_cloud",),
     "export.ply": ("read_cloud",),
-    "pipeline": ("Frame",),
+    "pipeline.messages": ("ScanFrame",),
     "plan": ("Plan", "Planning"),
-    "report.comparison": ("Comparison", "compare"),
-    "run.result": ("CampaignRun",),
+    "compare.comparison": ("Comparison", "compare"),
+    "run.run_result": ("CampaignRun",),
     "run.store": ("remove_run",),
     "scenario.build": ("Job",),
     "scene.actors": ("Actor",),
-    "scene.instances": ("Instance",),
-    "scene.mesh": ("Mesh",),
+    "scene.scene_instances": ("SceneInstance",),
+    "scene.scene_mesh": ("SceneMesh",),
     "scene.robot": ("Robot",),
     "scene.scene": ("Scene",),
-    "scene.urdf": ("load_robot",),
+    "scene.files.urdf": ("load_robot",),
     "sensor.models": ("datasheet", "load_sensor"),
     "sensor": (
         "Beams",
@@ -136,10 +140,6 @@ _MODULES = {
     "sensor.trajectory_files": ("load_trajectory",),
     "simulator": ("Scanner",),
 }
-
-
-# Imported when the first cloud is saved.
-ports.save_cloud = lambda *given: import_module(".export.formats", __name__).save(*given)
 
 
 def __getattr__(name: str) -> Any:

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING
 
 from ..base.notebook import cell_display
 from ..base.validation import checked
-from ..base.words import counted
-from ..run.result import RunResult
+from ..base.words import plural
+from ..export.formats import save_cloud
+from ..run.run_result import RunResult
 
 if TYPE_CHECKING:
-    from ..run.picture_file import Pictured
+    from ..run.picture_file import PictureContent
 
 # In a notebook: what is drawn of a result, and how large in pixels; scaled down by much, their
 # letters could not be read.
@@ -110,7 +111,7 @@ class Result(RunResult):
         LidarpoolError
             If there is no such picture, size or column, or a file cannot be written.
         """
-        from ..report.pictures import draw_pictures
+        from ..report.result_pictures import draw_pictures
 
         return list(draw_pictures(self._pictured, self._cloud_file, folder, only, size, colour))
 
@@ -141,10 +142,10 @@ class Result(RunResult):
                 weakref.finalize(self, stack.pop_all().close)
 
     @cached_property
-    def _pictured(self) -> Pictured:
-        from ..run.picture_file import Pictured
+    def _pictured(self) -> PictureContent:
+        from ..run.picture_file import PictureContent
 
-        return Pictured.of(self)
+        return PictureContent.of(self)
 
     @cached_property
     def _cloud_file(self) -> Path:
@@ -152,7 +153,7 @@ class Result(RunResult):
         folder = mkdtemp(prefix="lidarpool-")
         weakref.finalize(self, shutil.rmtree, folder, ignore_errors=True)
         path = Path(folder) / "cloud.ply"
-        self.points.save(path)
+        save_cloud(self.points, path)
         return path
 
     def __repr__(self) -> str:
@@ -184,11 +185,11 @@ class Result(RunResult):
         yield (
             "survey",
             f"{self.survey.scan_count:,} scans, {self.rays:,} rays, {self.hits:,} hits on "
-            f"{counted(len(self.objects), 'object')} ({self.backend}, "
+            f"{plural(len(self.objects), 'object')} ({self.backend}, "
             f"{self.survey_seconds:.1f} s)",
         )
         names = ", ".join(("x", "y", "z", *(column.name for column in self.points.table)))
-        yield "cloud", f"{counted(len(self.points), 'point')}{self.thinned}: {names}"
+        yield "cloud", f"{plural(len(self.points), 'point')}{self.thinned}: {names}"
         if self.plan is not None:
             free = "free of collisions" if self.plan.collision_free else "not free of collisions"
             yield (

@@ -13,14 +13,14 @@ from ..base.validation import checked
 from ..base.vocabulary import PATIENCE_S, WAIT_S
 from ..export.folder import output_place
 from ..live import page_of
-from ..pipeline import Frame
+from ..pipeline.messages import ScanFrame
 from ..plan import Planning
 from ..report.campaign_output import DataSetOutput
 from ..run.conductor import Conductor, Kept
-from ..run.jobs import OneJob
+from ..run.job_source import OneJob
 from ..run.options import RunOptions
 from ..run.progress import Progress, Screen
-from ..run.result import CampaignRun, RunResult
+from ..run.run_result import CampaignRun, RunResult
 from ..run.store import RUN_FOLDER
 from ..scenario import campaign as described
 from ..scenario.build import Job
@@ -38,7 +38,7 @@ def simulate(
     *,
     client: Client | None = None,
     backend: str = "auto",
-    on_frame: Callable[[Frame], None] | None = None,
+    on_frame: Callable[[ScanFrame], None] | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     live: bool = False,
     queue_capacity: int = 10,
@@ -69,8 +69,8 @@ def simulate(
         Ray-casting backend of stage 2: auto, cuda, embree or numpy.
     on_frame
         Called with each frame, in scan order, while the survey runs; its points are in storage by
-        then, see `Frame.points`. It is called in this thread: a slow callback makes the pipeline
-        wait, and nothing is lost.
+        then, see `ScanFrame.points`. It is called in this thread: a slow callback makes the
+        pipeline wait, and nothing is lost.
     on_progress
         Called some ten times a second with the progress. Without it there are bars in a notebook
         and at a terminal.
@@ -151,8 +151,8 @@ def simulate(
     return Result(**declared(result, RunResult))
 
 
-class Campaign(described.Campaign):  # noqa: D101 - as there
-    __doc__ = described.Campaign.__doc__
+class Campaign(described.CampaignSpec):  # noqa: D101 - as there
+    __doc__ = described.CampaignSpec.__doc__
 
     @checked
     def run(

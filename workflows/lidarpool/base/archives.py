@@ -1,4 +1,4 @@
-"""Archives of arrays that this package has written."""
+"""Archives of arrays: what this package writes, and reads again."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ import io
 import math
 import re
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..base.arrays import AnyArray
 from .allowance import Allowance
-from .errors import LidarpoolError
+from .arrays import AnyArray
+from .errors import LidarpoolError, explained, prefixed
 
 # Head of an array of numbers in format 1.0 of NumPy, after ten bytes with its length at their end.
 _HEADER = re.compile(
@@ -24,6 +24,13 @@ _HEADER = re.compile(
 )
 _LIMITED = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)  # others unpack more than they are asked for
 _AGAIN = "get it again, or read it on a machine with more memory"
+
+
+def packed(arrays: Mapping[str, Any]) -> bytes:
+    """Return an archive of arrays: the same arrays give the same bytes."""
+    memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
+    np.savez_compressed(memory, **arrays)
+    return memory.getvalue()
 
 
 @contextmanager
@@ -35,12 +42,11 @@ def open_archive(
     With `read`, which returns the content of the file, the path is only its name in errors.
     """
     try:
-        data = read() if read else Path(path).read_bytes()
-        yield read_arrays(data, Allowance(len(data), _AGAIN))
-    except LidarpoolError as error:
-        raise LidarpoolError(f"{path}: {error}") from error
-    except OSError as error:
-        raise LidarpoolError(f"{path} cannot be read: {error.strerror or error}.") from error
+        with explained(f"{path} cannot be read"), prefixed(path):
+            data = read() if read else Path(path).read_bytes()
+            yield read_arrays(data, Allowance(len(data), _AGAIN))
+    except LidarpoolError:
+        raise
     except Exception as error:  # zipfile, zlib, NumPy and Scene have many
         reason = " ".join(str(error).split())
         raise LidarpoolError(

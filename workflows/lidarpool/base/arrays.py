@@ -16,4 +16,6 @@ Indices = NDArray[np.intp]
 Integers = NDArray[np.integer[Any]]
 Bools = NDArray[np.bool_]
 Bytes = NDArray[np.uint8]
+AnyFloats = NDArray[np.floating[Any]]
+Records = NDArray[np.void]  # rows of named fields
 AnyArray = NDArray[Any]

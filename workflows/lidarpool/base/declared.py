@@ -22,12 +22,12 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-Share = Annotated[float, Field(ge=0, le=1)]
+UnitShare = Annotated[float, Field(ge=0, le=1)]
 Seed = Annotated[int, Field(ge=0, le=2**63 - 1)]
 Text = Annotated[str, Field(min_length=1)]
 # Nothing on Earth is farther from the origin of its map.
 Coordinate = Annotated[float, Field(ge=-1e8, le=1e8)]
-Angle = Annotated[float, Field(ge=-36_000, le=36_000)]
+AngleDeg = Annotated[float, Field(ge=-36_000, le=36_000)]
 
 T = TypeVar("T")
 # YAML has only lists, which strict validation does not accept as tuples.
@@ -41,7 +41,7 @@ Triple = Three[Coordinate]
 FILLED_IN = GetPydanticSchema(lambda kind, handler: handler(kind | None))
 
 
-def told(description: str, *examples: Any, **limits: Any) -> Any:
+def about(description: str, *examples: Any, **limits: Any) -> Any:
     """Describe a field; one whose default is computed has examples."""
     return Field(description=description, examples=[*examples] or None, **limits)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import _thread
 import os
 import signal
 import threading
@@ -18,9 +17,8 @@ INTERRUPTED = 130  # exit code of shells for a program ended by Ctrl-C
 STOPPED = "interrupted; everything was stopped"
 UNTOUCHED = f"{STOPPED}, and the output folder is as it was."
 
-# From the keyboard, from a job manager, and from a terminal that is closed (not on Windows).
-_NAMES = ("SIGINT", "SIGTERM", "SIGHUP")
-_SIGNALS = tuple(getattr(signal, name) for name in _NAMES if hasattr(signal, name))
+# From the keyboard, from a job manager, and from a terminal that is closed.
+_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 _IMPATIENT_S = 1.0  # a second signal sooner than this counts as the first
 _AGAIN_S = 0.01
 _WEAK = {weakref.__file__, weakref.WeakSet.add.__code__.co_filename}  # callbacks of references
@@ -35,7 +33,9 @@ class _Interrupt:
     def __call__(self, number: int, frame: FrameType | None) -> None:
         if self.first_at is None:
             if _drops_errors(frame):  # a little later, from a thread
-                threading.Timer(_AGAIN_S, _interrupt_main_thread).start()
+                main = threading.main_thread().ident
+                # Also out of a lock that it waits for.
+                threading.Timer(_AGAIN_S, signal.pthread_kill, (main, signal.SIGINT)).start()
                 return
             self.first_at = time.monotonic()
             raise KeyboardInterrupt
@@ -51,14 +51,6 @@ def _drops_errors(frame: FrameType | None) -> bool:
             return True
         frame = frame.f_back
     return False
-
-
-def _interrupt_main_thread() -> None:
-    main = threading.main_thread().ident
-    if hasattr(signal, "pthread_kill") and main is not None:
-        signal.pthread_kill(main, signal.SIGINT)  # also out of a lock that it waits for
-    else:
-        _thread.interrupt_main()
 
 
 def end_on_signals() -> None:
@@ -124,9 +116,6 @@ def children_spared() -> Iterator[None]:
     nannies. A blocked signal stays blocked in later threads and processes, also in a worker that a
     nanny restarts.
     """
-    if not hasattr(signal, "pthread_sigmask"):  # Windows
-        yield
-        return
     before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGHUP, signal.SIGQUIT})
     try:
         # It starts with the first process, and starting it unblocks SIGINT.

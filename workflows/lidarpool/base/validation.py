@@ -39,13 +39,13 @@ from pydantic_core import (
 
 from .arrays import AnyArray
 from .errors import LidarpoolError, Mistakes
-from .words import counted, did_you_mean
+from .words import did_you_mean, plural
 
 P = ParamSpec("P")
 R = TypeVar("R")
 C = TypeVar("C", bound=type)
 Fields = Mapping[str, FieldInfo]
-Place = tuple[int | str, ...]
+FieldPath = tuple[int | str, ...]
 
 # No others, finite numbers, no conversion of text to numbers.
 STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
@@ -56,7 +56,7 @@ _EXAMPLES = {
     "Gnss": "Gnss(horizontal_m=0.02)",
     "Imu": "Imu(gyroscope_noise_density=1e-4)",
     "Material": "Material('Window*', reflectance=0.1)",
-    "Mesh": "Mesh('hall', vertices, faces)",
+    "SceneMesh": "SceneMesh('hall', vertices, faces)",
     "Mounted": "Mounted(sensor, Pose((1, 0, 2)), 'roof')",
     "Navigation": "Navigation(imu=Imu(), gnss=Gnss())",
     "Noise": "Noise(range_m=0.01)",
@@ -271,7 +271,7 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     For a misspelt name, a field of the same section is suggested.
     """
     found = {detail["loc"]: detail for detail in error.errors(include_url=False)}
-    alike: dict[Any, list[Place]] = {}  # {field and kind of mistake: where it was made}
+    alike: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: where it was made}
     for place, detail in found.items():
         # Of a list in which all entries are wrong pydantic says that it has none.
         within = (other[: len(place)] == place != other for other in found)
@@ -280,7 +280,7 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
         field = tuple(step for step in place if not isinstance(step, int))
         alike.setdefault((field, detail["type"]), []).append(place)
     for first, *others in alike.values():
-        more = f" {counted(len(others), 'more entry', 'more entries')} like it." if others else ""
+        more = f" {plural(len(others), 'more entry', 'more entries')} like it." if others else ""
         hint, known = _at(first, section)
         yield _sentence(first, [found[first]], hint, known, _in_file) + more
 
@@ -292,7 +292,7 @@ def _in_file(value: Any) -> str:
 
 def _argument_error(error: ValidationError, hints: Mapping[str, Any]) -> str:
     """Return what is wrong with the first wrong argument; of a union, with all of its kinds."""
-    places: dict[Place, list[ErrorDetails]] = {}
+    places: dict[FieldPath, list[ErrorDetails]] = {}
     for detail in error.errors(include_url=False):
         name, *steps = detail["loc"]
         entry = (name, *(step for step in steps if isinstance(step, int)))
@@ -302,7 +302,7 @@ def _argument_error(error: ValidationError, hints: Mapping[str, Any]) -> str:
 
 
 def _sentence(
-    place: Place,
+    place: FieldPath,
     details: Sequence[ErrorDetails],
     hint: Any,
     known: Collection[str],
@@ -364,7 +364,7 @@ def _range(limits: Mapping[str, Any]) -> str:
     return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
 
 
-def _at(place: Place, hint: Any) -> tuple[Any, Fields]:
+def _at(place: FieldPath, hint: Any) -> tuple[Any, Fields]:
     """Return the annotation at a place in a file, and the fields of the section around it."""
     known: Fields = {}
     inner = _named(hint)

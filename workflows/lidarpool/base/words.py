@@ -20,7 +20,7 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f" Did you mean {lower[near[0]]!r}?" if near else ""
 
 
-def counted(number: float, what: str, several: str = "") -> str:
+def plural(number: float, what: str, several: str = "") -> str:
     """Return number and noun: «1 worker», «1,200 workers»."""
     return f"{number:,} {what if number == 1 else several or what + 's'}"
 

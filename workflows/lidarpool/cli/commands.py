@@ -24,11 +24,11 @@ from ..base.interrupts import (
     interrupt_on_signals,
 )
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
-from ..base.words import counted
-from . import options
-from .options import set_logs
+from ..base.words import plural
+from . import shared_options as options
 from .result_commands import compare, export, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
+from .shared_options import set_logs
 
 if TYPE_CHECKING:
     from ..base.storage import Storage
@@ -187,7 +187,7 @@ def _run(
             from ..base.storage import Storage
             from ..run.cluster_file import ClusterFile
             from ..run.store import RUN_FOLDER
-            from ..scenario.campaign import Campaign, is_campaign
+            from ..scenario.campaign import CampaignSpec, is_campaign
             from ..scenario.scenario import Scenario
             from .run_command import run_campaign, run_job, run_scenario
             from .terminal import Terminal
@@ -198,7 +198,7 @@ def _run(
         given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER) if resumable else None}
         if len(paths) > 1 or (paths and is_campaign(paths[0])):
             several = len(paths) > 1
-            campaign = Campaign.of_scenarios(paths) if several else Campaign.load(paths[0])
+            campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
             if number is not None:
                 run_job(campaign, number, terminal, **given)
             else:
@@ -245,15 +245,15 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     lines += [f"{'GPUs here':<14} {', '.join(told['gpus']) or 'none'}", "backends"]
     lines += [f"  {name:<12} {state}" for name, state in told["backends"].items()]
     if pool is not None:
-        hosts = counted(len({worker.host for worker in workers}), "host")
-        lines.append(f"cluster: {counted(len(workers), 'worker')} on {hosts}")
+        hosts = plural(len({worker.host for worker in workers}), "host")
+        lines.append(f"cluster: {plural(len(workers), 'worker')} on {hosts}")
     for worker in workers:
         held = ", ".join(f"{name}={slots:g}" for name, slots in sorted(worker.resources.items()))
         name = f"{worker.name}  " if worker.name != worker.address else ""
         lines.append(
             f"  {held or 'no partition':<12} {name}{worker.address}  "
-            f"{counted(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
-            f"{counted(len(worker.gpus), 'GPU')}"
+            f"{plural(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
+            f"{plural(len(worker.gpus), 'GPU')}"
         )
     options.show(told, lines, as_json)
 

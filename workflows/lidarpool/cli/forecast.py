@@ -9,7 +9,7 @@ import tempfile
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from dask.system import CPU_COUNT
@@ -22,27 +22,27 @@ from poolpart.probe import visible_gpus
 from raybeam import available_backends
 
 from ..base.arrays import Floats, Ints
-from ..base.choice import one_of_each_part
 from ..base.errors import LidarpoolError, Mistakes
+from ..base.sampling import even_indices
 from ..base.storage import Storage
-from ..base.words import counted
+from ..base.words import plural
 from ..columns.cloud import CHUNK_POINTS
-from ..export.navigation import instrument_bytes
-from ..pipeline import GPU, LIDAR, OTHER
+from ..export.navigation_files import instrument_bytes
 from ..pipeline.database import FILE
+from ..pipeline.names import GPU, LIDAR, OTHER
 from ..pipeline.policies import most_scans
 from ..report.output import ROOM_BYTES, SurveyOutput
 from ..run.checks import check_memory, check_workers, find_workers, gpu_note, slots_needed
 from ..run.connection import default_workers
-from ..run.jobs import identity_of
+from ..run.job_source import identity_of
 from ..run.options import RunOptions
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Job, build
-from ..scenario.campaign import Campaign, is_campaign
+from ..scenario.campaign import CampaignSpec, is_campaign
 from ..scenario.scenario import Scenario
-from ..scene.drawn import DRAWN_TRIANGLES
 from ..scene.scene import Scene
+from ..scene.simplified import DRAWN_TRIANGLES
 from ..sensor import Sensor, Survey
 from ..sensor.beams import Beams
 from ..simulator.echoes import PATTERN_RAYS
@@ -93,7 +93,7 @@ def look_at(
     -------
     Plain data for JSON, and the same as lines of text.
     """
-    campaign = Campaign.load(path) if is_campaign(path) else None
+    campaign = CampaignSpec.load(path) if is_campaign(path) else None
     if campaign is None and number is not None:
         raise LidarpoolError(f"{path} is no campaign, and has no job {number}.")
 
@@ -153,7 +153,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
         Plain data for JSON, sizes in bytes. `reasons` say why it cannot run, each with what to
         do. `memory` is of all processes on this machine, or, on another cluster, of a GPU worker.
     """
-    file, out, formats = options.cluster, options.out, job.outputs
+    out, formats = options.out, job.outputs
     assert out is not None, "commands write"
     mistakes, notes = Mistakes(), []
     with mistakes.noted():
@@ -165,10 +165,76 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
     for one in formats:
         with mistakes.noted():
             one.check_installed()
+    cluster = _look_at_cluster(job, options, client, mistakes, notes)
+    slots, casters, backend = cluster.slots, cluster.casters, cluster.backend
+    estimate = None
+    # Casting here needs as much memory as on a worker: it would fail or be killed.
+    if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
+        estimate = sample_survey(job.scene, job.survey)
+        if not estimate["hits"]:
+            notes.append(no_hits(job))
+    if backend == "embree":
+        notes += _of_fine_triangles(job.scene)
+    # Without an estimate every ray may hit.
+    points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
+    # Scans of the largest batches; small ones take less.
+    fit = scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=backend == "cuda")
+    batch = most_scans(fit, job.survey.scan_count, max(1, slots[GPU]["there"]))
+    disk = _disk(job, points, batch, len(formats), out)
+    stored = isinstance(out, Storage)
+    if disk["free"] < (least := disk["result"] + (0 if stored else disk["parts"])):
+        mistakes.lines.append(
+            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
+            f"needs about {format_bytes(least)}: make room, name another folder with "
+            f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
+        )
+    local = options.own and client is None
+    needed = _bytes_needed(job, points, batch, cluster, local=local)
+    if cluster.memory and cluster.memory < needed:
+        mistakes.lines.append(
+            f"There are {format_bytes(cluster.memory)} of memory, and the run needs about "
+            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), a smaller "
+            "batch_mb, rays_per_revolution or planning.particles, or a machine with more."
+        )
+    return {
+        "can_run": not mistakes.lines,
+        "reasons": mistakes.lines,
+        "notes": notes,
+        "objects": len(job.scene.all_names),
+        "triangles": job.scene.triangles,
+        "masked": list(job.scene.masked),
+        "bounds": (job.scene.bounds + job.scene.origin).tolist(),
+        "poses": job.survey.path.stations,
+        "drive": _drive(job.survey),
+        "scans": job.survey.scan_count,
+        "rays": job.survey.ray_count,
+        "estimate": estimate,
+        "trials": job.trials,
+        "backend": backend,
+        "casters": casters,
+        "slots": slots,
+        "memory": {"needed": needed, "there": cluster.memory or None},
+        "disk": disk,
+    }
+
+
+class _Cluster(NamedTuple):
+    """What a run would have to cast on."""
+
+    slots: dict[str, dict[str, int]]  # {partition: {"needed": …, "there": …}}
+    casters: int
+    backend: str | None  # None if it is not known yet
+    memory: int  # bytes; 0 for machines that are not there yet
+
+
+def _look_at_cluster(
+    job: Job, options: RunOptions, client: Client | None, mistakes: Mistakes, notes: list[str]
+) -> _Cluster:
+    """Look at the cluster of `client`, or at what `options` describe."""
     required = slots_needed(options, planning=job.planning is not None)
     casting, backend = None, None
     memory = 0  # that of machines that are not there yet is unknown
-    if file is not None:
+    if (file := options.cluster) is not None:
         there = file.slots
         with mistakes.noted():
             file.require(required)
@@ -195,57 +261,14 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
             check_memory(job, options, backend, each, "a GPU worker of this machine")
     slots = {n: {"needed": least, "there": there.get(n, 0)} for n, least in required.items()}
     casters = slots[GPU]["there"] if casting is None else len(casting)
-    estimate = None
-    # Casting here needs as much memory as on a worker: it would fail or be killed.
-    if _worker_bytes(job) + cast_bytes(job.scene, job.survey) <= MEMORY_LIMIT:
-        estimate = sample_survey(job.scene, job.survey)
-        if not estimate["hits"]:
-            notes.append(no_hits(job))
-    if backend == "embree":
-        notes += _of_fine_triangles(job.scene)
-    # Without an estimate every ray may hit.
-    points = estimate["points"] if estimate else job.survey.ray_count // job.survey.keep_every
-    # Scans of the largest batches; small ones take less.
-    on_device = backend == "cuda"
-    fit = scans_that_fit(job.scene, job.survey, options.batch_mb * MB, on_device=on_device)
-    batch = most_scans(fit, job.survey.scan_count, max(1, slots[GPU]["there"]))
-    disk = _disk(job, points, batch, len(formats), out)
-    stored = isinstance(out, Storage)
-    if disk["free"] < (least := disk["result"] + (0 if stored else disk["parts"])):
-        mistakes.lines.append(
-            f"The disk of {disk['folder']} has {format_bytes(disk['free'])} free, and the run "
-            f"needs about {format_bytes(least)}: make room, name another folder with "
-            f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
-        )
-    needed = _worker_bytes(job) + cast_bytes(job.scene, job.survey, batch, on_device=on_device)
-    if not (client or file):
-        needed = needed * casters + _rest_bytes(job, points, slots)
-    if memory and memory < needed:
-        mistakes.lines.append(
-            f"There are {format_bytes(memory)} of memory, and the run needs about "
-            f"{format_bytes(needed)}: take a smaller scene, fewer workers (pool.gpu), a smaller "
-            "batch_mb, rays_per_revolution or planning.particles, or a machine with more."
-        )
-    return {
-        "can_run": not mistakes.lines,
-        "reasons": mistakes.lines,
-        "notes": notes,
-        "objects": len(job.scene.all_names),
-        "triangles": job.scene.triangles,
-        "masked": list(job.scene.masked),
-        "bounds": (job.scene.bounds + job.scene.origin).tolist(),
-        "poses": job.survey.path.stations,
-        "drive": _drive(job.survey),
-        "scans": job.survey.scan_count,
-        "rays": job.survey.ray_count,
-        "estimate": estimate,
-        "trials": job.trials,
-        "backend": backend,
-        "casters": casters,
-        "slots": slots,
-        "memory": {"needed": needed, "there": memory or None},
-        "disk": disk,
-    }
+    return _Cluster(slots, casters, backend, memory)
+
+
+def _bytes_needed(job: Job, points: int, batch: int, cluster: _Cluster, *, local: bool) -> int:
+    """Memory of a casting worker, or if the cluster is local of all its processes."""
+    on_device = cluster.backend == "cuda"
+    worker = _worker_bytes(job) + cast_bytes(job.scene, job.survey, batch, on_device=on_device)
+    return worker * cluster.casters + _rest_bytes(job, points, cluster.slots) if local else worker
 
 
 def _disk(job: Job, points: int, batch: int, exports: int, out: Path | Storage) -> dict[str, Any]:
@@ -298,7 +321,7 @@ def sample_survey(scene: Scene, survey: Survey, backend: str = "auto") -> dict[s
     returns how many rays were cast.
     """
     each = min(*survey.steps_each, SAMPLE_SCANS)  # of at most two stations: a cast of each
-    firsts = each * one_of_each_part(-(-survey.scan_count // each), SAMPLE_PARTS)
+    firsts = each * even_indices(-(-survey.scan_count // each), SAMPLE_PARTS)
     stops = np.minimum(firsts + each, survey.scan_count)
     subrays = max(returns.subrays for returns in survey.returns_each)
     rays = survey.ray_count * subrays * int((stops - firsts).sum()) // survey.scan_count
@@ -380,7 +403,7 @@ def _of_fine_triangles(scene: Scene) -> list[str]:
         # Without an area no backend hits them.
         count += int(((edges > 0) & (edges < least)).sum())
     note = "with an edge below a millionth of the scene may be missed by embree, not by numpy"
-    return [f"{counted(count, 'triangle')} {note}"] if count else []
+    return [f"{plural(count, 'triangle')} {note}"] if count else []
 
 
 def _look_at_folder(out: Path | Storage) -> list[str]:
@@ -429,10 +452,10 @@ def _point_bytes(job: Job) -> int:
     return sum(np.dtype(column.dtype).itemsize for column in job.survey.stored_columns)
 
 
-def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
+def _of_campaign(campaign: CampaignSpec, found: dict[str, Any]) -> Iterator[str]:
     """Print what was found out of a campaign as lines of text."""
     kept = campaign.keep.format + f", {campaign.keep.layout}" * (campaign.keep.format == "mcap")
-    yield f"campaign    {counted(campaign.count, 'job')}, seed {campaign.seed}, kept as {kept}"
+    yield f"campaign    {plural(campaign.count, 'job')}, seed {campaign.seed}, kept as {kept}"
     for name, words in campaign.choices.items():
         yield f"varied      {name}: {words}"
     if campaign.splits:
@@ -444,7 +467,7 @@ def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
         if job["estimate"]:
             points = f", about {job['estimate']['points']:,} points"
         yield (
-            f"            {counted(job['objects'], 'object')}, {counted(job['scans'], 'scan')}, "
+            f"            {plural(job['objects'], 'object')}, {plural(job['scans'], 'scan')}, "
             f"{job['rays']:,} rays{points}"
         )
     if found["jobs"]:
@@ -454,7 +477,7 @@ def _of_campaign(campaign: Campaign, found: dict[str, Any]) -> Iterator[str]:
         points = sum((job["estimate"] or {"points": 0})["points"] for job in found["jobs"])
         yield (
             f"in all      about {scans:,} scans, {rays:,} rays and {round(share * points):,} "
-            f"points, judged by {counted(len(found['jobs']), 'job')}"
+            f"points, judged by {plural(len(found['jobs']), 'job')}"
         )
     for note in found["notes"]:
         yield f"note: {note}"
@@ -477,7 +500,7 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         turn = f"{len(job.survey.carried)} sensors"
     elif sensor.period is not None and sensor.cycle != "frame":
         turn = f"{sensor.period:,} x {sensor.channels:,} a {sensor.cycle}"
-    yield f"scene       {counted(found['objects'], 'object')}, {found['triangles']:,} triangles"
+    yield f"scene       {plural(found['objects'], 'object')}, {found['triangles']:,} triangles"
     for file, taken in found["sources"].items():
         yield f"file        {file}: {taken}"
     sides = list(zip("xyz", *found["bounds"], strict=True))
@@ -485,11 +508,11 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
     yield f"size        {' x '.join(f'{high - low:,.2f}' for _, low, high in sides)} m; {spans}"
     if masked := found["masked"]:
         shown = ", ".join(masked[:3]) + ", …" * (len(masked) > 3)
-        have = counted(len(masked), "object has masks", "objects have masks")
+        have = plural(len(masked), "object has masks", "objects have masks")
         yield f"masks       {have}: {shown}"
     drive = found["drive"]
-    where = "along a trajectory" if drive else f"from {counted(found['poses'], 'pose')}"
-    yield f"survey      {counted(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
+    where = "along a trajectory" if drive else f"from {plural(found['poses'], 'pose')}"
+    yield f"survey      {plural(found['scans'], 'scan')} {where}, {found['rays']:,} rays ({turn})"
     if drive:
         yield f"trajectory  {drive['metres']:,.2f} m in {drive['seconds']:,.3f} s"
         for one in drive["sensors"]:
@@ -497,7 +520,7 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
             if one["turns"]:
                 turns = f", {one['turns']:,.2f} {one['cycle']}s; in one the carrier moves "
                 turns += f"{one['metres_a_turn']:,.3f} m"
-            firings = counted(one["firings"], "firing")
+            firings = plural(one["firings"], "firing")
             yield f"{one['name'] or 'sensor':<11} {one['model']}, {firings}{turns}"
     returns = job.survey.returns_each[0]
     if drive or returns != type(returns)():
@@ -514,10 +537,10 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     backend = found["backend"]
     kind = {None: "", "cuda": "GPU "}.get(backend, "CPU ")
-    workers = counted(found["casters"], f"{kind}worker")
+    workers = plural(found["casters"], f"{kind}worker")
     yield f"cast by     {workers} ({backend or 'backend not known yet'})"
     for name, slots in found["slots"].items():
-        yield f"{name:<10}  {counted(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
+        yield f"{name:<10}  {plural(slots['there'], 'slot')}, at least {slots['needed']:,} needed"
     there = found["memory"]["there"]
     limit = f" of {format_bytes(there)}" if there else ""
     yield f"memory      about {format_bytes(found['memory']['needed'])}{limit}"

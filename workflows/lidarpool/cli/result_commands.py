@@ -11,8 +11,8 @@ import click
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.vocabulary import PICTURES
-from ..export.table import EXPORTS, LAYOUTS
-from . import options
+from ..export.format_table import EXPORTS, LAYOUTS
+from . import shared_options as options
 
 
 def _size(text: str) -> tuple[int, int]:
@@ -58,8 +58,8 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
     from ..export.folder import local_folder, local_result, send
-    from ..report.pictures import draw_pictures
-    from ..run.picture_file import PICTURE_FILE, Pictured
+    from ..report.result_pictures import draw_pictures
+    from ..run.picture_file import PICTURE_FILE, PictureContent
 
     place = result if out is None else out
     with local_result(result, (PICTURE_FILE, "cloud.ply")) as made:
@@ -69,7 +69,7 @@ def plot(result: Path | Storage, out: Path | Storage | None, **given: Any) -> No
                 "folder of a finished run (its --out)."
             )
         keep_freed_memory()
-        shown, cloud = Pictured.load(made / PICTURE_FILE), made / "cloud.ply"
+        shown, cloud = PictureContent.load(made / PICTURE_FILE), made / "cloud.ply"
         with local_folder(place) as folder:
             for path in draw_pictures(shown, cloud, folder, **given):
                 click.echo(click.format_filename(send(path, place)))
@@ -112,7 +112,7 @@ def export(
     from ..columns.cloud_file import CloudFile
     from ..export.folder import local_result, result_folder, send
     from ..export.formats import Format
-    from ..export.navigation import FILES as INSTRUMENT_FILES
+    from ..export.navigation_files import FILES as INSTRUMENT_FILES
     from ..export.sweeps import SWEEPS_FILE, Sweeps
 
     # The report of a result is moved into place last.
@@ -133,16 +133,16 @@ def export(
         written: list[str] = []
         with result_folder(place) as folder:
             for one in wanted:  # before any is written, which may take long
-                one.check(folder / one.file, cloud, overwrite=overwrite)
-                if isinstance(place, Storage) and not overwrite and one.file in place.entries():
+                one.check(folder / one.row.file, cloud, overwrite=overwrite)
+                if isinstance(place, Storage) and not overwrite and one.row.file in place.entries():
                     raise LidarpoolError(
-                        f"{place.path(one.file)} is there already: give another place with --out, "
-                        "or --overwrite."
+                        f"{place.path(one.row.file)} is there already: give another place with "
+                        "--out, or --overwrite."
                     )
             try:
                 for one in wanted:
-                    one.write(folder / one.file, cloud, sweeps, overwrite=overwrite)
-                    written.append(click.format_filename(send(folder / one.file, place)))
+                    one.write(folder / one.row.file, cloud, sweeps, overwrite=overwrite)
+                    written.append(click.format_filename(send(folder / one.row.file, place)))
                     for note in one.notes(cloud):
                         click.echo(f"note: {note}", err=True)
                     click.echo(written[-1])
@@ -153,7 +153,7 @@ def export(
 
 
 @click.command()
-@click.argument("result", type=options.Place())
+@click.argument("result", type=options.StoragePath())
 @click.option(
     "--port",
     type=click.IntRange(0, 65_535),
@@ -243,8 +243,8 @@ def compare(a: Path, b: Path, out: Path, as_json: bool, **given: Any) -> None:
       lidarpool compare scan.laz earlier.laz --distance 0.05
     """  # noqa: D301 - click wants the character, not its name
     from ..base.fork_server import keep_freed_memory
-    from ..report.comparison import DISTANCES_M
-    from ..report.comparison import compare as compared
+    from ..compare.comparison import DISTANCES_M
+    from ..compare.comparison import compare as compared
 
     keep_freed_memory()
     given["distances_m"] = given["distances_m"] or DISTANCES_M

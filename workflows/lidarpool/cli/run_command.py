@@ -12,10 +12,10 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
-from ..base.words import counted
-from ..export.dataset import DataSet
+from ..base.words import plural
+from ..datasets.dataset import DataSet
+from ..datasets.job_table import Tally, read_table
 from ..export.folder import local_result, output_place
-from ..export.jobs import Tally, read_table
 from ..live import page_of
 from ..report.campaign_output import (
     CAMPAIGN_FILE,
@@ -27,17 +27,17 @@ from ..report.campaign_output import (
 from ..report.output import CLOUD, SurveyOutput
 from ..report.report import summary
 from ..run.conductor import Conductor
-from ..run.jobs import OneJob
+from ..run.job_source import OneJob
 from ..run.options import RunOptions
-from ..run.result import RunResult
+from ..run.run_result import RunResult
 from ..run.store import RUN_FOLDER
 from ..scenario.advice import advice
 from ..scenario.build import Built, Job, build
-from ..scenario.campaign import Campaign
+from ..scenario.campaign import CampaignSpec
 from ..scenario.placing import seen_from
 from ..scenario.scenario import Scenario
 from ..simulator.world import check_backend_here
-from .options import show
+from .shared_options import show
 from .terminal import Terminal
 
 
@@ -82,7 +82,9 @@ def _run_survey(
                 page.stay(folder / CLOUD)
 
 
-def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **given: Any) -> None:
+def run_campaign(
+    campaign: CampaignSpec, terminal: Terminal, *, only: str | None, **given: Any
+) -> None:
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
     if only:
         raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
@@ -97,8 +99,8 @@ def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **
         told |= {name: getattr(run, name) for name in names}
         lines = [
             *(f"note: {note}" for note in run.notes),
-            f"{counted(run.done, 'job')}, {counted(run.rays, 'ray')}, "
-            f"{counted(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
+            f"{plural(run.done, 'job')}, {plural(run.rays, 'ray')}, "
+            f"{plural(run.points, 'point')} in the data set ({run.seconds:.1f} s)",
             f"data set in {click.format_filename(str(options.out))}: see README.md there",
         ]
         show(told, lines, terminal.as_json)
@@ -109,7 +111,12 @@ def run_campaign(campaign: Campaign, terminal: Terminal, *, only: str | None, **
 
 
 def run_job(
-    campaign: Campaign, number: int, terminal: Terminal, *, only: str | None, **given: Any
+    campaign: CampaignSpec,
+    number: int,
+    terminal: Terminal,
+    *,
+    only: str | None,
+    **given: Any,
 ) -> None:
     """Run one job of a campaign again, and write it as the result of a survey.
 
@@ -163,10 +170,10 @@ def _of_result(
         yield f"note: {no_hits(job)}"
     on = report["hits_on_surfaces"]
     yield (
-        f"{counted(job.survey.scan_count, 'scan')}, {counted(result.rays, 'ray')}, "
-        f"{counted(on, 'hit')} on {counted(len(job.scene.all_names), 'object')}"
+        f"{plural(job.survey.scan_count, 'scan')}, {plural(result.rays, 'ray')}, "
+        f"{plural(on, 'hit')} on {plural(len(job.scene.all_names), 'object')}"
         f"{f' and {result.hits - on:,} on none' if result.hits > on else ''}, "
-        f"{counted(len(result.points), 'point')} in the cloud{result.thinned} "
+        f"{plural(len(result.points), 'point')} in the cloud{result.thinned} "
         f"({result.backend}, {result.survey_seconds:.1f} s)"
     )
     if (plan := result.plan) is not None:

@@ -14,9 +14,9 @@ import click
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import UNITS_M
-from ..base.words import counted
-from . import options
-from .options import Command, overwrite, together
+from ..base.words import plural
+from . import shared_options as options
+from .shared_options import Command, overwrite, together
 
 if TYPE_CHECKING:
     from ..plan.stations import StationPlan
@@ -109,7 +109,7 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
 
 def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> dict[str, str]:
     """Entry of `scene.files` for a mesh file, relative to the scenario's folder."""
-    from ..scene.meshfile import SUFFIXES
+    from ..scene.files.meshfile import SUFFIXES
 
     if not path.is_file() or path.suffix.lower() not in SUFFIXES:
         raise LidarpoolError(
@@ -151,7 +151,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
     made = import_survey(survey, out or Path(survey.stem), assets)
     sensors, files = len(made.scenario.sensors), len(made.scenario.scene.files)
     name = click.format_filename(made.path)
-    click.echo(f"{name}: {counted(sensors, 'sensor')}, {counted(files, 'mesh file')}")
+    click.echo(f"{name}: {plural(sensors, 'sensor')}, {plural(files, 'mesh file')}")
     for line in made.left_out:
         click.echo(f"not supported: {line}")
     click.echo(f"next: lidarpool check {shlex.quote(str(made.path))}")
@@ -265,7 +265,7 @@ def city(out: Path, triangles: int, seed: int, overwrite: bool, trees: int, cars
       lidarpool scene city city.ply --triangles 10000000 --seed 7
       lidarpool scene city green.glb --trees 500 --cars 200
     """  # noqa: D301 - click wants the character, not its name
-    from ..scene.city import city as make
+    from ..scene.generated.city import city as make
 
     _write(out, lambda: make(triangles, seed, trees, cars), overwrite)
 
@@ -283,7 +283,7 @@ def terrain(out: Path, triangles: int, seed: int, side: float, overwrite: bool, 
       lidarpool scene terrain small.obj --triangles 20000 --side 100
       lidarpool scene terrain woods.glb --trees 10000
     """  # noqa: D301 - click wants the character, not its name
-    from ..scene.terrain import terrain as make
+    from ..scene.generated.terrain import terrain as make
 
     _write(out, lambda: make(triangles, seed, side, trees), overwrite)
 
@@ -311,7 +311,7 @@ def points(cloud: Path, out: Path, voxel_m: float | None, size: float, overwrite
       lidarpool scene points scan.ply place.glb
       lidarpool scene points survey.laz place.obj --voxel-m 0.5
     """  # noqa: D301 - click wants the character, not its name
-    from ..scene.points import scene_of_points
+    from ..scene.point_scene import scene_of_points
 
     _write(out, lambda: scene_of_points(cloud, voxel_m=voxel_m, size=size), overwrite)
 
@@ -334,7 +334,7 @@ def _write(out: Path, make: Callable[[], Scene], overwrite: bool) -> None:
     write_scene(out, made)
     low, high = made.bounds
     click.echo(
-        f"{made.triangles:,} triangles, {counted(len(made.names), 'object')}, "
+        f"{made.triangles:,} triangles, {plural(len(made.names), 'object')}, "
         f"{' x '.join(f'{length:.0f}' for length in high - low)} m: {click.format_filename(out)}"
     )
 
@@ -475,7 +475,7 @@ def stations(
     if count is not None and coverage is not None:
         raise click.UsageError("--count and --coverage both say when to stop: give one of them.")
     from ..plan.stations import STATIONS_MOST, plan_stations
-    from ..report.pictures import draw_stations
+    from ..report.result_pictures import draw_stations
     from ..scenario.advice import advice
     from ..scenario.build import build
     from ..scenario.scenario import Scenario
@@ -497,7 +497,7 @@ def stations(
         page = draw_stations(built.scene, plan)
     folder.mkdir(parents=True, exist_ok=True)
     file = folder / PLAN_FILE
-    file.write_text(_scenario(read, scene.parent, folder, model, plan), "utf-8", newline="\n")
+    file.write_text(_scenario(read, folder, model, plan), "utf-8", newline="\n")
     page.save(folder / PICTURE_FILE)
     notes = advice(built)
     reached = float(plan.coverage[-1])
@@ -509,39 +509,37 @@ def stations(
     if count is not None and len(plan.stations) < count:
         notes.append(f"{len(plan.stations)} of {count} stations already see all that can be seen")
     figures = _figures(plan, built.scene.names, sensor.model, notes)
-    lines = [*_told(plan, built.scene.names), *(f"note: {note}" for note in notes)]
+    lines = [*_plan_lines(plan, built.scene.names), *(f"note: {note}" for note in notes)]
     options.show(figures, lines, as_json)
     if not as_json:
         click.echo(f"stations in {click.format_filename(folder)}: {PLAN_FILE}, {PICTURE_FILE}")
         click.echo(f"next: lidarpool check {shlex.quote(str(file))}")
 
 
-def _scenario(read: Scenario, base: Path, folder: Path, model: str, plan: StationPlan) -> str:
+def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> str:
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
     from ..scenario.scenario import MESH_CLOUD
 
-    def moved(file: str) -> str:
-        path = (base / Path(file).expanduser()).resolve()
-        return Path(os.path.relpath(path, folder.resolve())).as_posix()
+    def moved(file: Path) -> str:
+        return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
 
     entry = read.scene.model_dump(exclude_unset=True, mode="json", by_alias=True)
     copies = entry.get("copies", [])
     named = [*entry.get("files", []), *(c.get(kind) for c in copies for kind in ("file", "table"))]
     for one in filter(None, named):
-        one["file"] = moved(one["file"])
-    if model.endswith((".yaml", ".yml")):
-        model = Path(os.path.relpath(Path(model).resolve(), folder.resolve())).as_posix()
+        one["file"] = moved(read.path(one["file"]))
+    own = model.endswith((".yaml", ".yml"))
     data = {
         **({"scene": entry} if entry else {}),
-        "sensor": {"model": model},
+        "sensor": {"model": moved(Path(model)) if own else model},
         "poses": [[round(float(part), 3) for part in place] for place in plan.stations],
         "steps": 36,
         "cloud": {**MESH_CLOUD, "columns": ["range"]},
     }
     head = (
-        f"# {counted(len(plan.stations), 'station')}, in the order in which they were chosen: "
+        f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen: "
         f"{plan.coverage[-1]:.1%} of what\n# can be seen is covered. Steps are of 10 degrees: one "
         "turn from each.\n"
     )
@@ -568,12 +566,12 @@ def _figures(
     }
 
 
-def _told(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
+def _plan_lines(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
     """Print a plan as lines of text: stations, then objects, those with most left first."""
-    from ..render.page import without_common_prefix
+    from ..render.picture_page import without_common_prefix
 
     yield (
-        f"{counted(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
+        f"{plural(len(plan.candidates), 'place')} on a grid of {plan.spacing_m:g} m, which see "
         f"{plan.visible_m2.sum():,.0f} m²"
     )
     yield "station        x          y          z   covered     added"
@@ -596,4 +594,4 @@ def _told(plan: StationPlan, names: tuple[str, ...]) -> Iterator[str]:
         yield f"{label:<{wide}} {visible:9,.1f} m² {covered / visible:9.1%}"
     blind = len(names) - len(order)
     if blind:
-        yield f"out of sight from all places: {counted(blind, 'object')}"
+        yield f"out of sight from all places: {plural(blind, 'object')}"

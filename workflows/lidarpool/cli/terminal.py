@@ -15,7 +15,7 @@ from rich.console import Console
 
 from ..base.streams import Unheard
 from ..run.progress import STAGES, Pace, Progress, Screen, Show, bars, standing_still
-from .options import set_logs
+from .shared_options import set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
 # of hours does not fill a log.

@@ -7,14 +7,12 @@ from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.util import find_spec
-from pathlib import Path
 from typing import Any, Literal, Protocol
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
-from ..base import ports
-from ..base.arrays import AnyArray
+from ..base.arrays import AnyArray, AnyFloats, Integers
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..base.validation import as_array, checked, checked_fields
@@ -30,7 +28,7 @@ class CloudLike(Protocol):
     def __len__(self) -> int: ...
 
     @property
-    def bounds(self) -> NDArray[np.floating]:
+    def bounds(self) -> AnyFloats:
         """Lowest and highest coordinates, (2, 3), metres, in the positions' type."""
 
     @property
@@ -44,56 +42,9 @@ class CloudLike(Protocol):
         """Row of the first point of a scan, if the points are in the order of scans."""
 
 
-class Savable:
-    """Common base of clouds in memory and in parts: `save`."""
-
-    # Returns the `lidarpool.export.sweeps.Sweeps` of the survey; None if unknown.
-    sweeps: Callable[[], Any] | None
-
-    @checked
-    def save(
-        self,
-        path: str | Path,
-        *,
-        format: str | None = None,  # noqa: A002 - its name in scenarios and in the command
-        layout: str = "velodyne",
-        precision_m: float | None = None,
-    ) -> list[str]:
-        """Write the points in the format of the path's ending, completely or not at all.
-
-        The same points give the same bytes. About a million points are in memory at a time, or
-        those of the largest sweep.
-
-        Parameters
-        ----------
-        path
-            Its ending is .ply, .las, .laz, .e57, .mcap or .parquet, unless there is a `format`.
-            Its folder must exist. An existing file is replaced, a folder is not.
-        format
-            Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
-            "nuscenes" or "rosbag2".
-        layout
-            Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
-            velodyne with range images.
-        precision_m
-            Step of stored positions, metres; by default that of the survey, else 0.001.
-
-        Returns
-        -------
-        Names of the columns that the format cannot hold.
-
-        Raises
-        ------
-        LidarpoolError
-            If there is no such format, it lacks a column or package, it stores single sweeps and
-            the cloud is not of a result, or the file cannot be written.
-        """
-        return ports.save_cloud(Path(path), self, format, layout, precision_m)
-
-
 @dataclass(frozen=True, eq=False, repr=False)
 @checked_fields
-class Cloud(Savable):
+class Cloud:
     """Points of a survey, ordered by scan and ray.
 
     Read a column as ``cloud["channel"]``, or as ``cloud.scan`` unless an attribute has its name.
@@ -107,7 +58,7 @@ class Cloud(Savable):
     own
         Descriptions of the columns that are not in the table.
     sweeps
-        Returns the sweeps of the survey for `save`; clouds of a `Result` have it.
+        Returns the sweeps of the survey for `save_cloud`; clouds of a `Result` have it.
 
     Raises
     ------
@@ -115,7 +66,7 @@ class Cloud(Savable):
         If the lengths differ, a position is not finite, or a value does not fit its column.
     """
 
-    positions: NDArray[np.floating]
+    positions: AnyFloats
     columns: Mapping[str, AnyArray]
     own: tuple[Column, ...] = ()
     sweeps: Callable[[], Any] | None = None
@@ -194,7 +145,7 @@ class Cloud(Savable):
         return Waveforms.of(self.columns[WAVEFORM])
 
     @property
-    def bounds(self) -> NDArray[np.floating]:
+    def bounds(self) -> AnyFloats:
         """Lowest and highest coordinates, (2, 3), metres; zeros where there are no points."""
         if not len(self):
             return np.zeros((2, 3), self.positions.dtype)
@@ -223,7 +174,7 @@ class Cloud(Savable):
             cloud.point[column.in_files] = o3d.core.Tensor(values)
         return cloud
 
-    def part(self, rows: slice | NDArray[np.integer]) -> Cloud:
+    def part(self, rows: slice | Integers) -> Cloud:
         """Select points; consecutive ones as views."""
         columns = {name: array[rows] for name, array in self.columns.items()}
         return Cloud(self.positions[rows], columns, self.own, self.sweeps)

@@ -8,10 +8,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, Ints
-from ..base.choice import one_of_each_part
+from ..base.arrays import AnyArray, AnyFloats, Ints, Records
+from ..base.sampling import even_indices
 from .cloud import CHUNK_POINTS, Cloud
 from .ply_format import AXES, mapped_rows
 from .table import TABLE, Column
@@ -29,7 +28,7 @@ class CloudFile:
         dtype = self._rows.dtype
         self.table = _table(dtype, own)
         scans = self._rows["scan"] if "scan" in (dtype.names or ()) else np.empty(0, np.int32)
-        some = scans[one_of_each_part(len(scans), 100_000)]
+        some = scans[even_indices(len(scans), 100_000)]
         ordered = scans.dtype.kind in "iu" and bool((np.diff(some) >= 0).all())
         # First and last scan; (0, 0) if the points are not in scan order.
         self.scans = (int(scans[0]), int(scans[-1])) if ordered and len(scans) else (0, 0)
@@ -38,7 +37,7 @@ class CloudFile:
         return len(self._rows)
 
     @property
-    def bounds(self) -> NDArray[np.floating]:
+    def bounds(self) -> AnyFloats:
         """Lowest and highest coordinates, (2, 3), metres; all points are read for it."""
         each = [chunk.bounds for chunk in self.chunks()] or [np.zeros((2, 3))]
         lows, highs = zip(*each, strict=True)
@@ -51,7 +50,7 @@ class CloudFile:
 
     def choose(self, most: int) -> Cloud:
         """Select at most so many evenly spaced points, and of these the finite ones, in order."""
-        rows = self._rows[one_of_each_part(len(self), most)]
+        rows = self._rows[even_indices(len(self), most)]
         known = np.isfinite(_positions(rows)).all(axis=1)
         return self._cloud(rows if known.all() else rows[known], np.float64)
 
@@ -71,12 +70,12 @@ class CloudFile:
         files = {column.name: column.in_files for column in self.table}
         return np.asarray(self._rows[files.get(name, name)][rows])
 
-    def _cloud(self, rows: NDArray[np.void], dtype: Any = None) -> Cloud:
+    def _cloud(self, rows: Records, dtype: Any = None) -> Cloud:
         columns = {column.name: rows[column.in_files] for column in self.table}
         return Cloud(_positions(rows, dtype), columns, self.table)
 
 
-def _positions(rows: NDArray[np.void], dtype: Any = None) -> AnyArray:
+def _positions(rows: Records, dtype: Any = None) -> AnyArray:
     return np.stack([rows[axis] for axis in AXES], axis=1, dtype=dtype)
 
 

@@ -18,14 +18,13 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from ..base.archives import read_array, read_arrays
-from ..base.arrays import AnyArray, Floats, Floats32, Ints, Ints32, UInts32
-from ..base.choice import one_of_each_part
+from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.errors import LidarpoolError
+from ..base.sampling import even_indices
 from ..base.storage import Storage, target_of
-from .cloud import CHUNK_POINTS, Cloud, Savable, described, need_packages
+from .cloud import CHUNK_POINTS, Cloud, described, need_packages
 from .table import AXES, SCAN, Column
 from .waveforms import WAVEFORM
 
@@ -122,7 +121,7 @@ class PartColumns:
         table: Sequence[Column],
         precision_m: float,
         origin: Floats,
-        rows: NDArray[np.integer] | slice = slice(None),
+        rows: Integers | slice = slice(None),
         sweeps: Callable[[], Any] | None = None,
     ) -> Cloud:
         """Points of the part, or some of its rows, with these columns beside the positions.
@@ -221,7 +220,7 @@ def read_tally(storage: Storage, name: str) -> tuple[Ints32, Ints]:
 
 
 @dataclass(eq=False, repr=False)
-class StoredCloud(Savable):
+class StoredCloud:
     """The points of parts in (scan, ray) order, read in pieces; a `CloudLike`."""
 
     storage: Storage  # of the parts
@@ -233,7 +232,7 @@ class StoredCloud(Savable):
     precision_m: float  # size of the cells that positions were rounded to
     origin: Floats  # world position of the scene's local origin, (3,), metres
     keeper: Any = None  # kept alive while the parts can be read
-    sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save`
+    sweeps: Callable[[], Any] | None = None  # returns the sweeps of the survey for `save_cloud`
 
     def __getstate__(self) -> dict[str, Any]:
         return self.__dict__ | {"keeper": None, "sweeps": None}  # both hold the scene
@@ -262,7 +261,7 @@ class StoredCloud(Savable):
         """Whether its points have waveforms."""
         return any(column.name == WAVEFORM for column in self.columns)
 
-    def cloud_of(self, part: PartColumns, rows: NDArray[np.integer] | slice = slice(None)) -> Cloud:
+    def cloud_of(self, part: PartColumns, rows: Integers | slice = slice(None)) -> Cloud:
         """Points of a part, or some of them."""
         return part.cloud(self.table, self.precision_m, self.origin, rows, self.sweeps)
 
@@ -300,9 +299,9 @@ class StoredCloud(Savable):
     def sample(self, most: int, parts: int) -> Cloud:
         """Read at most so many evenly spaced points, of at most so many parts."""
         filled = [i for i, rows in enumerate(self.rows) if rows]
-        opened = [filled[i] for i in one_of_each_part(len(filled), parts)]
+        opened = [filled[i] for i in even_indices(len(filled), parts)]
         total = sum(self.rows[i] for i in opened)
-        picked = one_of_each_part(total, most)
+        picked = even_indices(total, most)
         clouds, before = [], 0
         for i in opened:
             inside = picked[(picked >= before) & (picked < before + self.rows[i])] - before
@@ -345,7 +344,7 @@ class StoredCloud(Savable):
         return Cloud(np.zeros((0, 3)), columns, self.table, self.sweeps)
 
 
-def positions(cells: NDArray[np.integer], precision_m: float, origin: Floats) -> Floats:
+def positions(cells: Integers, precision_m: float, origin: Floats) -> Floats:
     """World coordinates, (n, 3), of points in these cells, (n, 3)."""
     found = cells * precision_m + origin
     # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.

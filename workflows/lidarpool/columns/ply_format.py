@@ -7,9 +7,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray
+from ..base.arrays import AnyArray, Records
 from ..base.errors import LidarpoolError, explained
 from .table import Column
 
@@ -92,7 +91,7 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     return start, count, dtype
 
 
-def mapped_rows(path: Path) -> NDArray[np.void]:
+def mapped_rows(path: Path) -> Records:
     """Return the points of a PLY file, a row each, which stay on the disk until they are used.
 
     LidarpoolError if the file cannot be read, or is not a complete binary PLY file with our

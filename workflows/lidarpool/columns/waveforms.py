@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, Floats
+from ..base.arrays import AnyArray, Floats, Records
 
 WAVEFORM = "waveform"  # name of the column in parts; in files of clouds it has no place but in LAS
 ZERO = 2048  # that a digitised sample of 0 has, since noise goes below
@@ -43,7 +42,7 @@ def column_type(samples: int) -> str:
     return f"V{record(samples).itemsize}"
 
 
-def records(column: AnyArray) -> NDArray[np.void]:
+def records(column: AnyArray) -> Records:
     """Return a column (n,) as records, see `record`."""
     return column.view(record((column.dtype.itemsize - _REST) // 2))
 

@@ -6,23 +6,22 @@ import re
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Literal
 
 import numpy as np
 
-from ..base.declared import told
+from ..base.declared import about
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage, flush
-from ..base.validation import checked_fields
+from ..base.validation import checked, checked_fields
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.parts import StoredCloud
 from .folder import staging
-from .pieces import RangeWriter, Workers
+from .format_table import EXPORTS, FORMATS, LAYOUTS, FormatRow
+from .pieces import RangeWorkers, RangeWriter
 from .sweeps import Sweeps
-from .table import EXPORTS, FORMATS, LAYOUTS, FormatRow
 
 _ENDINGS = {Path(row.file).suffix: name for name, row in FORMATS.items() if "." in row.file}
 _FILES = "; ".join(f"{name}: {FORMATS[name].file}" for name in EXPORTS)
@@ -35,11 +34,11 @@ class Format:
 
     format: Annotated[
         Literal[tuple(FORMATS)],  # type: ignore[valid-type]
-        told(_FILES),
+        about(_FILES),
     ]
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]
-        told("layout of points in mcap and rosbag2"),
+        about("layout of points in mcap and rosbag2"),
     ] = "velodyne"
 
     @classmethod
@@ -53,29 +52,23 @@ class Format:
             ) from error
 
     @property
-    def _row(self) -> FormatRow:
+    def row(self) -> FormatRow:
+        """Its row of the table."""
         return FORMATS[self.format]
 
     @property
-    def file(self) -> str:
-        """Its file or folder in the folder of a result."""
-        return self._row.file
-
-    @property
-    def in_pieces(self) -> bool:
-        """Whether it has many files, which workers can write."""
-        return self._row.in_pieces
+    def _laid_out(self) -> tuple[str, ...]:
+        return self.row.layouts.get(self.layout, ())
 
     @property
     def needs(self) -> tuple[str, ...]:
         """Names of the columns that a cloud must have."""
-        return self._row.needed(self.layout)
+        return self.row.needs + self._laid_out
 
     def left_out(self, cloud: CloudLike) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
-        held, there = self._row.holds, (column.name for column in cloud.table)
-        laid_out = self._row.layouts.get(self.layout, ())
-        return [] if held is None else [name for name in there if name not in held + laid_out]
+        held, there = self.row.holds, (column.name for column in cloud.table)
+        return [] if held is None else [n for n in there if n not in held + self._laid_out]
 
     def notes(self, cloud: CloudLike) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""
@@ -84,11 +77,11 @@ class Format:
 
     def check_installed(self) -> None:
         """Check that it can be written here; LidarpoolError if a package is missing."""
-        absent = [package for package in self._row.packages if find_spec(package) is None]
+        absent = [package for package in self.row.packages if find_spec(package) is None]
         if absent:
             raise LidarpoolError(
                 f"The format {self.format} needs {' and '.join(absent)}: "
-                f'pip install "lidarpool[{self._row.module}]".'
+                f'pip install "lidarpool[{self.row.module}]".'
             )
 
     def check(self, path: Path, cloud: CloudLike, *, overwrite: bool = False) -> None:
@@ -105,7 +98,7 @@ class Format:
         """Check that a cloud has the columns that the format needs, or raise LidarpoolError."""
         there = {column.name for column in cloud.table}
         if missing := [name for name in self.needs if name not in there]:
-            laid_out = f"with the layout {self.layout} " if self._row.layouts else ""
+            laid_out = f"with the layout {self.layout} " if self.row.layouts else ""
             lacks = ", ".join(missing)
             raise LidarpoolError(
                 f"The format {self.format} {laid_out}needs {lacks}, which the cloud lacks: run the "
@@ -120,7 +113,7 @@ class Format:
         sweeps: Sweeps,
         *,
         overwrite: bool = False,
-        workers: Workers | None = None,
+        workers: RangeWorkers | None = None,
     ) -> None:
         """Write a cloud to a file or folder completely, or not at all.
 
@@ -132,18 +125,17 @@ class Format:
         LidarpoolError
             If a package or column is missing, if something is there, or if it cannot be written.
         """
-        module = self._row.module
-        more = {"layout": self.layout} if self._row.layouts else {}
+        more = {"layout": self.layout} if self.row.layouts else {}
         with explained(f"{path} cannot be written"):
             self.check(path, cloud, overwrite=overwrite)
             with staging(path.parent) as beside:
                 staged = beside / path.name  # bags contain the name of their file
-                if self.in_pieces:
+                if self.row.in_pieces:
                     place = Storage(str(staged), durable=False)
-                    RangeWriter(module, cloud, sweeps, place).write(workers)
+                    RangeWriter(self.format, cloud, sweeps, place).write(workers)
                 else:
-                    writers = import_module(f".{module}", __package__)
-                    getattr(writers, f"write_{self.format}")(staged, cloud, sweeps, **more)
+                    write = getattr(self.row.load(), f"write_{self.format}")
+                    write(staged, cloud, sweeps, **more)
                 flush(staged)
                 if path.is_dir() or staged.is_dir():  # files replace files atomically
                     Storage.at(path.parent).discard(path.name)
@@ -151,16 +143,16 @@ class Format:
                 flush(path.parent)
 
     def put(
-        self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: Workers | None
+        self, storage: Storage, cloud: CloudLike, sweeps: Sweeps, workers: RangeWorkers | None
     ) -> None:
         """Have workers write a format of many files into a storage; LidarpoolError leaves none."""
-        place = Storage(storage.path(self.file))
+        place = Storage(storage.path(self.row.file))
         with explained(f"{place} cannot be written"):
             try:
-                RangeWriter(self._row.module, cloud, sweeps, place).write(workers)
+                RangeWriter(self.format, cloud, sweeps, place).write(workers)
             except BaseException:
                 with suppress(OSError):
-                    storage.discard(self.file)
+                    storage.discard(self.row.file)
                 raise
 
 
@@ -176,11 +168,48 @@ def refuse_strangers(place: Storage, names: Collection[str]) -> None:
                 )
 
 
-def save(
-    path: Path, cloud: Cloud | StoredCloud, name: str | None, layout: str, precision_m: float | None
+@checked
+def save_cloud(
+    cloud: Cloud | StoredCloud,
+    path: str | Path,
+    *,
+    format: str | None = None,  # noqa: A002 - its name in scenarios and in the command
+    layout: str = "velodyne",
+    precision_m: float | None = None,
 ) -> list[str]:
-    """Write a cloud by itself, and name the columns that are left out; see `Cloud.save`."""
-    name = name or _ENDINGS.get(path.suffix)
+    """Write points in the format of the path's ending, completely or not at all.
+
+    The same points give the same bytes. About a million points are in memory at a time, or
+    those of the largest sweep.
+
+    Parameters
+    ----------
+    cloud
+        In memory, or the stored points of a result.
+    path
+        Its ending is .ply, .las, .laz, .e57, .mcap or .parquet, unless there is a `format`.
+        Its folder must exist. An existing file is replaced, a folder is not.
+    format
+        Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
+        "nuscenes" or "rosbag2".
+    layout
+        Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
+        velodyne with range images.
+    precision_m
+        Step of stored positions, metres; by default that of the survey, else 0.001.
+
+    Returns
+    -------
+    Names of the columns that the format cannot hold.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no such format, it lacks a column or package, it stores single sweeps and
+        the cloud is not of a result, or the file cannot be written.
+    """
+    path = Path(path)
+    name = format or _ENDINGS.get(path.suffix)
     if name is None:
         raise LidarpoolError(
             f"{path}: its ending has no format: use {', '.join(_ENDINGS)}, or give a format."

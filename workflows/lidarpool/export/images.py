@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from ..base.archives import open_archive
+from ..base.archives import open_archive, packed
 from ..base.arrays import AnyArray, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
@@ -128,10 +127,8 @@ class Pieces(pieces.Pieces):
                     raise LidarpoolError(f"Two arrays of an image would be {key!r}: rename one.")
                 arrays[key] = made
         arrays["pose"] = sweeps.pose.matrix(number)
-        memory = io.BytesIO()
-        np.savez_compressed(memory, **arrays)
         boxes = Boxes.of(sweeps, number, points) if sweeps.actors and self.entry else None
-        return {_file(sweeps, self.folders, number): memory.getvalue()}, boxes
+        return {_file(sweeps, self.folders, number): packed(arrays)}, boxes
 
 
 class Reader(reading.Reader):
@@ -141,7 +138,7 @@ class Reader(reading.Reader):
         """Return the name of the file of the images."""
         return _file(self.sweeps, _folders(self.sweeps, self.entry), sweep)
 
-    def read(self, sweep: int) -> reading.Points:
+    def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep, in the order of their rays."""
         file = self.file(sweep)
         with open_archive(self.place.path(file), partial(self.place.read, file)) as images:
@@ -168,7 +165,7 @@ def _key(name: str, plane: int) -> str:
 def _folders(sweeps: Sweeps, entry: Entry | None) -> list[str]:
     """Folders of the sensors."""
     names = plain_names(name or "lidar" for name in sweeps.sensors)
-    return names if entry is None else [f"images/{entry.name}/{name}" for name in names]
+    return names if entry is None else [f"{entry.place('images')}/{name}" for name in names]
 
 
 def _file(sweeps: Sweeps, folders: Sequence[str], sweep: int) -> str:

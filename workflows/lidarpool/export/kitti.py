@@ -92,7 +92,7 @@ class Reader(reading.Reader):
         """Return the name of the file of points."""
         return self._file(sweep, "velodyne", "bin")
 
-    def read(self, sweep: int) -> reading.Points:
+    def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
         rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 4)
         file = self._file(sweep, "labels", "label")

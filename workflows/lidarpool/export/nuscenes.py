@@ -101,7 +101,7 @@ class Reader(reading.Reader):
         """Return the name of its file."""
         return self._files[sweep]
 
-    def read(self, sweep: int) -> reading.Points:
+    def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
         rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
         columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
@@ -188,6 +188,7 @@ class _Tables:
             last_sample_token=self._token("sample", count - 1),
         )  # fmt: skip
         # The devkit sorts scenes by their time, and fails where two have the same.
+        # nuscenes-devkit sorts scenes by time, and fails where two have the same.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]
         for number, beside in enumerate(self._chain("sample", list(range(count)))):

@@ -28,11 +28,9 @@ class Pieces(pieces.Pieces):
     sweeps read one or two.
     """
 
-    boxes = False  # its pieces are not sweeps
-
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         super().__init__(cloud, sweeps, entry)
-        self.folders = [] if entry is None else [f"points/job={entry.number}"]
+        self.folders = [] if entry is None else [entry.place("parquet")]
         fields = [
             pa.field(
                 c.in_files, pa.from_numpy_dtype(kind), True, {"unit": c.unit, "meaning": c.meaning}
@@ -76,7 +74,7 @@ class Reader(reading.Reader):
 
     def file(self, sweep: int) -> str:
         """Return the name of the job's partition."""
-        return f"points/job={self.entry.number}"
+        return self.entry.place("parquet")
 
     @cached_property
     def _table(self) -> Any:
@@ -87,7 +85,7 @@ class Reader(reading.Reader):
             f"{folder}/{self.file(0)}", format="parquet", filesystem=system
         )
 
-    def read(self, sweep: int) -> reading.Points:
+    def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep, of which only groups of rows with its scans are read."""
         first, stop = self.sweeps.scans[sweep : sweep + 2].tolist()
         scan = pyarrow.dataset.field("scan")

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import os
 import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
-from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
+from .format_table import FORMATS
 from .sweeps import MIXED_UP, Sweeps
 
 # NumPy, pyarrow and system calls for the disk hold Python's lock at most 6 % of the time.
@@ -24,8 +24,9 @@ _MARK = ".writing"  # a file in the folder while ranges are written
 
 
 Data = bytes | memoryview
-Span = tuple[int, int]  # a range of pieces
-Written = tuple[int, list[Any]]  # points of a range, and what `Pieces.others` needs of its pieces
+PieceRange = tuple[int, int]  # a range of pieces
+# Points of a range, and what `Pieces.others` needs of its pieces.
+WrittenRange = tuple[int, list[Any]]
 
 
 @dataclass(frozen=True)
@@ -35,6 +36,10 @@ class Entry:
     number: int
     name: str
 
+    def place(self, format: str) -> str:  # noqa: A002
+        """Name of its file or folder in data sets whose jobs are written in a format."""
+        return FORMATS[format].of_job.format(number=self.number, name=self.name)
+
 
 class Pieces:
     """The files of a cloud in a format of many: those of each piece, a sweep or other, and more.
@@ -43,7 +48,6 @@ class Pieces:
     """
 
     folders: Sequence[str] = ()
-    boxes = True  # `files` returns the boxes of a sweep, where there are actors
 
     def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
         self.cloud, self.sweeps, self.entry = cloud, sweeps, entry
@@ -67,7 +71,7 @@ class Pieces:
         """Return what the data set's own files need of this job, as JSON holds it."""
         return {}
 
-    def write(self, place: Storage, first: int, stop: int) -> Written:
+    def write(self, place: Storage, first: int, stop: int) -> WrittenRange:
         """Write the files of some pieces, one piece in memory at a time; OSError if that fails."""
         count, made = 0, []
         for number, points in enumerate(self.read(first, stop), first):
@@ -78,27 +82,42 @@ class Pieces:
             made.append(more)
         return count, made
 
-    def write_others(self, place: Storage, made: Sequence[Any]) -> None:
-        """Write the files that are not of one piece; OSError if that fails."""
+    def spans(self, parts: int = 1) -> list[PieceRange]:
+        """Divide all pieces into ranges, at least so many if there are as many pieces."""
+        count = len(self)
+        by_points = RANGE_POINTS * count // max(1, len(self.cloud))
+        size = max(1, min(RANGE_PIECES, by_points, count // parts))
+        return [(first, min(first + size, count)) for first in range(0, count, size)]
+
+    def finish(self, place: Storage, written: Iterable[WrittenRange]) -> list[Any]:
+        """Write the files that are not of one piece; returns what was made of the pieces.
+
+        LidarpoolError if the cloud is not of these sweeps, or not in order; OSError.
+        """
+        counts, ranges = zip(*written, strict=True) if self else ((), ())
+        if sum(counts) != len(self.cloud):
+            raise LidarpoolError(MIXED_UP)
+        made = [more for one in ranges for more in one]
         for name, data in self.others(made).items():
             place.prepare(Path(name).parent)
             place.write(name, data)
+        return made
 
 
 @dataclass(frozen=True)
 class RangeWriter:
     """Writes ranges of the pieces of a cloud, in any process that sees the folder `place`.
 
-    `module` is that of the format, whose class `Pieces` says what is in which file.
+    The class `Pieces` of the `format` says what is in which file.
     """
 
-    module: str
+    format: str
     cloud: CloudLike
     sweeps: Sweeps
     place: Storage
     _mark: bytes = field(default_factory=lambda: secrets.token_hex(8).encode())
 
-    def __call__(self, span: Span) -> Written | None:
+    def __call__(self, span: PieceRange) -> WrittenRange | None:
         """Write the files of a range; OSError if that fails.
 
         Returns
@@ -106,7 +125,7 @@ class RangeWriter:
         None if this process does not see the folder, lacks the format's package, or after `stop`.
         """
         try:
-            pieces = pieces_of(self.module, self.cloud, self.sweeps)
+            pieces = pieces_of(self.format, self.cloud, self.sweeps)
         except ImportError:
             return None
         if not self.place.sees(_MARK, self._mark):
@@ -117,7 +136,7 @@ class RangeWriter:
         """Let no further range be written."""
         self.place.remove([_MARK])
 
-    def write(self, workers: Workers | None = None) -> None:
+    def write(self, workers: RangeWorkers | None = None) -> None:
         """Write all files, in threads those that workers do not; OSError if that fails.
 
         Raises
@@ -125,27 +144,28 @@ class RangeWriter:
         LidarpoolError
             If the cloud is not of these sweeps, or not in order; or as `workers`.
         """
-        pieces = pieces_of(self.module, self.cloud, self.sweeps)
+        pieces = pieces_of(self.format, self.cloud, self.sweeps)
         for folder in ("", *pieces.folders):
             self.place.prepare(folder)
-        count = len(pieces)
-        size = max(1, min(RANGE_PIECES, RANGE_POINTS * count // max(1, len(self.cloud))))
-        spans = [(first, min(first + size, count)) for first in range(0, count, size)]
+        spans = pieces.spans()
         self.place.write(_MARK, self._mark)
         made = workers(self, spans) if workers else {}
         left = [span for span in spans if span not in made]
         with ThreadPoolExecutor(THREADS, "write") as pool:  # ends when all its threads have
             made |= {span: it for span, it in zip(left, pool.map(self, left), strict=True) if it}
         self.stop()
-        if sum(rows for rows, _ in made.values()) != len(self.cloud):
-            raise LidarpoolError(MIXED_UP)
-        pieces.write_others(self.place, [more for span in spans for more in made[span][1]])
+        pieces.finish(self.place, (made[span] for span in spans))
         self.place.tidy()
 
 
-def pieces_of(module: str, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> Pieces:
-    """Return the pieces of a cloud in the format of a module, as a job's with an `entry`."""
-    pieces: Pieces = import_module(f".{module}", __package__).Pieces(cloud, sweeps, entry)
+def pieces_of(
+    format: str,  # noqa: A002
+    cloud: CloudLike,
+    sweeps: Sweeps,
+    entry: Entry | None = None,
+) -> Pieces:
+    """Return the pieces of a cloud in a format of many files, as a job's with an `entry`."""
+    pieces: Pieces = FORMATS[format].load().Pieces(cloud, sweeps, entry)
     return pieces
 
 
@@ -155,4 +175,4 @@ def as_data(array: AnyArray) -> Data:
 
 
 # Writes ranges on workers; returns what was written of those whose workers see the folder.
-Workers = Callable[[RangeWriter, Sequence[Span]], dict[Span, Written]]
+RangeWorkers = Callable[[RangeWriter, Sequence[PieceRange]], dict[PieceRange, WrittenRange]]

@@ -7,12 +7,12 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
+from ..base.arrays import AnyFloats, Records
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..base.validation import checked
-from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from ..columns.cloud import Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from ..columns.table import AXES as POSITION
@@ -36,7 +36,6 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
     row = row_type(real, cloud.table)
-    _check_room(path, header(row, len(cloud)), len(cloud), row.itemsize)
     with path.open("xb") as file:
         for chunk in cloud.chunks():
             if file.tell():
@@ -56,7 +55,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
 
 @checked
 def read_cloud(path: str | Path) -> Cloud:
-    """Read a point cloud that a run or `Cloud.save` wrote as .ply, with all its columns.
+    """Read a point cloud that a run or `save_cloud` wrote as .ply, with all its columns.
 
     From the folder of a result it has sweeps, and can be saved in all formats.
 
@@ -81,13 +80,13 @@ class Reader(reading.Reader):
 
     def file(self, sweep: int) -> str:
         """Return the name of the job's cloud."""
-        return f"jobs/{self.entry.name}/cloud.ply"
+        return self.entry.place("ply")
 
     @cached_property
     def _cloud(self) -> CloudFile:
         return CloudFile(self.local(self.file(0)))
 
-    def read(self, sweep: int) -> reading.Points:
+    def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
         first, stop = (self._cloud.row_of(scan) for scan in self.sweeps.scans[sweep : sweep + 2])
         cloud = next(self._cloud.chunks(max(1, stop - first), first), None)
@@ -97,24 +96,13 @@ class Reader(reading.Reader):
         return self.inside(sweep, cloud)
 
 
-def real_type(bounds: NDArray[np.floating], precision_m: float) -> np.dtype[np.floating]:
+def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
     """Least precise type that is precise enough for positions between these bounds."""
     if bounds.dtype == np.float32:
         return bounds.dtype
     farthest = np.float32(np.abs(bounds).max(initial=0.0))
     enough = np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
     return np.dtype(np.float32 if enough else np.float64)
-
-
-def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
-    """Check that the disk has room for a file of so many points, and for a piece beside it."""
-    size, piece = len(head) + count * row_bytes, min(count, CHUNK_POINTS) * row_bytes
-    free = shutil.disk_usage(path.parent).free
-    if free < size + piece:
-        raise LidarpoolError(
-            f"{path} could not be written: it takes {size:,} bytes, and {piece:,} beside it "
-            f"meanwhile; the disk has {free:,} bytes free. Make room, or write to another folder."
-        )
 
 
 def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:
@@ -135,7 +123,7 @@ def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None
         raise LidarpoolError(f"Open3D cannot write to {path.parent}: check folder and disk.")
 
 
-def _rows(cloud: Cloud, row: np.dtype[np.void]) -> NDArray[np.void]:
+def _rows(cloud: Cloud, row: np.dtype[np.void]) -> Records:
     """Rows of a file, of the types and in the order of `row`."""
     rows = np.empty(len(cloud), row)
     for axis, values in zip(AXES, cloud.positions.T, strict=True):

@@ -18,7 +18,7 @@ from .pieces import Entry
 from .sweeps import Sweeps
 
 # Points, float32 (n, 3), metres in the sensor's axes, and {column: (n,)}, as the format holds them.
-Points = tuple[Floats32, dict[str, AnyArray]]
+PointColumns = tuple[Floats32, dict[str, AnyArray]]
 
 
 class Reader:
@@ -32,7 +32,7 @@ class Reader:
         """Return the name of the file that has the points of a sweep."""
         raise NotImplementedError
 
-    def read(self, sweep: int) -> Points:
+    def read(self, sweep: int) -> PointColumns:
         """Return the points of a sweep; any exception if they cannot be read."""
         raise NotImplementedError
 
@@ -59,7 +59,7 @@ class Reader:
             raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
         return np.frombuffer(bytearray(data), row)  # PyTorch wants arrays that it may write to
 
-    def inside(self, sweep: int, cloud: Cloud) -> Points:
+    def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
         """Return points of the cloud's coordinates and all their columns."""
         places = self.sweeps.in_sensor(sweep, cloud.positions).astype(np.float32)
         return places, {name: np.array(array) for name, array in cloud.columns.items()}

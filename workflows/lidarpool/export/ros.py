@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 from rosbags.interfaces import (
     Qos,
     QosDurability,
@@ -24,14 +23,14 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.store import Typestore
 
-from ..base.arrays import AnyArray, Floats32
+from ..base.arrays import AnyArray, Floats32, Records
 from ..columns.cloud import Cloud, CloudLike
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.colours import as_float
 from . import reading
 from .boxes import Boxes
 from .images import Image
-from .navigation import GNSS_FILE, IMU_FILE, Instruments
+from .navigation_files import GNSS_FILE, IMU_FILE, Instruments
 from .sweeps import Placed, Sweeps, plain_names
 
 Sent = tuple[str, Any, int]  # topic, message, time in nanoseconds
@@ -186,7 +185,7 @@ class Reader(reading.Reader):
 
     def file(self, sweep: int) -> str:
         """Return the name of the job's bag."""
-        return f"bags/{self.entry.name}.mcap"
+        return self.entry.place("mcap")
 
     @cached_property
     def _bag(self) -> Bag:
@@ -195,7 +194,7 @@ class Reader(reading.Reader):
         bag.open()
         return bag
 
-    def read(self, sweep: int) -> reading.Points:
+    def read(self, sweep: int) -> reading.PointColumns:
         """Return the points of a sweep."""
         topic = _topic(self.sweeps, _frames(self.sweeps), sweep)
         connections = [one for one in self._bag.connections if one.topic == topic]
@@ -287,7 +286,7 @@ def _row(layout: str, extra: list[str]) -> np.dtype[np.void]:
 
 def _rows(
     layout: str, row: np.dtype[np.void], points: Cloud, sweeps: Sweeps, sweep: int
-) -> NDArray[np.void]:
+) -> Records:
     """Points of a sweep in a layout, of the type of `_row`."""
     there, since = points.columns, points["time"] - sweeps.begins_ns[sweep]
     light = np.clip(there["intensity"], 0, 1)

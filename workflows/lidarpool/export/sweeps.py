@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import re
 from collections.abc import Callable, Iterable, Iterator
@@ -13,18 +12,17 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..base.archives import open_archive
-from ..base.arrays import Bools, Bytes, Floats, Ints
+from ..base.archives import open_archive, packed
+from ..base.arrays import AnyFloats, Bools, Bytes, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.described import described, remade
+from ..sensor.plain_data import described, remade
 from ..sensor.survey import nanoseconds
 from ..sensor.trajectory import matrices, presence_ns, quaternions_of
-from .navigation import Instruments
+from .navigation_files import Instruments
 
 SWEEPS_FILE = "sweeps.npz"
 MIXED_UP = (
@@ -94,7 +92,7 @@ class Sweeps:
     def __len__(self) -> int:
         return len(self.begins_ns)
 
-    def in_sensor(self, sweep: int, points: NDArray[np.floating]) -> Floats:
+    def in_sensor(self, sweep: int, points: AnyFloats) -> Floats:
         """Points (k, 3) of a sweep in its sensor's axes: at its start, or as stored."""
         exact = points.astype(np.float64)
         return exact if self.coordinates == "sensor" else self.pose.inward(sweep, exact)
@@ -230,9 +228,7 @@ class Sweeps:
             rays = {"sensors": told, "returns": self.fired.returns}
             arrays["rays"] = np.frombuffer(json.dumps(rays).encode(), np.uint8)
             arrays["steps"] = self.fired.steps
-        memory = io.BytesIO()  # NumPy leaves its own file open if it cannot write it
-        np.savez_compressed(memory, **arrays)
-        return memory.getvalue()
+        return packed(arrays)
 
     @classmethod
     def load(cls, path: Path | str, read: Callable[[], bytes] | None = None) -> Sweeps:

@@ -2,14 +2,14 @@
 
 from contextlib import AbstractContextManager, nullcontext
 
-from ..run.jobs import Jobs
-from ..run.page import Page
+from ..run.job_source import Jobs
+from ..run.run_page import RunPage
 
 
-def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[Page]:
+def page_of(jobs: Jobs, wanted: bool) -> AbstractContextManager[RunPage]:
     """Show jobs in the browser, or nothing: Matplotlib is imported only if it is wanted."""
     if not wanted:
-        return nullcontext(Page())
+        return nullcontext(RunPage())
     from .live_page import live_page
 
     return live_page(jobs.count, jobs.names, jobs.title or "lidarpool")

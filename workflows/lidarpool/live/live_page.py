@@ -28,17 +28,18 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.parts import read_part
-from ..export.jobs import JobRow, Value
+from ..datasets.figures import Figures
+from ..datasets.job_table import JobRow, Value
 from ..export.sweeps import Sweeps
-from ..pipeline import Frame, Receipt
+from ..pipeline.messages import Receipt, ScanFrame
 from ..plan import best
-from ..report.campaign_report import Figures, draw_results, draw_varied
+from ..report.charts import draw_results, draw_varied
 from ..run.job_points import JobPoints
-from ..run.page import JobNow, Page
-from ..run.picture_file import Pictured
+from ..run.picture_file import PictureContent
 from ..run.progress import STAGES, Pace, Progress, in_words, standing_still, time_in_words
-from ..run.result import RunResult
-from .points import HeldPoints
+from ..run.run_page import JobNow, RunPage
+from ..run.run_result import RunResult
+from .point_selection import HeldPoints
 from .server import PORT, VIEWER, Answer, Arguments, PageServer, announced, page_server
 from .view import View, wait_for_interrupt
 
@@ -56,7 +57,7 @@ PARTS_AT_ONCE = 8  # parts read for one drawing
 FRAMES_SHOWN = 40  # whose rays are shown
 
 
-class LivePage(Page):
+class LivePage(RunPage):
     """Connects a run and its page, in both directions: the list of jobs, or the only one."""
 
     page: PageServer
@@ -73,7 +74,7 @@ class LivePage(Page):
         self._under_way: Sequence[JobNow] = ()
         self._ask_at = self._list_at = 0.0
         self._looked_for = float("-inf")  # when a browser last wanted points of the newest job
-        self._reading = Share(READING_SHARE)
+        self._reading = CpuShare(READING_SHARE)
         self._sums = Counter(done=0, failed=0, points=0, rays=0)
         self._ended: deque[dict[str, Any]] = deque(maxlen=ENDED_MOST)
         self._failures: deque[dict[str, Any]] = deque(maxlen=FAILED_MOST)
@@ -97,7 +98,7 @@ class LivePage(Page):
         """Record parts of the only job."""
         self._jobs[0].add(receipts)
 
-    def on_frame(self, frame: Frame) -> None:
+    def on_frame(self, frame: ScanFrame) -> None:
         """Record a frame, which is displayed unless many others come at once."""
         self._jobs[0].frames.append(frame)
 
@@ -245,7 +246,7 @@ class LivePage(Page):
         return [str(one).lower() if isinstance(one, bool) else str(one) for one in words]
 
 
-class Share:
+class CpuShare:
     """A share of a core that something may take; processor time, since waiting does not count."""
 
     def __init__(self, share: float) -> None:
@@ -277,7 +278,7 @@ class Charts:
     def __init__(self, names: Sequence[str], count: int) -> None:
         self._figures, self._count = Figures(names), count
         self._lock, self._drawing = threading.Lock(), threading.Lock()
-        self._share = Share(DRAWING_SHARE)
+        self._share = CpuShare(DRAWING_SHARE)
         self._drawn, self._svg = 0, ""
 
     def add(self, row: JobRow) -> None:
@@ -300,9 +301,7 @@ class Charts:
                     figures = deepcopy(self._figures)
                 self._drawn = figures.jobs
                 with self._share.taken(), suppress(LidarpoolError):
-                    pages = [draw_varied(figures)]
-                    if over or pages[0] is None:
-                        pages.append(draw_results(figures))
+                    pages = draw_varied(figures), draw_results(figures)
                     drawn = (f"<figure>{page.svg()}</figure>" for page in pages if page is not None)
                     self._svg = "".join(drawn)
             return self._svg
@@ -344,7 +343,7 @@ class LiveJob:
         self._counts = np.zeros(self._job.scene.counters, np.int64)
         self._hits = 0  # of the parts that were read
         self.cloud = replace(self._points, names=(), rows=()).load()  # none, with their columns
-        self.frames: deque[Frame] = deque(maxlen=FRAMES_SHOWN)  # the last ones
+        self.frames: deque[ScanFrame] = deque(maxlen=FRAMES_SHOWN)  # the last ones
         self._view: View | None = None  # until somebody asks
         self._making = threading.Lock()
         self._whole = False  # all parts were read
@@ -418,7 +417,7 @@ class LiveJob:
         """What its page shows, made when it is first asked for."""
         with self._making:
             if self._view is None:
-                job, (pictured, drawn) = self._job, Pictured.before(self._job)
+                job, (pictured, drawn) = self._job, PictureContent.before(self._job)
                 sweeps = Sweeps.of(job.survey, job.scene) if self._whole else None
                 title = f"job {self.name} - lidarpool" if self.name else "lidarpool"
                 self._view = View(HeldPoints(self.cloud), pictured, sweeps, title=title)
@@ -450,7 +449,7 @@ class LiveJob:
         return header, {"rays": _rays_of(frames) if frames else view.rays_shown}
 
 
-def _rays_of(frames: list[Frame]) -> Floats32:
+def _rays_of(frames: list[ScanFrame]) -> Floats32:
     """Return some rays (n, 2, 3) of frames, local."""
     pairs = ((np.full_like(one.samples, one.pose.position), one.samples) for one in frames)
     return np.concatenate([np.stack(pair, axis=1) for pair in pairs]).astype(np.float32)

@@ -33,7 +33,7 @@ from tornado.web import Application, HTTPError, RequestHandler, StaticFileHandle
 
 from ..base.arrays import AnyArray
 from ..base.notebook import cell_display
-from .points import Abandoned
+from .point_selection import Abandoned
 
 HOST = "127.0.0.1"
 PORT = 8080  # or the next that is free

@@ -20,7 +20,7 @@ from raybeam import RayCaster
 from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
-from ..base.words import counted
+from ..base.words import plural
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
@@ -37,16 +37,16 @@ from ..render.colouring import (
     with_rgb,
     word_of,
 )
-from ..render.hits import HITS_TITLE, hit_colours
+from ..render.hit_density import HITS_TITLE, hit_colours
 from ..render.surface import apart
 from ..render.theme import mapped, object_colours
-from ..run.picture_file import PICTURE_FILE, PLACES_MOST, Pictured, SensorWay, ways_of
+from ..run.picture_file import PICTURE_FILE, PLACES_MOST, PictureContent, SensorWay, ways_of
 from ..run.store import RUN_FOLDER
 from ..scene.actors import Actor, samples_each, shapes_of
-from ..scene.drawn import simplified
 from ..scene.scene import Scene
+from ..scene.simplified import simplified
 from ..sensor.trajectory import presence_ns
-from .points import Eye, Filter, PointFinder, Points, Scans, corners_of, positions
+from .point_selection import Eye, Filter, PointFinder, Points, ScanRanges, corners_of, positions
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MOST_POINTS = 20_000_000  # in an answer
@@ -78,7 +78,7 @@ class View:
     """
 
     points: Points
-    pictured: Pictured | None = None
+    pictured: PictureContent | None = None
     sweeps: Sweeps | None = None
     note: str = ""  # a remark on what is shown
     title: str = "lidarpool"
@@ -102,7 +102,7 @@ class View:
         self.columns = {"z": Z, "x": X, "y": Y, **rest}  # to colour and filter by
         self._coloured = with_rgb(self.columns)
         self._lock = threading.Lock()
-        self._surface: Surface | None = None
+        self._surface: ShownSurface | None = None
         self._range_limits: dict[int, tuple[float, float]] = {}  # {sensor: ends of the scale}
         self.show(self.points)
 
@@ -337,7 +337,9 @@ class View:
         if pictured is None:
             raise KeyError("surface")
         with self._lock:  # one browser after the other: it may take long, once
-            surface = self._surface = self._surface or Surface(pictured.scene, pictured.reflectance)
+            surface = self._surface = self._surface or ShownSurface(
+                pictured.scene, pictured.reflectance
+            )
         counts, places = pictured.hit_counts, np.zeros((0, 3), np.float32)
         if colour == "hits":
             counts = counts if self.hits is None else self.hits()
@@ -433,13 +435,13 @@ def _of_points(points: Points) -> tuple[Floats, Floats]:
     return origin, box - origin
 
 
-def _scans(text: str) -> Scans:
+def _scans(text: str) -> ScanRanges:
     """Read ranges of scans, ``first-last,first-last``."""
     pairs = (entry.split("-") for entry in text.split(",") if entry)
     return tuple((int(first), int(last)) for first, last in pairs)
 
 
-class Surface:
+class ShownSurface:
     """A scene's triangles, or a simplified mesh of at most so many, in the chosen colours.
 
     Vertices in the same cell of a grid are merged (Rossignac and Borrel, 1993), and hits of a
@@ -538,7 +540,7 @@ def as_bytes(colours: Floats) -> Bytes:
 @contextmanager
 def result_page(view: View, *, port: int = PORT, browser: bool = True) -> Iterator[PageServer]:
     """Serve the page of a result while the body runs; see `announced`."""
-    shows = f"shows {counted(len(view.points), 'point')}"
+    shows = f"shows {plural(len(view.points), 'point')}"
     shows += "" if cell_display() else "; Ctrl-C ends it"
     with page_server(view.answer, port) as page, announced(page, f"{page.url} {shows}", browser):
         yield page
@@ -582,7 +584,7 @@ def open_result(path: Path) -> View:
     pictured, sweeps, note = None, None, ""
     try:
         sweeps = Sweeps.load(beside) if beside.exists() else None
-        pictured = Pictured.load(scene) if scene.exists() else None
+        pictured = PictureContent.load(scene) if scene.exists() else None
     except LidarpoolError as error:
         note = f"The cloud is shown without all that belongs to it. {error}"
     file = CloudFile(cloud, pictured.own if pictured else ())

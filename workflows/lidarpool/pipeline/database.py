@@ -44,7 +44,6 @@ CREATE TABLE frames (job INTEGER PRIMARY KEY, count INTEGER NOT NULL);
 CREATE TABLE made_of (job INTEGER PRIMARY KEY, hash TEXT NOT NULL);
 CREATE TABLE jobs (number INTEGER PRIMARY KEY, failed INTEGER NOT NULL, data TEXT NOT NULL);
 """
-_DONE, _FAILED = 1, 2  # what became of a job
 _OF_JOBS = ("parts", "trials", "frames", "made_of")  # tables about jobs under way
 _FIRST = attrgetter("first")  # the order of parts
 PARTS_FOLDER = re.compile("run-[0-9a-f]{16}")  # names of `parts_folder`
@@ -157,8 +156,8 @@ class RunDatabase:
         # Numbers of the jobs that have not ended and of which something is committed.
         self.begun: set[int] = set()
         self.ended_count = 0
-        self._ended = bytearray()  # of each job: 0, _DONE or _FAILED
-        with self._explained():
+        self._ended = bytearray()  # of each job: 1 if it has ended
+        with _explained(self.path):
             self._sql = sqlite3.connect(
                 path, isolation_level=None, timeout=1.0, check_same_thread=False
             )
@@ -169,7 +168,8 @@ class RunDatabase:
                 raise
 
     def _open(self, new: Mapping[str, str]) -> None:
-        # The lock is held while the database is open, so that no second run writes to it.
+        # The lock is held while the database is open, so that no second run writes to it. No
+        # write-ahead log: it does not work on network disks.
         self._sql.execute("PRAGMA locking_mode = EXCLUSIVE")
         self._sql.execute(f"PRAGMA synchronous = {'FULL' if self._durable else 'OFF'}")
         self._sql.execute("BEGIN IMMEDIATE")
@@ -183,14 +183,14 @@ class RunDatabase:
             raise sqlite3.DatabaseError(f"it is of format {made}, and this version reads {FORMAT}")
         _checked_place(self.meta)
         # From Python 3.12 on, an unfinished cursor in a traceback keeps a closed file locked.
-        with closing(self._sql.execute("SELECT number, failed FROM jobs")) as rows:
-            for number, failed in rows:
-                self._mark_ended(number, _FAILED if failed else _DONE)
+        with closing(self._sql.execute("SELECT number FROM jobs")) as rows:
+            for (number,) in rows:
+                self._mark_ended(number)
         for table in _OF_JOBS:
             self.begun.update(job for (job,) in self._rows(f"SELECT DISTINCT job FROM {table}"))
 
     def _rows(self, query: str, *values: Any) -> list[tuple[Any, ...]]:
-        with self._explained():
+        with _explained(self.path):
             return self._sql.execute(query, values).fetchall()
 
     # -- reading -------------------------------------------------------------------------
@@ -201,7 +201,7 @@ class RunDatabase:
             return found
         job = JobParts(number, scan_count, self._summaries)
         if number in self.begun:
-            with self._explained():
+            with _explained(self.path):
                 self._read(job)
         self.under_way[number] = job
         return job
@@ -231,9 +231,10 @@ class RunDatabase:
         """Whether a job has ended."""
         return number < len(self._ended) and self._ended[number] != 0
 
-    def failed(self) -> Iterator[int]:
-        """Yield the numbers of the jobs that have failed, in order."""
-        return (number for number, state in enumerate(self._ended) if state == _FAILED)
+    def failed(self) -> list[int]:
+        """Numbers of the jobs that have failed, in order."""
+        query = "SELECT number FROM jobs WHERE failed ORDER BY number"
+        return [number for (number,) in self._rows(query)]
 
     def hash_of(self, number: int) -> str:
         """Hash of what a job under way is made of; empty if none was kept."""
@@ -243,7 +244,7 @@ class RunDatabase:
     def job_rows(self) -> Iterator[dict[str, Any]]:
         """Yield what was stored of the jobs that have ended, by number; one at a time."""
         with (
-            self._explained(),
+            _explained(self.path),
             closing(self._sql.execute("SELECT data FROM jobs ORDER BY number")) as rows,
         ):
             for (data,) in rows:
@@ -327,8 +328,8 @@ class RunDatabase:
             self._sql.executemany("INSERT OR REPLACE INTO jobs VALUES (?, ?, ?)", rows)
             self._delete(ended)
         self.begun -= ended.keys()
-        for number, (failed, _) in ended.items():
-            self._mark_ended(number, _FAILED if failed else _DONE)
+        for number in ended:
+            self._mark_ended(number)
             self.under_way.pop(number, None)
 
     def forget_jobs(self, numbers: Iterable[int]) -> None:
@@ -338,7 +339,7 @@ class RunDatabase:
         with self._transaction():
             self._sql.executemany("DELETE FROM jobs WHERE number = ?", forgotten)
         for (number,) in forgotten:
-            self._mark_ended(number, 0)
+            self._mark_ended(number, False)
 
     def restart(self, number: int) -> None:
         """Drop all that is committed of a job that has not ended."""
@@ -356,7 +357,7 @@ class RunDatabase:
 
     def copy(self) -> bytes:
         """Content of the file after the last transaction."""
-        with self._explained():
+        with _explained(self.path):
             return self._sql.serialize()
 
     def close(self) -> None:
@@ -369,13 +370,13 @@ class RunDatabase:
         for table in _OF_JOBS:
             self._sql.executemany(f"DELETE FROM {table} WHERE job = ?", there)
 
-    def _mark_ended(self, number: int, state: int) -> None:
+    def _mark_ended(self, number: int, ended: bool = True) -> None:
         if not 0 <= number < JOBS_MOST:
             raise ValueError(f"{number} is not the number of a job")
         if number >= len(self._ended):
             self._ended.extend(bytes(number + 1 - len(self._ended)))
-        self.ended_count += bool(state) - bool(self._ended[number])
-        self._ended[number] = state
+        self.ended_count += ended - self._ended[number]
+        self._ended[number] = ended
 
     def _write_frames(self) -> None:
         for job in self.under_way.values():
@@ -386,7 +387,7 @@ class RunDatabase:
 
     @contextmanager
     def _transaction(self) -> Iterator[None]:
-        with self._explained():
+        with _explained(self.path):
             self._sql.execute("BEGIN IMMEDIATE")
             try:
                 yield
@@ -396,25 +397,24 @@ class RunDatabase:
                     self._sql.execute("ROLLBACK")
                 raise
 
-    @contextmanager
-    def _explained(self) -> Iterator[None]:
-        """Translate an error of SQLite."""
-        try:
-            yield
-        except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
-            words = str(error)
-            # Without a table or column it is not what it was.
-            if not isinstance(error, sqlite3.OperationalError) or "no such" in words:
-                raise DamagedError(
-                    f"{self.path} is damaged ({words}): drop the run with --fresh, or give another "
-                    "folder."
-                ) from error
-            if "locked" in words:
-                raise LidarpoolError(f"Another run is using {self.path.parent}.") from error
-            raise LidarpoolError(
-                f"{self.path} cannot be written ({words}): make room on its disk, or give another "
-                "folder."
+
+@contextmanager
+def _explained(path: Path) -> Iterator[None]:
+    """Translate an error of SQLite about the database at a path."""
+    try:
+        yield
+    except (sqlite3.Error, ValueError, TypeError, KeyError) as error:
+        words = str(error)
+        # Without a table or column it is not what it was.
+        if not isinstance(error, sqlite3.OperationalError) or "no such" in words:
+            raise DamagedError(
+                f"{path} is damaged ({words}): drop the run with --fresh, or give another folder."
             ) from error
+        if "locked" in words:
+            raise LidarpoolError(f"Another run is using {path.parent}.") from error
+        raise LidarpoolError(
+            f"{path} cannot be written ({words}): make room on its disk, or give another folder."
+        ) from error
 
 
 def parts_folder(mark: str) -> str:
@@ -442,9 +442,8 @@ def read_place(path: Path) -> tuple[str, str] | None:
         return None
     try:
         # Not read-only: then SQLite could not undo a transaction that was interrupted.
-        with closing(
-            sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=1.0)
-        ) as sql:
+        address = f"{path.absolute().as_uri()}?mode=rw"
+        with _explained(path), closing(sqlite3.connect(address, uri=True, timeout=1.0)) as sql:
             tables = {name for (name,) in sql.execute("SELECT name FROM sqlite_master")}
             if tables and not tables >= {"meta", "parts", "trials"}:
                 raise LidarpoolError(
@@ -452,9 +451,5 @@ def read_place(path: Path) -> tuple[str, str] | None:
                     "folder."
                 )
             return _checked_place(dict(sql.execute("SELECT name, value FROM meta")))
-    except sqlite3.Error as error:
-        if "locked" in str(error):
-            raise LidarpoolError(f"Another run is using {path.parent}.") from error
-        return None
-    except (ValueError, TypeError, KeyError):
+    except DamagedError:
         return None

@@ -6,17 +6,16 @@ import time
 from collections import deque
 from collections.abc import Collection, Iterable, Mapping
 
-from poolpart import TaskRecord, Whereabouts
+from poolpart import TaskLocations, TaskRecord
 
-from ..base.storage import Storage
 from ..columns.parts import part_name
 from . import policies
-from .failures import JobError, storing
-from .jobs import Batch, JobState, Outcome, Place
+from .casting_workers import CastingWorkers
+from .failures import JobError
+from .job_state import Batch, BatchState, JobState, Outcome
 from .long_stages import LongStages
 from .messages import CollectOrder, ColumnsLost, Receipt, scans_in_words
 from .names import COLLECT, GENERATE, GPU, INTERSECT, LIDAR
-from .workers import CastingWorkers
 
 ADVISED_AGAIN = 0.2  # change of the scans in an item of stage 1 that is worth a request
 PIECES = 16  # a failing batch is divided into so many
@@ -25,18 +24,15 @@ PIECES = 16  # a failing batch is divided into so many
 class Dispatcher:
     """Has batches of all jobs cast and stored, and judges those with which workers die.
 
-    Parts go to `storage`, where files have the run's `mark`. Jobs that cannot be cast are in
-    `failed`, until they are dropped.
+    Files of parts have the run's `mark`. Jobs that cannot be cast are in `failed`, until they are
+    dropped.
     """
 
-    def __init__(
-        self, workers: CastingWorkers, stages: LongStages, storage: Storage, mark: str
-    ) -> None:
+    def __init__(self, workers: CastingWorkers, stages: LongStages, mark: str) -> None:
         self.batches: dict[tuple[int, int], Batch] = {}  # {(job, first scan): batch}
         self.failed: dict[JobState, JobError] = {}
         self.advice = 1  # scans that stage 1 was told to put into an item
-        self._workers, self._stages = workers, stages
-        self._storage, self._mark = storage, mark
+        self._workers, self._stages, self._mark = workers, stages, mark
         self._tasks: dict[str, list[Batch]] = {}  # {key of a casting task: its batches left}
         self._count = 0  # of batches so far
         self._seconds: deque[float] = deque(maxlen=64)  # casting times of batches
@@ -44,16 +40,8 @@ class Dispatcher:
         self.per_task = 1  # small batches of a task
         # {job: batches that were tried alone before any was cast, each with a worker that died}
         self._first_deaths: dict[JobState, list[Batch]] = {}
-        self._hidden: set[str] = set()  # addresses of LIDAR workers that do not see the storage
 
-    @property
-    def notes(self) -> list[str]:
-        """Notes for the user."""
-        workers = f"{', '.join(sorted(self._hidden))} of partition {LIDAR}"
-        note = f"{workers} cannot see {self._storage.url}: the driver wrote their parts"
-        return [note] if self._hidden else []
-
-    def at(self, *places: Place) -> list[Batch]:
+    def at(self, *places: BatchState) -> list[Batch]:
         """Batches in some states."""
         return [batch for batch in self.batches.values() if batch.place in places]
 
@@ -126,10 +114,10 @@ class Dispatcher:
 
     def offer(self) -> bool:
         """Offer waiting batches to workers that have room."""
-        waiting = sorted(self.at(Place.WAITING), key=lambda batch: (batch.order, batch.first))
+        waiting = sorted(self.at(BatchState.WAITING), key=lambda batch: (batch.order, batch.first))
         if not waiting:
             return False
-        there = [*waiting, *self.at(Place.CASTING, Place.CAST, Place.COLLECTING)]
+        there = [*waiting, *self.at(BatchState.CASTING, BatchState.CAST, BatchState.COLLECTING)]
         chosen = policies.offers(there, self._workers.slots, self.most, self.per_task)
         for task, worker in chosen:
             spans = [(batch.job.number, (batch.first, batch.stop)) for batch in task]
@@ -137,7 +125,7 @@ class Dispatcher:
             self._tasks[key] = task
             for batch in task:
                 batch.key, batch.worker, batch.collector = key, worker, ""
-                batch.move(Place.CASTING)
+                batch.move(BatchState.CASTING)
                 batch.job.trace("submit", INTERSECT, batch.scans)
         return bool(chosen)
 
@@ -145,7 +133,7 @@ class Dispatcher:
         """Look which casting tasks have ended."""
         moved = False
         for key, left in [*self._tasks.items()]:
-            if left[0].place is not Place.CASTING:
+            if left[0].place is not BatchState.CASTING:
                 continue
             try:
                 outcome = self._workers.outcome(key, left[0].worker)
@@ -155,23 +143,23 @@ class Dispatcher:
             for batch in [*left] if outcome is not Outcome.PENDING else ():
                 moved = True
                 if outcome is Outcome.DONE:
-                    batch.move(Place.CAST)
+                    batch.move(BatchState.CAST)
                     batch.job.cast += len(batch)
                 else:
                     self._again(batch, outcome.value)
                     batch.divided |= outcome is Outcome.DIVIDE
         return moved
 
-    def leave_workers(self, seen: Whereabouts) -> None:
+    def leave_workers(self, seen: TaskLocations) -> None:
         """Offer batches again whose workers died, are silent, late, or take no tasks."""
         prepared, late_s = len(self._workers.slots), policies.late_after_s(self._seconds)
         for batch in [*self.batches.values()]:
             if why := policies.loss(batch, seen, prepared, time.monotonic(), late_s):
                 self._again(batch, why.value)
 
-    def _again(self, batch: Batch, reason: str, place: Place = Place.WAITING) -> None:
+    def _again(self, batch: Batch, reason: str, place: BatchState = BatchState.WAITING) -> None:
         """Return a batch to be cast again, or only to be collected again."""
-        if place is Place.WAITING:
+        if place is BatchState.WAITING:
             self._forget(batch)
         batch.move(place)
         batch.job.offered_again += 1
@@ -252,15 +240,15 @@ class Dispatcher:
 
     def hand_over(self) -> bool:
         """Assign batches that were cast to collectors."""
-        if not (cast := self.at(Place.CAST)):
+        if not (cast := self.at(BatchState.CAST)):
             return False
         orders: dict[str, list[CollectOrder]] = {}  # {collector: its message}
-        there = [*cast, *self.at(Place.COLLECTING)]
+        there = [*cast, *self.at(BatchState.COLLECTING)]
         for task, name in policies.handovers(there, self._stages.collectors):
             parts = []
             for batch in task:
                 batch.collector, number, first = name, batch.job.number, batch.first
-                batch.move(Place.COLLECTING)
+                batch.move(BatchState.COLLECTING)
                 batch.job.trace("handon", COLLECT, batch.scans)
                 part = part_name(self._mark, number, first, batch.stop)
                 parts.append((number, (first, batch.stop), part))
@@ -272,16 +260,10 @@ class Dispatcher:
 
     def stored(self, receipt: Receipt) -> bool:
         """Whether a part is in storage; one that its worker holds goes there now, if it is left."""
-        if not receipt.held_at:
+        if not receipt.held_at or self._stages.store_held(receipt):
             return True
-        self._hidden.add(receipt.held_at)
-        data = self._stages.take_held(receipt)
-        if data is None:
-            self._collect_in_vain(self._within(receipt), "its part was lost")
-            return False
-        with storing(self._storage):
-            self._storage.write(receipt.name, data)
-        return True
+        self._collect_in_vain(self._within(receipt), "its part was lost")
+        return False
 
     def lost(self, message: ColumnsLost) -> None:
         """Have batches cast again whose columns could not be fetched."""
@@ -291,7 +273,7 @@ class Dispatcher:
 
     def _collect_in_vain(self, batches: Iterable[Batch], reason: str) -> None:
         for batch in batches:
-            if batch.place is Place.COLLECTING:
+            if batch.place is BatchState.COLLECTING:
                 self._again(batch, reason)
 
     def release(self, committed: Iterable[tuple[JobState, Receipt]]) -> None:
@@ -306,17 +288,17 @@ class Dispatcher:
             self._judge(job)
             if receipt.record is not None:
                 records.append((job, receipt.stop, receipt.record))
-        for other in self.at(Place.COLLECTING) if waited else ():
+        for other in self.at(BatchState.COLLECTING) if waited else ():
             # Those behind them had to wait.
             if other.collector in waited and other.since >= waited[other.collector]:
-                other.move(Place.COLLECTING)
+                other.move(BatchState.COLLECTING)
         self._learn(records)
 
     def leave_collectors(self, died: Mapping[str, str], started: Collection[str]) -> None:
         """Take back the batches of collectors that died, {name: address}, or were replaced."""
-        for batch in self.at(Place.COLLECTING):
+        for batch in self.at(BatchState.COLLECTING):
             name = batch.collector
             if name in died or name in started:
-                self._again(batch, f"{name} was replaced", Place.CAST)
+                self._again(batch, f"{name} was replaced", BatchState.CAST)
                 if name in died:
                     self._blame(batch, COLLECT, died[name])

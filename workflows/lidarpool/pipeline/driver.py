@@ -17,30 +17,27 @@ from itertools import chain
 
 import cloudpickle
 
-from poolpart import TaskRecord
-
-from ..base.storage import Storage
 from ..columns.cloud import Cloud
 from ..scene.scene import Scene
 from ..sensor import Survey
+from .casting_workers import CastingWorkers
 from .database import RunDatabase
 from .dispatch import Dispatcher
 from .failures import JobError
-from .jobs import JobState
+from .job_state import JobState
 from .long_stages import LongStages
 from .messages import (
     ColumnsLost,
     Description,
     Failed,
-    Frame,
     Message,
     Receipt,
+    ScanFrame,
     ScanRange,
     Summaries,
 )
 from .names import COLLECT, GENERATE, SORT
 from .task_book import TaskBook
-from .workers import CastingWorkers
 
 STALL_S = 60.0  # without news from the sorter; then it gets its summaries again
 WAIT_S = 0.05  # for news, where there is nothing else to do
@@ -54,16 +51,14 @@ class RunDriver:
     """Runs jobs on the partitions of a cluster.
 
     `workers` and `stages` are all that it asks of Dask, so that tests can play the cluster. What is
-    committed in `db` is not cast again, and `storage` is where parts go.
+    committed in `db` is not cast again.
     """
 
-    def __init__(
-        self, workers: CastingWorkers, stages: LongStages, db: RunDatabase, storage: Storage
-    ) -> None:
+    def __init__(self, workers: CastingWorkers, stages: LongStages, db: RunDatabase) -> None:
         self.workers, self.stages, self._db = workers, stages, db
-        self.dispatcher = Dispatcher(workers, stages, storage, db.meta["mark"])
+        self.dispatcher = Dispatcher(workers, stages, db.meta["mark"])
         self.jobs: dict[int, JobState] = {}  # those under way
-        self.book = TaskBook()  # of stage 2
+        self.book = TaskBook()  # of stage 2, and in the end of the others
         self.progress = 0  # a number that grows when something is committed or handed out
         self.later = 0  # scans of jobs that are not begun yet
         self._announced: dict[int, int] = {}  # {job: scans}, in the order of stage 1, until taken
@@ -79,7 +74,7 @@ class RunDriver:
         *,
         fit: int,
         in_all: int = 0,
-        on_frame: Callable[[Frame], None] | None = None,
+        on_frame: Callable[[ScanFrame], None] | None = None,
         read: Callable[[int], Cloud] | None = None,
         on_parts: Callable[[list[Receipt]], None] | None = None,
     ) -> JobState:
@@ -152,7 +147,7 @@ class RunDriver:
     @property
     def notes(self) -> list[str]:
         """Notes for the user."""
-        return [*self.stages.notes, *self.workers.notes, *self.dispatcher.notes]
+        return [*self.stages.notes, *self.workers.notes]
 
     # -- one step ----------------------------------------------------------------------------
 
@@ -269,6 +264,8 @@ class RunDriver:
     def _wants_scans(self) -> bool:
         """Whether the next job of stage 1 wants scans, or is none any more."""
         # Those of others are behind them in the pipe: a job gets no more than it has room for.
+        # After the last scan the pipe is closed, which ends each wait at once: a driver that still
+        # asked did so 700 times a second.
         for number in self._announced:
             job = self.jobs.get(number)
             return job is None or bool(job.condemned) or self.dispatcher.room(job) > 0
@@ -302,12 +299,10 @@ class RunDriver:
             self.dispatcher.drop(job)
         self.stages.stop(reason)
 
-    def finish(self) -> list[TaskRecord]:
-        """Wait a moment for the stages to end, and clean up scheduler and storage.
-
-        Returns the records of the stages whose workers can be reached.
-        """
+    def finish(self) -> None:
+        """Wait a moment for the stages to end, and clean up scheduler and storage."""
         try:
-            return self.stages.finish(self.workers.futures)
+            for record in self.stages.finish(self.workers.futures):
+                self.book.add(record)
         finally:
             self.workers.release()

@@ -15,8 +15,8 @@ from poolpart import (
     Partition,
     Pipe,
     PipeFailed,
+    TaskLocations,
     TaskRecord,
-    Whereabouts,
     fetch_available,
     forget_pipes,
     look_for_tasks,
@@ -142,9 +142,20 @@ class LongStages:
         """Tell stage 1 how many scans an item should have."""
         self._scans.advise(scans)
 
-    def take_held(self, receipt: Receipt) -> Any:
-        """Bytes of a part from a worker that does not see the storage; None if they are lost."""
-        return take_held(self.client, receipt.held_at, receipt.name)
+    def store_held(self, receipt: Receipt) -> bool:
+        """Store a part of a worker that does not see the storage; False if it is lost."""
+        note = (
+            f"{receipt.held_at} of partition {self.partition.name} cannot see "
+            f"{self._storage.url}: the driver wrote its parts"
+        )
+        if note not in self.notes:
+            self.notes.append(note)
+        data = take_held(self.client, receipt.held_at, receipt.name)
+        if data is None:
+            return False
+        with storing(self._storage):
+            self._storage.write(receipt.name, data)
+        return True
 
     @property
     def collectors(self) -> dict[str, str]:
@@ -177,6 +188,7 @@ class LongStages:
             lock.release()
 
     def _start_all(self) -> None:
+        # All or none, and under a lock: two runs might each get slots that the other needs.
         seen, now, needed = self._look(), time.monotonic(), len(self._names)
         free = {address: count for address, count in seen.free.items() if count > 0}
         if sum(free.values()) < needed:
@@ -206,7 +218,7 @@ class LongStages:
             f'"{self.partition.name}=1" and run it again.'
         )
 
-    def _look(self) -> Whereabouts:
+    def _look(self) -> TaskLocations:
         keys = [task.future.key for task in self._tasks.values()]
         return look_for_tasks(self.client, self.partition.name, keys)
 

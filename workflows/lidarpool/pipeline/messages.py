@@ -19,7 +19,7 @@ from ..columns.cloud import Cloud
 from ..columns.parts import PartColumns
 from ..sensor import Pose
 
-Span = tuple[int, int]  # the first scan of a batch, and its end
+BatchRange = tuple[int, int]  # the first scan of a batch, and its end
 
 SAMPLES_MOST = 4  # sample rays of a scan
 SAMPLES_WANTED = 400  # of a survey
@@ -102,7 +102,7 @@ class CollectOrder:
 
     key: str  # of the casting task
     worker: str  # address of the worker that has its result
-    parts: tuple[tuple[int, Span, str], ...]  # job, scans and name of each
+    parts: tuple[tuple[int, BatchRange, str], ...]  # job, scans and name of each
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,7 +157,7 @@ Message = ScanRange | Summaries | ColumnsLost | Receipt | Failed
 
 
 @dataclass(frozen=True)
-class Frame:
+class ScanFrame:
     """One scan from stage 3, in scan order, whose points are in storage.
 
     Parameters

@@ -10,9 +10,9 @@ import statistics
 from collections import Counter, deque
 from collections.abc import Iterable, Mapping, Sequence
 
-from poolpart import Whereabouts
+from poolpart import TaskLocations
 
-from .jobs import Batch, Outcome, Place
+from .job_state import Batch, BatchState, Outcome
 from .names import COLLECT, INTERSECT
 
 BATCH_SECONDS = 0.2  # casting time that makes a batch worth its overhead
@@ -50,7 +50,11 @@ def scans_per_batch(seconds: float, scans: int, fit: int, scan_count: int, slots
 
 
 def batches_per_task(seconds: Sequence[float]) -> int:
-    """Choose how many small batches a casting task has, from casting times of others."""
+    """Choose how many small batches a casting task has, from casting times of others.
+
+    A task takes the scheduler 0.5 to 1 ms. With one batch in each, a receipt took 2.5 ms of the
+    scheduler's processor time; with several, it takes 0.4 to 0.9 ms.
+    """
     if not seconds:
         return 1
     typical = max(statistics.median(seconds), 1e-6)
@@ -109,13 +113,13 @@ def offers(
     occupy all workers. Batches that wait are taken in their order. `slots` says how many tasks each
     worker runs at a time.
     """
-    casting = [b for b in batches if b.place is Place.CASTING]
+    casting = [b for b in batches if b.place is BatchState.CASTING]
     load = Counter(worker for _, worker in {(b.key, b.worker) for b in casting})
     alone = {batch.worker for batch in casting if suspect(batch, INTERSECT)}
-    waiting = [b for b in batches if b.place is Place.WAITING]
-    behind = [b for b in batches if b.place in (Place.CAST, Place.COLLECTING)]
+    waiting = [b for b in batches if b.place is BatchState.WAITING]
+    behind = [b for b in batches if b.place in (BatchState.CAST, BatchState.COLLECTING)]
     left = most - weight([*behind, *(b for b in casting if b.worker in slots)], per_task)
-    backlog = any(b.place is Place.CAST for b in behind)
+    backlog = any(b.place is BatchState.CAST for b in behind)
     idle = sum(max(0, count - load[a]) for a, count in slots.items() if a not in alone)
     spread = -(-weight(waiting, per_task) // max(1, idle))  # all idle slots get some
     size = per_task if backlog else min(per_task, spread)
@@ -176,8 +180,8 @@ def handovers(
     preferred. A suspect batch is collected while there is no other in stage 4: several collectors
     may share a process. `collectors` has the address of the worker of each.
     """
-    ready = [b for b in batches if b.place is Place.CAST]
-    busy = [b for b in batches if b.place is Place.COLLECTING]
+    ready = [b for b in batches if b.place is BatchState.CAST]
+    busy = [b for b in batches if b.place is BatchState.COLLECTING]
     if suspects := [b for b in ready if suspect(b, COLLECT)]:
         ready = [] if busy else suspects[:1]
     if any(suspect(b, COLLECT) for b in busy):
@@ -214,23 +218,24 @@ def late_after_s(seconds: Sequence[float]) -> float:
 
 
 def loss(
-    batch: Batch, seen: Whereabouts, prepared: int, now: float, late_s: float
+    batch: Batch, seen: TaskLocations, prepared: int, now: float, late_s: float
 ) -> Outcome | None:
     """Whether a batch should be offered again although its task has not failed, and why.
 
     It depends on what was `seen` of workers and tasks, and on the number of workers that are
-    `prepared`: while there is no other, a batch is waited for.
+    `prepared`: while there is no other, a batch is waited for. A worker that Dask has paused starts
+    no task until memory is free, perhaps never: what it has not started is offered elsewhere.
     """
-    if batch.place in (Place.CASTING, Place.CAST):
+    if batch.place in (BatchState.CASTING, BatchState.CAST):
         if batch.worker not in seen.members:
-            return Outcome.DIED if batch.place is Place.CASTING else Outcome.GONE
+            return Outcome.DIED if batch.place is BatchState.CASTING else Outcome.GONE
         if batch.worker in seen.silent:
             if prepared:
                 return Outcome.GONE
-        elif batch.worker not in seen.free and batch.place is Place.CASTING:
+        elif batch.worker not in seen.free and batch.place is BatchState.CASTING:
             task = seen.tasks.get(batch.key)
             # "no-worker": not even sent there, as the worker was paused before.
             if task and task.state in ("no-worker", "processing") and not task.started:
                 return Outcome.REFUSED
-    late = batch.place in (Place.CASTING, Place.COLLECTING) and now - batch.since > late_s
-    return Outcome.LATE if late and (prepared > 1 or batch.place is Place.COLLECTING) else None
+    late = batch.place in (BatchState.CASTING, BatchState.COLLECTING) and now - batch.since > late_s
+    return Outcome.LATE if late and (prepared > 1 or batch.place is BatchState.COLLECTING) else None

@@ -30,7 +30,7 @@ from ..simulator.device import DeviceReturns
 from ..simulator.returns import BatchReturns
 from ..simulator.rig import Rig
 from .failures import naming_scans
-from .messages import Span, samples_of_scan
+from .messages import BatchRange, samples_of_scan
 from .names import GPU, INTERSECT
 
 UNUSED_S = 600.0  # a rig unused for so long, as of a killed driver, goes when another is made
@@ -121,7 +121,7 @@ class CastWork:
 
     job: int
     handle: str  # of the rig
-    spans: Sequence[Span]  # the first scan and the end of each batch
+    spans: Sequence[BatchRange]  # the first scan and the end of each batch
 
 
 @dataclass(frozen=True)

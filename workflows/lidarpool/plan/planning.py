@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
-from ..base.declared import Seed, told
+from ..base.declared import Seed, about
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .geometry import segment_distances
@@ -25,13 +25,13 @@ class Search:
     swarms converge more slowly.
     """
 
-    trials: Annotated[int, told("particle swarms, each with its own seed", ge=1, le=10**6)] = 100
-    particles: Annotated[int, told("of each swarm", ge=1, le=10_000_000)] = 1000
-    iterations: Annotated[int, told("of each swarm", ge=1, le=1_000_000)] = 300
+    trials: Annotated[int, about("particle swarms, each with its own seed", ge=1, le=10**6)] = 100
+    particles: Annotated[int, about("of each swarm", ge=1, le=10_000_000)] = 1000
+    iterations: Annotated[int, about("of each swarm", ge=1, le=1_000_000)] = 300
     waypoints: Annotated[
-        int, told("corners of the path between start and target", ge=1, le=100)
+        int, about("corners of the path between start and target", ge=1, le=100)
     ] = 5
-    seed: Annotated[Seed, told("the same seed gives the same path")] = 0
+    seed: Annotated[Seed, about("the same seed gives the same path")] = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,9 +15,9 @@ from raybeam import RayCaster
 from ..base.arrays import Bools, Floats, Ints
 from ..base.errors import LidarpoolError
 from ..base.validation import checked
-from ..scene.drawn import Drawn
 from ..scene.floor import SLAB_M
 from ..scene.scene import Scene
+from ..scene.simplified import Drawn
 from ..sensor import Sensor, Spin
 
 STATIONS_MOST = 100

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.colors import Normalize
 
 from ..sensor import LineSensor, Sensor
-from .page import Page
+from .picture_page import Page
 from .shot import SIZE
 from .theme import mapped
 

@@ -10,8 +10,8 @@ import numpy as np
 from raybeam import RayCaster
 
 from ..base.arrays import Floats, Ints
-from ..scene.mesh import triangle_areas
 from ..scene.scene import Scene
+from ..scene.scene_mesh import triangle_areas
 from .surface import spiral
 
 # Margin on each side of a trajectory: a share of its diagonal, times its height above the scene's
@@ -75,7 +75,7 @@ def _rough(heights: Floats) -> float:
 
 
 @dataclass(frozen=True, eq=False)
-class Part:
+class ShownPart:
     """A part of a scene."""
 
     scene: Scene
@@ -83,11 +83,11 @@ class Part:
     shares: Floats  # (f,) its share of that triangle's area
 
     @classmethod
-    def whole(cls, scene: Scene) -> Part:
+    def whole(cls, scene: Scene) -> ShownPart:
         """All of a scene."""
         return cls(scene, np.arange(len(scene.faces)), np.ones(len(scene.faces)))
 
-    def cut(self, box: Floats) -> Part:
+    def cut(self, box: Floats) -> ShownPart:
         """Cut a box (2, 3) out; all if there is nothing in it.
 
         Objects narrower than the box are included if their middle is inside; wider ones, such as
@@ -117,7 +117,7 @@ class Part:
         was = triangle_areas(scene.vertices[scene.faces[own]])
         areas = triangle_areas(vertices[faces])
         shares = np.divide(areas, was, out=np.ones(len(was)), where=was > 0)
-        return Part(part, self.parents[own], self.shares[own] * shares)
+        return ShownPart(part, self.parents[own], self.shares[own] * shares)
 
 
 def _clipped(

@@ -7,18 +7,17 @@ from textwrap import fill
 
 import numpy as np
 from matplotlib.colors import LogNorm, Normalize
-from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, Floats, Floats32, Ints, UInts32
-from ..base.words import counted
+from ..base.arrays import AnyArray, AnyFloats, Floats, Floats32, Ints, UInts32
+from ..base.words import plural
 from ..columns.cloud import Cloud
 from ..columns.table import Column, Z
 from ..scene.scene import Scene
 from . import theme
 from .colouring import TURBO, colours_of, values_of
-from .hits import HITS_TITLE, hit_colours
-from .page import LEGEND_ROWS, Page, whole_of, without_common_prefix
-from .shot import Shot
+from .hit_density import HITS_TITLE, hit_colours
+from .picture_page import LEGEND_ROWS, Page, whole_of, without_common_prefix
+from .shot import SurfaceView
 
 MOST_POINTS = 1_000_000  # of a cloud are drawn; a picture has a few more pixels
 MOST_HITS, MOST_PIECES = 200_000, 100_000  # to count, and to colour
@@ -28,14 +27,14 @@ MOST_RAYS, MOST_OF_MOVING = 600, 150  # more from one trajectory would hide the 
 SURROUNDING = 0.6
 
 
-def draw_scene(shot: Shot, triangles: int) -> Page:
+def draw_scene(shot: SurfaceView, triangles: int) -> Page:
     """Draw a scene, each object in its own colour, and the sensors; `triangles` is their number.
 
     Of more objects than a legend has rows, copies of one thing share a colour. A scene that has
     colours is drawn in these, without a legend.
     """
     scene = shot.scene
-    words = f"{counted(len(scene.names), 'object')} · {counted(triangles, 'triangle')}"
+    words = f"{plural(len(scene.names), 'object')} · {plural(triangles, 'triangle')}"
     if scene.colours is not None:
         page = Page(shot.camera.size)
         page.show(shot, shot.paint(scene.colours.means() / 255))
@@ -62,7 +61,7 @@ def draw_scene(shot: Shot, triangles: int) -> Page:
 
 
 def draw_hits(
-    shot: Shot, hit_counts: AnyArray, points: Floats, sample_rays: NDArray[np.floating]
+    shot: SurfaceView, hit_counts: AnyArray, points: Floats, sample_rays: AnyFloats
 ) -> Page:
     """Draw a scene coloured by hits per square metre, with the sensors and sample rays.
 
@@ -90,12 +89,12 @@ def draw_hits(
     rays = np.linspace(0, len(sample_rays) - 1, most).astype(int)
     page.lines(axes, shot, sample_rays[rays].astype(np.float64), 0.45, 0.5)
     page.colour_bar(TURBO, LogNorm(*limits), HITS_TITLE)
-    page.title("Hits", f"{counted(round(hit_counts.sum()), 'hit')} · {shot.when}", shot.models)
+    page.title("Hits", f"{plural(round(hit_counts.sum()), 'hit')} · {shot.when}", shot.models)
     return page
 
 
 def draw_cloud(
-    shot: Shot,
+    shot: SurfaceView,
     cloud: Cloud,
     count: int,
     column: Column = Z,
@@ -124,7 +123,7 @@ def draw_cloud(
             page.colour_bar(coloured.scale, norm, (coloured.name + unit).rstrip())
     page.show(shot, image)
     by = "height" if column is Z else column.name.replace("_", " ")
-    page.title(f"Point cloud by {by}", f"{counted(count, 'point')} · {shot.when}", shot.models)
+    page.title(f"Point cloud by {by}", f"{plural(count, 'point')} · {shot.when}", shot.models)
     return page
 
 
@@ -164,7 +163,7 @@ def _object_colours(scene: Scene, kinds: Ints) -> Floats:
 
 
 def with_points(
-    image: Floats32, shot: Shot, points: Floats, colours: Floats, solid: bool = False
+    image: Floats32, shot: SurfaceView, points: Floats, colours: Floats, solid: bool = False
 ) -> Floats32:
     """Draw points (n, 3) as discs over an image; `solid` makes them close the gaps between them.
 
@@ -217,6 +216,6 @@ def with_points(
     return drawn
 
 
-def _packed(colours: NDArray[np.floating]) -> UInts32:
+def _packed(colours: AnyFloats) -> UInts32:
     """Colours (..., 4) in 0 to 1 as one number each, with a byte for each part."""
     return np.round(255 * colours).astype(np.uint8).view(np.uint32)[..., 0]

@@ -13,14 +13,14 @@ from PIL import Image, ImageDraw
 from raybeam import RayCaster
 
 from ..base.arrays import Bools, Floats, Floats32, Ints
-from ..base.words import counted
+from ..base.words import plural
 from ..scene.scene import Scene
 from . import theme
 from .camera import Camera, fit_camera
-from .closeup import Part, around_ways, floor_and_cut
+from .closeup import ShownPart, around_ways, floor_and_cut
 from .cutaway import cast_through, plan_cutaway
 from .light import STRIDE, alike, make_light_map, plane_tolerance
-from .stage import Stage
+from .stage import PlotBox
 from .surface import Surface, apart, unit
 
 SIZE = (1600, 1000)  # pixels of a finished picture
@@ -55,7 +55,7 @@ class Samples:
         return whole
 
     def paint(self, face_colours: Floats, contrast: float) -> Floats32:
-        """Colours (n, 4) of the samples; see `Shot.paint`."""
+        """Colours (n, 4) of the samples; see `SurfaceView.paint`."""
         image = np.zeros((len(self.triangle), 4), np.float32)
         surface = np.flatnonzero(self.triangle >= 0)
         ground = np.flatnonzero(self.triangle == GROUND)
@@ -71,17 +71,17 @@ class Samples:
 
 
 @dataclass(frozen=True, eq=False)
-class Shot:
+class SurfaceView:
     """A scene on its ground with sensors in it, seen by a camera."""
 
-    part: Part
+    part: ShownPart
     uncut: Scene  # what there was of the part before it was cut open
     sensors: Floats  # (p, 3) metres, local coordinates
     paths: tuple[Floats, ...]  # of moving sensors, (k, 3) each
     actors: int  # number of actors, the last objects of the scene, which are labelled
     when: str  # what is drawn, for a caption: how many sensors there are, and at what time
     models: str  # what the sensors are, for a caption
-    stage: Stage
+    stage: PlotBox
     camera: Camera
     whole: Samples  # through the middle of each pixel
     edges: Ints  # (e,) pixels that show the edge of something
@@ -114,7 +114,7 @@ class Shot:
             image[self.edges] = finer.reshape(len(self.edges), -1, 4).mean(axis=1)
         return np.clip(image, 0, 1).reshape(*self.camera.size[::-1], 4)
 
-    def divided(self, pieces: Floats32, owner: Ints) -> Shot:
+    def divided(self, pieces: Floats32, owner: Ints) -> SurfaceView:
         """Return the same shot of triangles divided into pieces (k, 3, 3), to paint these.
 
         The first piece of each triangle has its number, and `owner` (k,) says whose each is.
@@ -182,7 +182,7 @@ def take_shot(
     models: str = "",
     size: tuple[int, int] = SIZE,
     backend: str = "auto",
-) -> Shot:
+) -> SurfaceView:
     """Look at a scene from a good viewpoint.
 
     The camera looks down from the side on which the scene is wider. If the sensors stand inside a
@@ -207,9 +207,9 @@ def take_shot(
     """
     sensors = np.asarray(poses, dtype=np.float64).reshape(-1, 3) - scene.origin
     everywhere = np.concatenate([sensors, *paths])
-    when = when or counted(len(sensors), "sensor position")
+    when = when or plural(len(sensors), "sensor position")
     box = around_ways(scene.bounds, around)
-    part = Part.whole(scene) if box is None else Part.whole(scene).cut(box)
+    part = ShownPart.whole(scene) if box is None else ShownPart.whole(scene).cut(box)
     bounds = part.scene.bounds
     step = _APART * float(np.linalg.norm(np.ptp(bounds, 0)))
     part = uncut = replace(part, scene=apart(part.scene, part.scene.face_object, step))
@@ -271,7 +271,7 @@ def take_shot(
             pixels[there], samples.position[there], samples.normal[there],
             samples.triangle[there] == GROUND,
         )  # fmt: skip
-    return Shot(
+    return SurfaceView(
         part,
         uncut.scene,
         sensors,
@@ -287,16 +287,16 @@ def take_shot(
     )
 
 
-def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> Stage:
+def _stage(bounds: Floats, sensors: Floats, origin: Floats) -> PlotBox:
     """Choose the box to show: that of the scene, and the sensors that are near it."""
     low, high = bounds
     reach = 2 * max(float(np.linalg.norm(high - low)), 1e-3)
     near = sensors[((sensors > low - reach) & (sensors < high + reach)).all(axis=1)]
     shown = np.concatenate([bounds, near])
-    return Stage.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), origin)
+    return PlotBox.around(np.stack([shown.min(axis=0), shown.max(axis=0)]), origin)
 
 
-def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera:
+def _camera(stage: PlotBox, size: tuple[int, int], elevation_deg: float) -> Camera:
     """Look along the diagonal, so that the wider side of the stage runs across the picture."""
     wide = np.ptp(stage.ground[:, 0]) >= np.ptp(stage.ground[:, 1])
     top = stage.corners.copy()
@@ -307,7 +307,7 @@ def _camera(stage: Stage, size: tuple[int, int], elevation_deg: float) -> Camera
     return fit_camera(corners, size, FRAME, -62.0 if wide else -28.0, elevation_deg)
 
 
-def _outline(stage: Stage, camera: Camera) -> Bools:
+def _outline(stage: PlotBox, camera: Camera) -> Bools:
     """Whether the stage's box can be seen through each pixel, (pixels,)."""
     ends = (*stage.ground.T, (stage.level, stage.bounds[1, 2]))
     flat, _ = camera.project(list(product(*ends)))
@@ -318,7 +318,7 @@ def _outline(stage: Stage, camera: Camera) -> Bools:
     return np.asarray(image).ravel()
 
 
-def _ground_distance(stage: Stage, eye: Floats, directions: Floats) -> Floats:
+def _ground_distance(stage: PlotBox, eye: Floats, directions: Floats) -> Floats:
     """Metres (n,) from the eye to the ground's rectangle along directions (n, 3)."""
     with np.errstate(divide="ignore", invalid="ignore"):
         distance = (stage.level - eye[2]) / directions[:, 2]

@@ -23,7 +23,7 @@ class Axis:
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class PlotBox:
     """A box with round ticks on its axes, and the ground rectangle under it; local metres."""
 
     bounds: Floats  # (2, 3) lowest and highest corner of what is shown
@@ -43,7 +43,7 @@ class Stage:
         return np.array([[x, y, self.level] for x, y in ((x0, y0), (x1, y0), (x1, y1), (x0, y1))])
 
     @classmethod
-    def around(cls, bounds: Floats, origin: Floats) -> Stage:
+    def around(cls, bounds: Floats, origin: Floats) -> PlotBox:
         """Build the stage of a box (2, 3), local metres, which may be flat or a single point."""
         low, high = bounds
         widest = float((high - low).max()) or 1.0

@@ -5,11 +5,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import RayCaster
 
-from ..base.arrays import Floats, Integers, Ints
+from ..base.arrays import AnyFloats, Floats, Integers, Ints
 from ..scene.scene import Scene
 
 # Faces that meet at a flatter angle than this are shaded as one smooth surface.
@@ -95,7 +94,7 @@ def _places(scene: Scene, objects: Integers) -> Ints:
     return np.unique(key, return_inverse=True)[1]
 
 
-def dot(a: NDArray[np.floating], b: NDArray[np.floating]) -> NDArray[np.floating]:
+def dot(a: AnyFloats, b: AnyFloats) -> AnyFloats:
     """Scalar products (...,) of vectors (..., 3)."""
     return np.asarray(np.einsum("...i,...i->...", a, b))
 

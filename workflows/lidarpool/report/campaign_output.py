@@ -14,17 +14,17 @@ from typing import Any
 from ..base.errors import LidarpoolError, explained
 from ..base.software import difference, software
 from ..base.storage import Storage
-from ..base.words import counted
-from ..export.dataset import INDEX_FILE, OF_JOBS, DataSet
+from ..base.words import plural
+from ..datasets.dataset import INDEX_FILE, OF_JOBS, DataSet
+from ..datasets.job_table import JobRow, read_table, write_table
+from ..datasets.loader import read_index, sweeps
 from ..export.folder import result_folder
-from ..export.jobs import JobRow, read_table, write_table
-from ..export.loader import read_index, sweeps
 from ..pipeline.database import FILE
 from ..run.conductor import Conductor, Output
 from ..run.job_points import listed
-from ..run.result import CampaignRun
+from ..run.run_result import CampaignRun
 from ..run.store import RUN_FOLDER, RunStore, remove_run
-from ..scenario.campaign import Campaign, hashes
+from ..scenario.campaign import CampaignSpec, hashes
 
 CAMPAIGN_FILE = "campaign.json"  # whose data set this is, and the software that made it
 
@@ -42,7 +42,7 @@ class DataSetOutput(Output[CampaignRun]):
     """The data set of a campaign in its folder or storage, `place`."""
 
     place: Path | Storage
-    campaign: Campaign
+    campaign: CampaignSpec
     dataset: DataSet = field(init=False)
 
     def __post_init__(self) -> None:
@@ -131,7 +131,7 @@ class DataSetOutput(Output[CampaignRun]):
         """Write what all jobs share, and remove the run unless jobs have failed."""
         store, cast = conductor.store, conductor.run
         seconds = time.monotonic() - conductor.started
-        more = {"stages": cast.stages if cast else (), "notes": tuple(conductor.notes)}
+        more = {"stages": cast.stages if cast else (), "notes": tuple(store.notes)}
         run = CampaignRun.of(store.rows(), seconds, store.resumed, sensors=store.sensors, **more)
         self._write_shared(store, run)
         if run.failed:
@@ -145,14 +145,15 @@ class DataSetOutput(Output[CampaignRun]):
     def _write_shared(self, store: RunStore, run: CampaignRun) -> None:
         """Write what all jobs share, and last what says that the data set is complete."""
         # Matplotlib takes as long as all other imports.
-        from .campaign_report import draw_sweep, write_card
+        from .campaign_report import write_card
+        from .charts import draw_sweep
 
         campaign, place = self.campaign, self.dataset.place
         made: dict[str, Any] = {"identity": dict(store.identity), "casting": store.casting}
         made |= {"backend": store.backend, "sensors": run.sensors}
         with explained(f"{place} cannot be written"):
             place.write(CAMPAIGN_FILE, (json.dumps(made, indent=1) + "\n").encode())
-        write_table(place, campaign.names, store.rows())
+        write_table(place, campaign.names, store.rows)
         self.dataset.finish(store.rows())
         saved = sweeps(place.url)
         picture = draw_sweep(next(iter(saved))) if len(saved) else None
@@ -160,7 +161,10 @@ class DataSetOutput(Output[CampaignRun]):
 
 
 def _look(
-    dataset: DataSet, rows: Iterable[JobRow], contents: bool, campaign: Campaign | None = None
+    dataset: DataSet,
+    rows: Iterable[JobRow],
+    contents: bool,
+    campaign: CampaignSpec | None = None,
 ) -> tuple[int, dict[int, str]]:
     """Count the jobs that are whole, and tell what is wrong with others, {number: a clause}.
 
@@ -214,10 +218,10 @@ def verify(place: Storage, number: int | None = None) -> str:
             f"{place} is damaged: {listed([*wrong.values()])}. With the campaign, --verify makes "
             "these jobs again."
         )
-    return f"{place} is whole: {counted(len(rows), 'job')}"
+    return f"{place} is whole: {plural(len(rows), 'job')}"
 
 
-def check_same(place: Storage, campaign: Campaign) -> Mapping[str, Any]:
+def check_same(place: Storage, campaign: CampaignSpec) -> Mapping[str, Any]:
     """Check that a data set is of this campaign, and of the software here; returns its record.
 
     LidarpoolError names what differs, there and here.
@@ -273,7 +277,7 @@ def _remove_dataset(out: Storage, kept: Storage) -> None:
 
 def failures(run: CampaignRun, most: int = 5) -> str:
     """Name the jobs that have failed, with their values and why."""
-    lines = [f"{counted(len(run.failed), 'job')} failed, the other {run.done:,} are done:"]
+    lines = [f"{plural(len(run.failed), 'job')} failed, the other {run.done:,} are done:"]
     for row in run.failed[:most]:
         values = ", ".join(f"{name} {value}" for name, value in row.values.items())
         lines.append(f"job {row.name}{f' ({values})' if values else ''}: {row.error}")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -17,14 +17,14 @@ from ..base.open3d_module import load_open3d
 from ..base.storage import Storage, flush
 from ..base.vocabulary import PICTURES
 from ..export.folder import LAST_FILE, result_folder, staging
+from ..export.format_table import EXPORTS, FORMATS
 from ..export.formats import Format, refuse_strangers
-from ..export.navigation import FILES as INSTRUMENT_FILES
-from ..export.navigation import Instruments, write_instruments
+from ..export.navigation_files import FILES as INSTRUMENT_FILES
+from ..export.navigation_files import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
-from ..export.table import EXPORTS, FORMATS
 from ..run.conductor import Conductor, Output
-from ..run.picture_file import PICTURE_FILE, Pictured
-from ..run.result import RunResult
+from ..run.picture_file import PICTURE_FILE, PictureContent
+from ..run.run_result import RunResult
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
 from ..sensor import Survey
@@ -105,7 +105,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     ) -> tuple[RunResult, dict[str, Any]]:
         """Write the result, and remove the run."""
         result = conductor.result()
-        in_pieces = any(one.in_pieces for one in self.formats)
+        in_pieces = any(one.row.in_pieces for one in self.formats)
         workers = None
         if not in_pieces:
             conductor.cluster_stack.close()
@@ -151,40 +151,37 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         with (
             explained(f"The result cannot be written to {place}", advice),
             staging(folder, place) as staged,
-            nullcontext() if self.only_cloud else _Pictures(result, staged) as pictures,
+            ThreadPoolExecutor(1, "pictures") as thread,
         ):
+            pictures = None if self.only_cloud else _Pictures(result, staged)
+            others = thread.submit(pictures.draw, of_cloud=False) if pictures else None
             drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
             further = _further_files(result.survey, formats)
             files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
             refuse_strangers(target, {*further, *earlier})
 
-            @cache
-            def clear() -> None:
-                """Remove once what an earlier result has there and this one would not replace."""
-                for name in (REPORT, PAGE, *_stale(earlier, files)):
-                    target.discard(name)
-
+            clear = cache(partial(_clear, target, files, earlier))  # once
             sweeps.save(staged / SWEEPS_FILE)
             if (instruments := sweeps.instruments) is not None:
                 write_instruments(staged, result.survey, result.scene.origin)
                 sweeps = replace(sweeps, instruments=replace(instruments, folder=staged))
             Format("ply").write(staged / CLOUD, cloud, sweeps)
-            for one in sorted(formats, key=lambda one: one.in_pieces):
-                if storage and workers and one.in_pieces:
+            for one in sorted(formats, key=lambda one: one.row.in_pieces):
+                if storage and workers and one.row.in_pieces:
                     clear()
                     one.put(storage, points, sweeps, workers)
                 else:
                     one.write(
-                        staged / one.file, points, sweeps, workers=None if storage else workers
+                        staged / one.row.file, points, sweeps, workers=None if storage else workers
                     )
             if workers:
                 result = workers.recorded(result)
             report = make_report(result, files, cloud)
             report["notes"] += [note for one in formats for note in one.notes(points)]
-            if pictures:
-                from .page.page import write_page  # as slow to import as the pictures
+            if pictures and others:
+                from .page.rendering import write_page  # as slow to import as the pictures
 
-                images = pictures.finish()
+                images = others.result() | pictures.draw(of_cloud=True)
                 write_page(staged / PAGE, report, result, cloud, images, self.scenario)
             text = json.dumps(report, indent=1, allow_nan=False) + "\n"
             (staged / REPORT).write_text(text, encoding="utf-8")
@@ -204,7 +201,7 @@ def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
     """Name the files that a result has besides those that all have."""
     instruments = Instruments.of(survey)
     measured = [] if instruments is None else instruments.files
-    return [*(one.file for one in formats), *measured]
+    return [*(one.row.file for one in formats), *measured]
 
 
 def _earlier(storage: Storage) -> tuple[dict[str, str], frozenset[str]]:
@@ -227,20 +224,14 @@ def _move(
     earlier: Collection[str],
     then: Callable[[], object],
 ) -> None:
-    """Move a whole result into place.
+    """Move a whole result into place, its report last.
 
-    A folder with a report is a result: the earlier report is removed first, and the new one is
-    moved last. If the process is killed in between, --resume continues from the run's folder.
+    If the process is killed in between, --resume continues from the run's folder.
     """
     for name in files:
         flush(staged / name)
     with deferred_interrupts():
-        for name in (REPORT, PAGE):
-            (folder / name).unlink(missing_ok=True)
-        flush(folder)
-        # A path of an earlier run would look like this one's; folders are not replaced.
-        for name in _stale(earlier, files):
-            Storage.at(folder).discard(name)
+        _clear(Storage.at(folder), files, earlier)
         for name in (*_FURTHER, *FILES):
             if name in files:
                 (staged / name).replace(folder / name)
@@ -248,46 +239,38 @@ def _move(
         then()
 
 
-def _stale(earlier: Collection[str], files: Collection[str]) -> list[str]:
-    """Files that are removed before a result of `files` is put into its place.
+def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) -> None:
+    """Remove what is in the place of a result of `files`, its report first: that tells a result.
 
     Folders and files of formats only if they are replaced, or the earlier result lists them. If a
     killed run has removed the earlier report, they stay.
     """
     further = [name for name in _FURTHER if name in files or name in earlier]
-    return further + [name for name in FILES if name not in files]
+    # A path of an earlier run would look like this one's.
+    for name in (REPORT, PAGE, *further, *(name for name in FILES if name not in files)):
+        target.discard(name)
+        if name == PAGE and target.is_local:
+            flush(target.local())
 
 
-class _Pictures(AbstractContextManager["_Pictures"]):
-    """Pictures of a result, drawn in a thread while the cloud is written.
-
-    They are drawn from the file of the cloud, as by `lidarpool plot`, so that both draw the same.
-    """
+class _Pictures:
+    """Pictures of a result, which are drawn from the file of the cloud, as by `lidarpool plot`."""
 
     def __init__(self, result: RunResult, staged: Path) -> None:
-        from .pictures import picture_makers  # Matplotlib takes as long as all other imports
+        from .result_pictures import picture_makers  # Matplotlib takes as long as all other imports
 
-        self._staged, self._thread = staged, ThreadPoolExecutor(1, "pictures")
-        self._pictured = Pictured.of(result)
+        pictured, self._staged = PictureContent.of(result), staged
+        pictured.save(staged / PICTURE_FILE)
         columns = [column.name for column in result.survey.stored_columns]
-        self._makers = picture_makers(self._pictured, staged / CLOUD, columns)
+        self._makers = picture_makers(pictured, staged / CLOUD, columns)
         self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
-        self._drawn: dict[str, Future[str]] = {}
-        self._begin(name for name in self._makers if name not in _OF_CLOUD)
 
-    def __exit__(self, *_: object) -> None:
-        self._thread.shutdown(cancel_futures=True)
-
-    def _begin(self, names: Iterable[str]) -> None:
-        self._drawn |= {name: self._thread.submit(self._draw, name) for name in names}
-
-    def _draw(self, name: str) -> str:
-        page = self._makers[name]()
-        page.save(self._staged / f"{name}.png")
-        return page.svg()
-
-    def finish(self) -> dict[str, str]:
-        """Draw those of the cloud, whose file is there by now; returns all as SVG, by name."""
-        self._begin(name for name in _OF_CLOUD if name in self._makers)
-        self._pictured.save(self._staged / PICTURE_FILE)
-        return {name: self._drawn[name].result() for name in self._makers}
+    def draw(self, *, of_cloud: bool) -> dict[str, str]:
+        """Draw those of the cloud's file, or all others; returns them as SVG, by name."""
+        images = {}
+        for name, make in self._makers.items():
+            if (name in _OF_CLOUD) == of_cloud:
+                page = make()
+                page.save(self._staged / f"{name}.png")
+                images[name] = page.svg()
+        return images

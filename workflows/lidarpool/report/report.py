@@ -19,10 +19,10 @@ from ..base.declared import declared
 from ..base.storage import Storage
 from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.table import NO_SURFACE, Column
-from ..pipeline import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
+from ..pipeline.names import COLLECT, EXPORT, GENERATE, INTERSECT, SORT
 from ..pipeline.task_book import StageTotals, union
 from ..plan.planning import Search
-from ..run.result import RunResult
+from ..run.run_result import RunResult
 from ..run.trials import TRIAL
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey

@@ -24,7 +24,8 @@ from raybeam import available_backends
 from .._version import __version__
 from ..base.errors import LidarpoolError
 from ..base.software import difference, software, software_there
-from ..pipeline import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT, JobError
+from ..pipeline.failures import JobError
+from ..pipeline.names import COLLECT, GENERATE, GPU, LIDAR, OTHER, SORT
 from ..scenario.build import Job
 from ..scenario.sections import TaskOptions
 from ..simulator.memory import MB, cast_bytes

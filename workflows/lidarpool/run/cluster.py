@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext, suppress
-from typing import Any, TypeVar
+from typing import Any
 
 from distributed import Client
 from distributed.client import FutureCancelledError
@@ -14,7 +14,7 @@ from distributed.comm.core import CommClosedError
 from poolpart import Partition, PipeClosed, PipeFailed, PoolError
 
 from ..base.errors import LidarpoolError
-from ..pipeline import GPU, LIDAR, OTHER
+from ..pipeline.names import GPU, LIDAR, OTHER
 from ..scenario.build import Job
 from .checks import check_workers, find_workers, gpu_note, slots_needed
 from .connection import connected, local_client, started_client
@@ -24,12 +24,10 @@ from .store import RunStore
 from .tasks import Tasks
 from .watch import Waiting, Watch
 
-T = TypeVar("T")
-
 LOST_S = 0.5  # for a client to notice that its scheduler is gone
 
-# Errors that Dask raises once the scheduler is gone.
-_CLUSTER_LOST = (OSError, CommClosedError, FutureCancelledError, PipeClosed, PipeFailed)
+# Errors that Dask raises once the scheduler is gone; those of connections are OSErrors.
+_CLUSTER_LOST = (OSError, FutureCancelledError, PipeClosed, PipeFailed)
 
 
 def client_of(
@@ -99,14 +97,14 @@ class Cluster:
             raise
         except Exception as error:  # the kind depends on the request
             if client.status != "running" or isinstance(error, CommClosedError):
-                raise self._told_lost() from error
+                raise self._lost_error() from error
             raise
         names = sorted({name for worker in self._pool for name in worker.partitions})
         self.partitions = {name: Partition(name, client) for name in names}
         # Slots of LIDAR that the long stages leave, as they are at the start.
         self.spare = max(1, self.partitions[LIDAR].slots - 2 - options.collectors)
-        note = gpu_note(self._pool, self._casting, self.backend)
-        self.notes: list[str] = [note] if note else []
+        if note := gpu_note(self._pool, self._casting, self.backend):
+            store.notes.append(note)
         self._callers_error: BaseException | None = None
 
     def _want_nothing(self) -> None:
@@ -116,7 +114,7 @@ class Cluster:
                 for partition in self.partitions.values():
                     partition.want(0)
 
-    def _told_lost(self) -> LidarpoolError:
+    def _lost_error(self) -> LidarpoolError:
         return LidarpoolError(
             f"The cluster at {self.address} cannot be reached any more, or somebody cancelled "
             "the tasks of this run; it has ended without a result."
@@ -134,10 +132,10 @@ class Cluster:
         """Check that the workers have memory for a job; JobError if not."""
         check_workers(job, self.options, self.backend, self._casting)
 
-    def call(self, callback: Callable[[T], None], argument: T) -> None:
+    def call(self, callback: Callable[..., None], *arguments: Any) -> None:
         """Call a callback of the caller; its OSError must not look like the cluster's."""
         try:
-            callback(argument)
+            callback(*arguments)
         except BaseException as error:
             self._callers_error = error
             raise
@@ -178,7 +176,7 @@ class Cluster:
             if isinstance(error, PoolError) and not lost:
                 raise LidarpoolError(str(error)) from error
             if isinstance(error, _CLUSTER_LOST) or (lost and isinstance(error, Exception)):
-                raise self._told_lost() from error
+                raise self._lost_error() from error
             raise
         finally:
             self._want_nothing()

@@ -18,16 +18,16 @@ from poolpart.clusters import INFORMATION
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.validation import sentences
-from ..base.words import counted, did_you_mean
+from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
-from ..pipeline import GPU, LIDAR, OTHER
+from ..pipeline.names import GPU, LIDAR, OTHER
 
 # A scheduler that SSH has started outlives a driver that was killed: it ends when it has been
 # without tasks for so long. And a host that does not answer is given up after so long.
 _IDLE, _CONNECT = "1h", "30s"
 
 
-class Workers(BaseModel):
+class WorkerGroup(BaseModel):
     """Workers of a partition; other fields are arguments of the cluster that differ for it."""
 
     model_config = ConfigDict(extra="allow", frozen=True, strict=True)
@@ -68,7 +68,7 @@ class ClusterFile(BaseModel):
 
     cluster: str  # class, such as ``dask_jobqueue.SLURMCluster`` or ``distributed.SSHCluster``
     arguments: dict[str, Any] = {}
-    partitions: dict[str, Workers]
+    partitions: dict[str, WorkerGroup]
     _source: str = PrivateAttr("cluster file")
 
     @classmethod
@@ -109,7 +109,7 @@ class ClusterFile(BaseModel):
 
     def __str__(self) -> str:
         parts = ", ".join(f"{name} {workers}" for name, workers in self.partitions.items())
-        total = counted(sum(one.most for one in self.partitions.values()), "worker")
+        total = plural(sum(one.most for one in self.partitions.values()), "worker")
         total = f"up to {total}" if any(one.adapt for one in self.partitions.values()) else total
         return f"{self.cluster.rpartition('.')[2]}: {total}, {parts}"
 

@@ -3,25 +3,25 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import AbstractContextManager, ExitStack, nullcontext
 from typing import Generic, TypeVar
 
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
-from ..export.dataset import DataSet
-from ..export.jobs import JobRow
-from ..pipeline import Frame
+from ..datasets.dataset import DataSet
+from ..datasets.job_table import JobRow
 from ..pipeline.database import FILE
+from ..pipeline.messages import ScanFrame
 from ..plan import best
 from ..simulator.world import check_backend_here
 from .cluster import Cluster
-from .jobs import JobMaker, Jobs, Made, OneJob
+from .job_source import JobMaker, Jobs, MadeJob, OneJob
 from .options import RunOptions
-from .page import Page
 from .progress import Screen
-from .result import RunResult
 from .run import Run
+from .run_page import RunPage
+from .run_result import RunResult
 from .store import RunStore, remove_run
 
 R = TypeVar("R")
@@ -72,8 +72,8 @@ class Conductor(Generic[R]):
         options: RunOptions,
         output: Output[R],
         screen: Screen,
-        page: Page,
-        on_frame: Callable[[Frame], None] | None = None,
+        page: RunPage,
+        on_frame: Callable[[ScanFrame], None] | None = None,
     ) -> None:
         self.jobs, self.options, self.output = jobs, options, output
         self.screen, self.page, self._on_frame = screen, page, on_frame
@@ -129,10 +129,10 @@ class Conductor(Generic[R]):
         self.output.look(self)
         self.stack.enter_context(self.cluster_stack)
 
-    def _first_job(self) -> Made | None:
+    def _first_job(self) -> MadeJob | None:
         """Wait for a job that can be made; None if nothing is left to be cast."""
         if (only := self.store.only) is not None:
-            return None if only.complete else Made(only.job)
+            return None if only.complete else MadeJob(only.job)
         jobs, dataset, db = self.jobs, self.output.dataset, self.store.db
         assert not isinstance(jobs, OneJob) and dataset is not None, "it is a campaign"
         left = (number for number in range(jobs.count) if not db.ended(number))
@@ -143,7 +143,7 @@ class Conductor(Generic[R]):
             self.page.ended(found)
         return found
 
-    def _cast(self, first: Made) -> None:
+    def _cast(self, first: MadeJob) -> None:
         """Cast what is left, on a cluster with the slots that the first job needs."""
         store, options, enter = self.store, self.options, self.cluster_stack.enter_context
         if options.own:
@@ -155,17 +155,12 @@ class Conductor(Generic[R]):
         with self.screen.progress() as show:
             self.run.cast(first, show)
 
-    def _frame(self, frame: Frame) -> None:
+    def _frame(self, frame: ScanFrame) -> None:
         self.page.on_frame(frame)
         if self._on_frame is not None:
             self._on_frame(frame)
 
     # -- for outputs -------------------------------------------------------------------------
-
-    @property
-    def notes(self) -> Sequence[str]:
-        """Remarks for the user."""
-        return (*self.store.notes, *(self.run.notes if self.run else ()))
 
     def result(self) -> RunResult:
         """Return the result of the only job, which is committed."""
@@ -186,7 +181,7 @@ class Conductor(Generic[R]):
             hits=only.parts.hits,
             stages=run.stages if run else (),
             resumed=only.resumed,
-            notes=tuple(self.notes),
+            notes=tuple(self.store.notes),
             identity=self.store.identity,
             _hit_counts=only.hit_counts,
             sample_rays=only.sample_rays(),

@@ -6,9 +6,17 @@ import asyncio
 import errno
 import socket
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import AbstractContextManager, ExitStack, closing, contextmanager, nullcontext
+from contextlib import (
+    AbstractContextManager,
+    ExitStack,
+    closing,
+    contextmanager,
+    nullcontext,
+    suppress,
+)
 from pathlib import Path
 from typing import Any, NamedTuple
+from urllib.parse import urlsplit
 
 import dask
 from dask.system import CPU_COUNT
@@ -17,14 +25,14 @@ from distributed.comm import connect
 from distributed.utils import LoopRunner
 
 import poolpart
-from poolpart.internals import forked_workers
+from poolpart.internals.local_cluster import forked_workers
 from poolpart.probe import visible_gpus
 from poolpart.rules import check_count
 
 from ..base.errors import LidarpoolError
 from ..base.fork_server import start_fork_server
 from ..base.interrupts import children_spared, deferred_interrupts
-from ..pipeline import GPU, LIDAR, OTHER
+from ..pipeline.names import GPU, LIDAR, OTHER
 from .checks import LOOK_EVERY_S, TooFewWorkersError
 from .cluster_file import ClusterFile
 from .watch import Waiting
@@ -196,16 +204,13 @@ def connected(
 
 def _check_address(address: str) -> None:
     """Refuse an address at which nothing can ever be."""
-    host, _, port = address.rpartition("//")[2].partition("/")[0].rpartition(":")
-    if not host:
-        what = "host" if port.isdigit() else "port"
-    elif port.isdigit() and not 0 < int(port) < 1 << 16:
-        what = f"port of 1 to 65535, but {port}"
-    else:
-        return
+    with suppress(ValueError):  # of what is no port
+        given = urlsplit(f"//{address.rpartition('//')[2]}")
+        if given.hostname and given.port:
+            return
     raise LidarpoolError(
-        f"The address {address!r} has no {what}: give that of the scheduler, such as "
-        "tcp://host:8786."
+        f"The address {address!r} has no host, or no port of 1 to 65535: give that of the "
+        "scheduler, such as tcp://host:8786."
     )
 
 

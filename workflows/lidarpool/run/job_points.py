@@ -20,7 +20,7 @@ from ..export.sweeps import Sweeps
 from ..pipeline.database import JobParts
 from ..pipeline.messages import Receipt, samples_of_scan, scans_in_words, summary_type
 from ..scenario.build import Job
-from .jobs import OneJob
+from .job_source import OneJob
 from .progress import Progress
 
 if TYPE_CHECKING:

@@ -13,19 +13,19 @@ import numpy as np
 
 from ..base.archives import open_archive
 from ..base.arrays import AnyArray, Floats, Floats32
-from ..base.words import counted
+from ..base.words import plural
 from ..columns.table import CAUSES, TABLE, Column
 from ..plan import Plan, Planning
 from ..scenario.build import Job
 from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.colours import Colours
-from ..scene.drawn import Drawn, cut
-from ..scene.mesh import Mesh
 from ..scene.scene import Scene
+from ..scene.scene_mesh import SceneMesh
+from ..scene.simplified import Drawn, cut
 from ..sensor import Survey, Track
 from ..sensor.materials import MaterialTable
 from ..sensor.trajectory import ALWAYS, Beyond, presence_ns
-from .result import RunResult
+from .run_result import RunResult
 
 PICTURE_FILE = "pictures.npz"
 
@@ -56,7 +56,7 @@ class SensorWay:
 
 
 @dataclass(frozen=True, eq=False)
-class Pictured:
+class PictureContent:
     """Content of a result's pictures, except the points."""
 
     scene: Scene  # trajectories of its actors have a thousand poses at most
@@ -75,7 +75,7 @@ class Pictured:
     triangles: int = 0  # of the scene, though simpler instances may be drawn
 
     @classmethod
-    def of(cls, result: RunResult) -> Pictured:
+    def of(cls, result: RunResult) -> PictureContent:
         """Return what the pictures of a result show."""
         pictured, drawn = cls.before(result)
         return replace(
@@ -87,7 +87,7 @@ class Pictured:
         )
 
     @classmethod
-    def before(cls, job: Job | RunResult) -> tuple[Pictured, Drawn]:
+    def before(cls, job: Job | RunResult) -> tuple[PictureContent, Drawn]:
         """Return what is pictured before there is a result, and which counters its hits have."""
         scene, survey = job.scene, job.survey
         each = samples_each(scene.actors, PLACES_MOST)
@@ -117,12 +117,12 @@ class Pictured:
         """Describe the sensors, and the time of pictures with motion: half of the survey."""
         sensors, actors = len(self.sensors), len(self.scene.actors)
         if any(way.moves for way in self.sensors):
-            words = f"{counted(sensors, 'sensor')} on {'its' if sensors == 1 else 'their'} way"
+            words = f"{plural(sensors, 'sensor')} on {'its' if sensors == 1 else 'their'} way"
         else:
-            words = counted(sum(len(w.positions) for w in self.sensors), "sensor position")
+            words = plural(sum(len(w.positions) for w in self.sensors), "sensor position")
             if not actors:
                 return words
-        words += f" and {counted(actors, 'actor')}" if actors else ""
+        words += f" and {plural(actors, 'actor')}" if actors else ""
         return f"{words}, at {self.duration_ns / 2e9:.3g} s of {self.duration_ns / 1e9:.3g} s"
 
     @property
@@ -194,19 +194,19 @@ class Pictured:
         path.write_bytes(memory.getbuffer())
 
     @classmethod
-    def load(cls, path: Path) -> Pictured:
+    def load(cls, path: Path) -> PictureContent:
         """Read what `save` wrote; LidarpoolError if it is damaged. Nothing in the file is run."""
         with open_archive(path) as archive:
             return cls._from_arrays(archive)
 
     @classmethod
-    def _from_arrays(cls, arrays: Mapping[str, Any]) -> Pictured:
+    def _from_arrays(cls, arrays: Mapping[str, Any]) -> PictureContent:
         if (made := int(arrays["format"])) != _FORMAT:
             raise ValueError(f"it is of format {made}, not {_FORMAT}")
         names = json.loads(arrays["names"].tobytes())
         actors, which = [], arrays["actor_mesh"].tolist()
         meshes = [
-            Mesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
+            SceneMesh("", arrays[f"{mesh}_vertices"], arrays[f"{mesh}_faces"],
                  colours=_colours(arrays, f"{mesh}_colours"))
             for mesh in (f"mesh{number}" for number in range(max(which, default=-1) + 1))
         ]  # fmt: skip

@@ -8,32 +8,28 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 
 from distributed.client import FutureCancelledError
-from distributed.comm.core import CommClosedError
 
 from ..base.errors import LidarpoolError
-from ..export.dataset import DataSet
-from ..export.jobs import JobRow
-from ..pipeline import (
-    GPU,
-    LIDAR,
-    OTHER,
-    CastingWorkers,
-    Frame,
-    JobError,
-    JobState,
-    LongStages,
-    RunDriver,
-)
-from ..pipeline.task_book import StageTotals, TaskBook
+from ..datasets.dataset import DataSet
+from ..datasets.job_table import JobRow
+from ..pipeline.casting_workers import CastingWorkers
+from ..pipeline.driver import RunDriver
+from ..pipeline.failures import JobError
+from ..pipeline.job_state import JobState
+from ..pipeline.long_stages import LongStages
+from ..pipeline.messages import ScanFrame
+from ..pipeline.names import GPU, LIDAR, OTHER
+from ..pipeline.task_book import StageTotals
 from ..scenario.build import Job
 from ..simulator.memory import MB, scans_that_fit
 from .cluster import Cluster
 from .job_points import JobPoints
-from .jobs import JobMaker, Made, OneJob, failed_row
-from .page import JobNow, Page
+from .job_source import JobMaker, MadeJob, OneJob, failed_row
 from .progress import Progress, Show
+from .run_page import JobNow, RunPage
 from .store import RunStore
 from .trials import TrialPump
 from .writer import JobFiles, JobWriter
@@ -55,10 +51,10 @@ class Run:
         self,
         cluster: Cluster,
         store: RunStore,
-        page: Page,
+        page: RunPage,
         maker: JobMaker | None,
         dataset: DataSet | None,
-        on_frame: Callable[[Frame], None],
+        on_frame: Callable[[ScanFrame], None],
     ) -> None:
         self._cluster, self._store, self._page = cluster, store, page
         self._maker, self._on_frame = maker, on_frame
@@ -75,18 +71,16 @@ class Run:
         )
         gpus = cluster.partitions[GPU]
         workers = CastingWorkers(gpus, run, cluster.backend, cluster.software)
-        self._driver = RunDriver(workers, stages, store.db, store.storage)
+        self._driver = RunDriver(workers, stages, store.db)
         self._writer: JobWriter | None = None
         if dataset is not None:
             self._writer = JobWriter(cluster.tasks(LIDAR), dataset, store, stages.probe)
         self._trials: TrialPump | None = None
-        self._made: dict[int, JobPoints] = {}  # {number: job under way}
         self._rows: list[JobRow] = []  # of jobs that have ended, and are not yet committed
         self._scans_begun = self._jobs_begun = 0
         self._remover = ThreadPoolExecutor(1, "remove")
         self.kept: JobState | None = None  # the job whose parts are kept, once it is committed
         self.times: dict[str, float] = {}  # seconds: {"survey": …, "planning": …}
-        self.notes: list[str] = []
         self.stages: tuple[StageTotals, ...] = ()
 
     # -- jobs come and go --------------------------------------------------------------------
@@ -94,7 +88,9 @@ class Run:
     @property
     def finished(self) -> bool:
         """True once all jobs have ended."""
-        return (self._maker is None or self._maker.ended) and not self._made
+        if self._maker is None:
+            return self.kept is not None
+        return self._maker.ended and not self._store.under_way
 
     def step(self) -> bool:
         """Do what can be done now; returns whether there was anything to do.
@@ -109,7 +105,6 @@ class Run:
                 self._fail(state.number, error)
             elif self._writer is None:
                 self.kept = state
-                del self._made[state.number]
             else:
                 self._writer.waiting.append(self._files_of(state))
         for_all: LidarpoolError | None = None
@@ -135,7 +130,7 @@ class Run:
         together = self._driver.dispatcher.per_task if self._driver.jobs else 1
         if self._maker is None or not self._maker.has(together):
             return False
-        while self._driver.has_room and len(self._made) < most:
+        while self._driver.has_room and len(self._store.under_way) < most:
             if (found := self._maker.take()) is None:
                 break
             moved = True
@@ -145,8 +140,8 @@ class Run:
                 self._begin(found)
         return moved
 
-    def _begin(self, made: Made) -> None:
-        points = self._made[made.job.number] = self._store.points_of(made.job)
+    def _begin(self, made: MadeJob) -> None:
+        points = self._store.points_of(made.job)
         points.sweeps = made.sweeps
         try:
             if self._writer is not None:  # else it was checked before anything was started
@@ -174,18 +169,18 @@ class Run:
                 on_device=cluster.backend == "cuda",
             ),
             in_all=job.survey.scan_count * left,
-            on_frame=(lambda frame: cluster.call(self._on_frame, frame)) if kept else None,
+            on_frame=partial(cluster.call, self._on_frame) if kept else None,
             read=points.points_of_scan,
             on_parts=self._page.on_parts if kept else None,
         )
         self._jobs_begun += 1
         self._scans_begun += job.survey.scan_count
-        to_come = max(0, left - len(self._made))
+        to_come = max(0, left - len(self._store.under_way))
         self._driver.later = to_come * self._scans_begun // self._jobs_begun
 
     def _files_of(self, state: JobState) -> JobFiles:
         """Return what a job that is committed is written from."""
-        points = self._made[state.number]
+        points = self._store.under_way[state.number]
         job, sweeps = points.job, points.sweeps
         assert sweeps is not None, "of a data set"
         row = JobRow(
@@ -212,8 +207,8 @@ class Run:
         rows, self._rows = self._rows, []
         if not rows:
             return
-        # A job that could not be made has no points.
-        left = [(row, self._made.pop(row.number)) for row in rows if row.number in self._made]
+        made = self._store.under_way  # a job that could not be made has no points
+        left = [(row, made[row.number]) for row in rows if row.number in made]
         self._store.name_sensors(
             (carried.name or "lidar", f"{sensor.model}, {1e9 / sensor.turn_ns(1):.3g} Hz")
             for row, points in left
@@ -247,23 +242,21 @@ class Run:
                 seconds=0.0 if state is None else state.seconds,
                 writing=number in writing,
             )
-            for number, points in [*self._made.items()]
+            for number, points in [*self._store.under_way.items()]
             for state in [self._driver.jobs.get(number)]
         ]
         return sorted(jobs, key=lambda job: job.writing)
 
     # -- to the end --------------------------------------------------------------------------
 
-    def cast(self, first: Made, show: Show) -> None:
+    def cast(self, first: MadeJob, show: Show) -> None:
         """Do all jobs; on any error, everything has been stopped."""
         cluster, driver = self._cluster, self._driver
         try:
             with cluster.partitions_page(), cluster.stopping(self._stop):
                 driver.open()
                 self._loop(first, show)
-                stages = TaskBook()
-                for record in driver.finish():
-                    stages.add(record)
+                driver.finish()
         finally:
             if self._writer is not None:
                 self._writer.close()
@@ -272,14 +265,15 @@ class Run:
         self._store.save(now=True)
         self._store.tidy()
         others = [one.tasks.book for one in (self._writer, self._trials) if one is not None]
-        books = [driver.book, *others, stages]
+        books = [driver.book, *others]
         self.stages = tuple(totals for book in books for totals in book.stages.values())
-        self.notes += [*cluster.notes, *driver.notes]
+        self._store.notes += driver.notes
         if self._writer is not None and self._writer.hidden:
             place = self._writer.dataset.place
-            self.notes.append(f"no worker of {LIDAR} sees {place}: the driver wrote the data set")
+            note = f"no worker of {LIDAR} sees {place}: the driver wrote the data set"
+            self._store.notes.append(note)
 
-    def _loop(self, first: Made, show: Show) -> None:
+    def _loop(self, first: MadeJob, show: Show) -> None:
         """Step everything until all have finished."""
         driver, started, pause_s = self._driver, time.monotonic(), 0.0
         self._begin(first)  # and its trials
@@ -303,7 +297,7 @@ class Run:
             if now - saved >= SAVE_EVERY_S:
                 saved = now
                 self._save()
-            watch.look(now)
+            watch.look()
             if now - told >= PROGRESS_EVERY_S or self.finished:
                 told = now
                 self._tell_progress(show, now - started)
@@ -312,7 +306,7 @@ class Run:
                 time.sleep(pause_s)
             else:
                 driver.wait(pause_s, [future.key for one in beside for future in one.running])
-        self.notes += watch.notes
+        self._store.notes += watch.notes
 
     def _save(self) -> None:
         if self._trials is not None and (only := self._store.only) is not None:
@@ -324,7 +318,7 @@ class Run:
         waits_for = LIDAR if self._driver.stages.waiting else ""
         now = replace(self._progress(), seconds=seconds, waits_for=waits_for)
         self._cluster.call(show, now)
-        self._cluster.call(lambda progress: self._page.on_progress(progress, self.under_way), now)
+        self._cluster.call(self._page.on_progress, now, self.under_way)
 
     def _progress(self) -> Progress:
         if (points := self._store.only) is None:
@@ -349,8 +343,9 @@ class Run:
             if client.status != "running":
                 return
             try:
-                # Report the first error.
-                with suppress(OSError, CommClosedError, FutureCancelledError, RuntimeError):
+                # Report the first error. A client that has lost its scheduler cancels its futures
+                # before any call fails.
+                with suppress(OSError, FutureCancelledError, RuntimeError):
                     step()
             except Exception:
                 if client.status == "running":

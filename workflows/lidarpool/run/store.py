@@ -19,7 +19,7 @@ from ..base.software import software
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..columns.parts import mark_name, own_files, scans_of
-from ..export.jobs import JobRow
+from ..datasets.job_table import JobRow
 from ..pipeline.database import (
     FILE,
     PARTS_FOLDER,
@@ -32,7 +32,7 @@ from ..pipeline.failures import storing
 from ..scenario.build import Job
 from ..simulator.world import AUTO_TAKES
 from .job_points import JobPoints
-from .jobs import CONTENT, Jobs, OneJob, identity_of
+from .job_source import CONTENT, Jobs, OneJob, identity_of
 from .remote import OWNER, RemoteRun, fetch_database
 
 PARTS = "parts"  # the folder of the parts, in the run's folder
@@ -102,7 +102,7 @@ class RunStore:
         advice = "make the one that it lies in first, or give another"
         with explained(f"The run's folder {folder} cannot be made", advice):
             folder.mkdir(exist_ok=True)
-        self._points: dict[int, JobPoints] = {}  # {number: of a job that is under way}
+        self.under_way: dict[int, JobPoints] = {}  # {number: of a job that is under way}
         self.only: JobPoints | None = None  # of the only job, of a survey; None for a campaign
         with ExitStack() as undo:
             undo.callback(self._folder.remove, [], folder=True)
@@ -184,7 +184,7 @@ class RunStore:
             if (scans := scans_of(name, self.db.meta["mark"])) is not None:
                 self._strays.setdefault(scans[0], []).append(name)
         if isinstance(self.jobs, OneJob):
-            self.only = self._points[0] = JobPoints(self, self.jobs.only)
+            self.only = self.under_way[0] = JobPoints(self, self.jobs.only)
         if self.db.used:
             self._go_on(resume)
         if self._remote:
@@ -217,7 +217,16 @@ class RunStore:
             )
 
     def _other(self, identity: str) -> str:
-        return _difference(self.identity, json.loads(identity))
+        """Describe the difference of an earlier run in a clause; empty if there is none."""
+        there = json.loads(identity)
+        for name, value in self.identity.items():
+            if there.get(name) != value:
+                if name in CONTENT:
+                    return f"it is of another {name}"
+                if name != "lidarpool":
+                    return f"it is of another campaign: its {name} differs"
+                return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
+        return ""
 
     def _check_same(self, identity: str) -> None:
         """Check that the run that is there is the same."""
@@ -285,9 +294,9 @@ class RunStore:
 
     def points_of(self, job: Job) -> JobPoints:
         """Return what is kept of a job under way; parts of an earlier run are checked first."""
-        if (found := self._points.get(job.number)) is not None:
+        if (found := self.under_way.get(job.number)) is not None:
             return found
-        points = self._points[job.number] = JobPoints(self, job)
+        points = self.under_way[job.number] = JobPoints(self, job)
         strays = self._strays.pop(job.number, ())
         if job.number in self.db.begun or strays:
             known = self.db.hash_of(job.number)
@@ -304,7 +313,7 @@ class RunStore:
         """Commit that jobs have ended."""
         self.db.end_jobs((row.number, bool(row.error), asdict(row)) for row in rows)
         for row in rows:
-            self._points.pop(row.number, None)
+            self.under_way.pop(row.number, None)
 
     def forget(self, numbers: Iterable[int]) -> None:
         """Let some jobs be done again."""
@@ -338,7 +347,7 @@ class RunStore:
         Where it is time or `now`, copy the database. LidarpoolError if that fails, or another run
         has taken over.
         """
-        for number, points in self._points.items():
+        for number, points in self.under_way.items():
             if points.parts.scans_done and not points.complete and not points.identified:
                 points.identified = True
                 self.db.set_hash(number, _hash_of(points.job))
@@ -349,7 +358,7 @@ class RunStore:
     def tidy(self) -> None:
         """Remove parts that are in no job under way, of dead or superseded collectors."""
         mark = self.db.meta["mark"]
-        of_jobs = [part.name for p in self._points.values() for part in p.parts.ordered]
+        of_jobs = [part.name for p in self.under_way.values() for part in p.parts.ordered]
         ours = {mark_name(mark), *of_jobs}
         with suppress(OSError, LidarpoolError):
             self.storage.remove([n for n in own_files(self.storage, mark) if n not in ours])
@@ -389,18 +398,6 @@ class RunStore:
             with suppress(OSError, LidarpoolError):
                 _remove(self.place, self.storage, self.db.meta["mark"])
             self._folder.remove([FILE])  # where the place of the parts failed
-
-
-def _difference(here: Mapping[str, str], there: Mapping[str, str]) -> str:
-    """Describe the difference of an earlier run in a clause; empty if there is none."""
-    for name, value in here.items():
-        if there.get(name) != value:
-            if name in CONTENT:
-                return f"it is of another {name}"
-            if name != "lidarpool":
-                return f"it is of another campaign: its {name} differs"
-            return f"it was written with {name} {there.get(name, 'none')}, here it is {value}"
-    return ""
 
 
 def _hash_of(job: Job) -> str:

@@ -7,7 +7,7 @@ from typing import Any, Generic, TypeVar
 
 from distributed import Future
 
-from poolpart import Partition, Whereabouts, fetch_available, look_for_tasks
+from poolpart import Partition, TaskLocations, fetch_available, look_for_tasks
 
 from ..base.software import call_alike
 from ..pipeline.task_book import TaskBook
@@ -45,7 +45,7 @@ class Tasks(Generic[T]):
         failed = [future for future in self.running if future.status in ("error", "cancelled")]
         return [(self.running.pop(future), future) for future in failed]
 
-    def look(self) -> Whereabouts:
+    def look(self) -> TaskLocations:
         """Ask where they are."""
         keys = [future.key for future in self.running]
         return look_for_tasks(self._client, self.partition.name, keys)

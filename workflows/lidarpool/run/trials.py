@@ -7,7 +7,7 @@ import uuid
 from collections import Counter, deque
 from collections.abc import Sequence
 
-from poolpart import Whereabouts, recorded
+from poolpart import TaskLocations, recorded
 
 from ..pipeline.failures import raise_if_failed, was_killed
 from ..plan import Planning, Trial, run_trial
@@ -84,7 +84,7 @@ class TrialPump:
         for place, future in enumerate(lost if heard else []):
             self._submit(running.pop(future), heard[place % len(heard)])
 
-    def _look(self) -> Whereabouts:
+    def _look(self) -> TaskLocations:
         self._looked_at = time.monotonic()
         seen = self.tasks.look()
         # One waits behind each running trial: no slot idles, and a dying worker loses few. Trials

@@ -14,14 +14,14 @@ from poolpart import look_for_tasks, worker_identities
 
 from ..base.errors import LidarpoolError
 from ..base.vocabulary import PATIENCE_S
-from ..base.words import counted
+from ..base.words import plural
 
 WATCH_EVERY_S = 1.0
 TELL_EVERY_S = 5.0  # messages about waiting; less often in a long wait
 
 
 class Waiting:
-    """Time that a start may take, from the first time that it is asked or told.
+    """Time that something may take to come, from the first time that it is asked or told.
 
     `tell` is called every few seconds with a line that says what it waits for.
     """
@@ -34,22 +34,27 @@ class Waiting:
     def _began(self) -> float:
         return time.monotonic()
 
+    def begin(self) -> None:
+        """Begin anew: what was waited for has been there."""
+        self._began = time.monotonic()
+
     def left(self, now: float | None = None) -> float:
         """Seconds that are left; 0 when it is over."""
         now = time.monotonic() if now is None else now
         return max(0.0, self._began + self.seconds - now)
 
-    def tell(self, what: str, why: str) -> None:
+    def tell(self, what: str, why: str = "") -> None:
         """Say what is waited for, if it is time to."""
         now = time.monotonic()
         if now - max(self._told, self._began) >= max(TELL_EVERY_S, (now - self._began) / 10):
             self._told = now
-            self._tell(f"waiting for {what}, for another {self.left(now):.0f} s: {why}")
+            left = f"for another {self.left(now):.0f} s"
+            self._tell(f"waiting for {what}, {left}{f': {why}' if why else ''}")
 
 
 def queued(jobs: int) -> str:
     """Say that jobs are on their way."""
-    return f"{counted(jobs, 'job')} in the queue, or starting"
+    return f"{plural(jobs, 'job')} in the queue, or starting"
 
 
 class Watch:
@@ -68,37 +73,43 @@ class Watch:
         patience_s: float = PATIENCE_S,
         tell: Callable[[str], None] = lambda words: None,
     ) -> None:
-        self.client, self.lasting = client, frozenset(lasting)
-        self.patience_s, self._tell = patience_s, tell
-        self._looked = self._told = time.monotonic()
-        # {partition: when it last had workers}
-        self._seen = dict.fromkeys([*names, *self.lasting], self._looked)
-        self._paused: set[str] = set()  # partitions whose workers take no tasks
+        self.client, self.lasting, self._tell = client, frozenset(lasting), tell
+        # {partition: how long it may be without workers}
+        self._waits = {name: Waiting(patience_s, tell) for name in (*names, *self.lasting)}
+        self._looked = float("-inf")
         self.notes: list[str] = []  # what a user should know: workers that Dask has paused
 
     def forget(self, names: Iterable[str]) -> None:
         """Stop watching these partitions, which have no more work."""
         for name in names:
-            self._seen.pop(name, None)
+            self._waits.pop(name, None)
 
-    def look(self, now: float) -> None:
+    def look(self) -> None:
         """Check from time to time; LidarpoolError if a partition was empty for too long."""
+        now = time.monotonic()
         if now - self._looked < WATCH_EVERY_S:
             return
         self._looked = now
-        self._paused = set()
+        there, paused = set(), set()  # partitions with workers, and with those that take no tasks
         for worker in worker_identities(self.client).values():
-            for name in self._seen.keys() & worker["resources"].keys():
+            for name in self._waits.keys() & worker["resources"].keys():
                 if worker["status"] == "running" or name in self.lasting:
-                    self._seen[name] = now
+                    there.add(name)
                 else:
-                    self._paused.add(name)
+                    paused.add(name)
                     if worker["status"] == "paused":
                         self._note_paused(name, worker)
-        self._say(now)
-        for name, seen in self._seen.items():
-            if now - seen > self.patience_s:
-                raise LidarpoolError(self._error(name))
+        for name, waiting in self._waits.items():
+            if name in there:
+                waiting.begin()
+            elif not waiting.left():
+                raise LidarpoolError(_lacking(name, name in paused, f"{waiting.seconds:.0f} s"))
+            elif name in paused:
+                advice = "give them a larger --memory-limit"
+                waiting.tell(f"paused workers of partition {name}", advice)
+            else:
+                coming = look_for_tasks(self.client, name).coming
+                waiting.tell(f"workers of partition {name}", queued(coming) if coming else "")
 
     def _note_paused(self, partition: str, worker: Mapping[str, Any]) -> None:
         """Say once of each worker that it gets no more tasks."""
@@ -110,29 +121,14 @@ class Watch:
             self.notes.append(note)
             self._tell(note)
 
-    def _say(self, now: float) -> None:
-        """Print what the run waits for."""
-        waiting = {name: seen for name, seen in self._seen.items() if now - seen > TELL_EVERY_S}
-        if waiting and now - self._told >= max(TELL_EVERY_S, (now - min(waiting.values())) / 10):
-            self._told = now
-            for name, seen in waiting.items():
-                left = max(0.0, self.patience_s - (now - seen))
-                what, advice = "workers", ""
-                if name in self._paused:
-                    what, advice = "paused workers", ": give them a larger --memory-limit"
-                elif coming := look_for_tasks(self.client, name).coming:
-                    advice = f": {queued(coming)}"
-                self._tell(
-                    f"waiting for {what} of partition {name}, for another {left:.0f} s{advice}"
-                )
 
-    def _error(self, name: str) -> str:
-        start = f'start some with --resources "{name}=1" and run it again.'
-        seconds = f"{self.patience_s:.0f} s"
-        if name in self._paused:
-            return (
-                f"The workers of partition {name!r} have taken no tasks for {seconds}, so the run "
-                "was ended: Dask pauses those whose memory is nearly full. Give them a larger "
-                f"--memory-limit, or {start}"
-            )
-        return f"Partition {name!r} has had no workers for {seconds}, so the run was ended: {start}"
+def _lacking(name: str, paused: bool, seconds: str) -> str:
+    """Say that a partition was without workers for so long, or that they were paused."""
+    start = f'start some with --resources "{name}=1" and run it again.'
+    if paused:
+        return (
+            f"The workers of partition {name!r} have taken no tasks for {seconds}, so the run "
+            "was ended: Dask pauses those whose memory is nearly full. Give them a larger "
+            f"--memory-limit, or {start}"
+        )
+    return f"Partition {name!r} has had no workers for {seconds}, so the run was ended: {start}"

@@ -18,16 +18,16 @@ from poolpart import Recorder, TaskRecord, fetch_available, own_client
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import TEMPORARY
 from ..columns.parts import StoredCloud
-from ..export.dataset import DataSet, Listing
-from ..export.jobs import JobRow
-from ..export.pieces import RangeWriter, Span
-from ..export.pieces import Written as Range
+from ..datasets.dataset import DataSet, Listing
+from ..datasets.job_table import JobRow
+from ..export.pieces import PieceRange, RangeWriter
+from ..export.pieces import WrittenRange as Range
 from ..export.sweeps import Sweeps
-from ..pipeline import EXPORT, LIDAR, JobError
-from ..pipeline.failures import raise_if_failed, was_killed
-from ..pipeline.workers import share
+from ..pipeline.casting_workers import share
+from ..pipeline.failures import JobError, raise_if_failed, was_killed
+from ..pipeline.names import EXPORT, LIDAR
 from .cluster import Cluster
-from .result import RunResult
+from .run_result import RunResult
 from .store import RunStore
 from .tasks import Tasks
 
@@ -45,12 +45,12 @@ class JobFiles(NamedTuple):
     made_of: Sequence[Sequence[str]]
 
 
-Written = JobRow | LidarpoolError
+JobOutcome = JobRow | LidarpoolError
 
 
 def write_jobs(
     dataset: DataSet, probes: tuple[Any, Any], jobs: Sequence[JobFiles]
-) -> tuple[list[Written] | None, TaskRecord]:
+) -> tuple[list[JobOutcome] | None, TaskRecord]:
     """Write the files of jobs on a LIDAR worker; a row of each, or why it cannot be made.
 
     None in place of the rows if the worker does not see the data set, or the parts.
@@ -62,7 +62,7 @@ def write_jobs(
     return written, recorder.done(sum(int(job.sweeps.scans[-1]) for job in jobs))
 
 
-def _written(dataset: DataSet, job: JobFiles) -> Written:
+def _written(dataset: DataSet, job: JobFiles) -> JobOutcome:
     """Write a job; JobError if that fails, LidarpoolError if it is because of the place."""
     listing = Listing.of(dataset.place)
     try:
@@ -101,7 +101,7 @@ class JobWriter:
             place.prepare()
             place.write(*probe)
         self.waiting = deque[JobFiles]()
-        self._here: dict[Future[Written], JobFiles] = {}
+        self._here: dict[Future[JobOutcome], JobFiles] = {}
         self._thread = ThreadPoolExecutor(1, "write")
         self._moved_at = time.monotonic()
         self.hidden = False  # whether a worker did not see the data set
@@ -112,7 +112,7 @@ class JobWriter:
         yield from (job.row for jobs in self.tasks.running.values() for job in jobs)
         yield from (job.row for job in (*self._here.values(), *self.waiting))
 
-    def step(self, slots: int) -> list[tuple[JobFiles, Written]]:
+    def step(self, slots: int) -> list[tuple[JobFiles, JobOutcome]]:
         """Submit what there is room for; returns the rows of jobs, or why they were not written.
 
         Errors of single jobs are JobErrors; others are of the place, or of a worker's software.
@@ -121,7 +121,7 @@ class JobWriter:
             jobs = self._next()
             arguments = self.dataset, self._probes, jobs
             self.tasks.submit(jobs, write_jobs, *arguments, priority=5)
-        ended: list[tuple[JobFiles, Written]] = []
+        ended: list[tuple[JobFiles, JobOutcome]] = []
         for jobs, rows in self.tasks.take_done():
             if rows is None:
                 self.hidden = True
@@ -190,7 +190,7 @@ class LidarWorkers:
     def __init__(self, cluster: Cluster) -> None:
         self._cluster, self._tasks = cluster, cluster.tasks(LIDAR)
 
-    def __call__(self, writer: RangeWriter, spans: Sequence[Span]) -> dict[Span, Range]:
+    def __call__(self, writer: RangeWriter, spans: Sequence[PieceRange]) -> dict[PieceRange, Range]:
         """Write ranges; returns what was written of those whose workers see the folder.
 
         The range of a worker that dies is written by another. LidarpoolError if one cannot write,
@@ -198,7 +198,7 @@ class LidarWorkers:
         """
         partition, running = self._tasks.partition, self._tasks.running
         waiting, most = deque(spans), 2 * partition.slots
-        written: dict[Span, Range] = {}
+        written: dict[PieceRange, Range] = {}
         watch = self._cluster.watch([LIDAR])
         # Workers fetch it from the one that has it: as an argument of the tasks it would make Dask
         # send them all to that worker.
@@ -212,7 +212,7 @@ class LidarWorkers:
                     raise_if_failed(future, f"Writing {writer.place}")
                 done = self._tasks.take_done()
                 written |= {span: made for span, made in done if made is not None}
-                watch.look(time.monotonic())
+                watch.look()
                 if not done:
                     time.sleep(LOOK_EVERY_S)
         except OSError as error:
@@ -233,7 +233,10 @@ class LidarWorkers:
 
 @lru_cache(maxsize=1)
 def _fetched(key: str) -> RangeWriter:
-    """Fetch the writer once for all ranges; it is made again if its worker has died."""
+    """Fetch the writer once for all ranges; it is made again if its worker has died.
+
+    As an argument of the tasks, Dask would run them only on workers that hold it.
+    """
     until = time.monotonic() + FETCH_S
     while not (found := fetch_available(own_client(), [key])):
         if time.monotonic() > until:
@@ -243,7 +246,7 @@ def _fetched(key: str) -> RangeWriter:
     return writer
 
 
-def _write_range(key: str, span: Span) -> tuple[Range | None, TaskRecord]:
+def _write_range(key: str, span: PieceRange) -> tuple[Range | None, TaskRecord]:
     """Write a range on a worker."""
     recorder = Recorder(EXPORT, LIDAR)
     try:

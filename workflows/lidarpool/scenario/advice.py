@@ -6,9 +6,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..base.words import counted
+from ..base.words import plural
 from ..columns.table import VELOCITY
-from ..scene.meshfile import CITYJSON, UNITLESS, wrote_it
+from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.materials import MaterialTable
 from .build import Built
 from .placing import inside_note
@@ -31,7 +31,7 @@ def advice(built: Built) -> list[str]:
     notes, remarks = built.found.notes, built.found.remarks
     axes = remarks[:1]
     if remarks[1:]:
-        axes = [f"{axes[0]}; {counted(len(remarks) - 1, 'more file')}, too"]
+        axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
     return [*notes, *axes, *likely, *_without_effect(built.scenario)]
 
@@ -87,7 +87,7 @@ def _of_colours(built: Built) -> str:
         return ""
     shown = ", ".join(names[i] for i in grey[:3]) + ", …" * (len(grey) > 3)
     return (
-        f"{len(grey):,} of {counted(int(textured.sum()), 'object')} with reflectance: texture "
+        f"{len(grey):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
         f"have no colours and are grey: {shown}"
     )
 

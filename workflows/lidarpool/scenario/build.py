@@ -16,24 +16,23 @@ from ..base.arrays import Floats
 from ..base.declared import declared
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import checked_fields
-from ..base.words import counted, did_you_mean
+from ..base.words import did_you_mean, plural
+from ..export.format_table import check_whole
 from ..export.formats import Format
-from ..export.table import check_whole
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor
-from ..scene.cityjson import CLASSES as CITY_CLASSES
-from ..scene.meshfile import CITYJSON
+from ..scene.files.cityjson import CLASSES as CITY_CLASSES
+from ..scene.files.meshfile import CITYJSON
 from ..scene.robot import Robot
 from ..scene.scene import Scene
-from ..scene.urdf import load_robot
 from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import CloudOptions
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
 from ..simulator.surfaces import warn_of_grey
-from .moving import (
+from .actor_motion import (
     ActorSection,
     MountSection,
     TrafficSection,
@@ -41,10 +40,10 @@ from .moving import (
     actors_of,
     read_fcd,
 )
+from .ground import Standing
 from .placing import Placing, place
 from .scenario import Scenario
-from .sections import CopiesSection, MeshFile, SensorSection
-from .standing import Standing
+from .sections import CopiesSection, SensorSection
 from .static_scene import Findings, SceneCache, Shapes, read_static_scene
 
 # Objects lower than this are floors and markings, which a path may cross.
@@ -56,8 +55,6 @@ SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
 # Of the hits in a scene with the default objects, every so many are kept.
 SEED_KEPT = 5
-
-Robots = Mapping[MeshFile, Robot]  # by the file that each is read from
 
 
 @dataclass(frozen=True, eq=False)
@@ -146,17 +143,16 @@ def build(
     """
     static = read_static_scene(scenario) if cache is None else cache.find(scenario)
     found, scene, standing = static.found.copy(), static.scene, static.standing
-    shapes, robots = Shapes(scenario, found), _read_robots(scenario, found)
-    epsg, way = _common_epsg(scenario, found), scenario.trajectory
+    shapes, epsg, way = Shapes(scenario, found), _common_epsg(scenario, found), scenario.trajectory
     with prefixed(scenario.source):
         track = None if way is None else way.track(scenario.path, standing)
-        sensors = _mounted(scenario, robots)
+        sensors = _mounted(shapes)
     placing: Placing | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
         placing = place(scene, sensors[0], landscape=bool(found.rasters))
     poses = SEED_POSES if placing is None else placing.poses
     survey_of = partial(_survey, scenario, sensors, track or poses, scene.origin, epsg)
-    actors = _actors(scenario, standing, track, shapes, robots)
+    actors = _actors(shapes, standing, track)
     vehicles: list[tuple[Actor, VehicleSection]] = []
     if scenario.traffic is not None:
         with prefixed(scenario.source):
@@ -206,22 +202,6 @@ class Built:
         return Job(self.scene, self.survey, self.planning, outputs=outputs, **own)
 
 
-def _read_robots(scenario: Scenario, found: Findings) -> dict[MeshFile, Robot]:
-    """Read the robots, each file once."""
-    robots: dict[MeshFile, Robot] = {}
-    for file in dict.fromkeys(entry.robot for entry in scenario.actors if entry.robot):
-        with prefixed(scenario.source):
-            path = scenario.path(file.file)
-        robots[file] = load_robot(
-            path,
-            opacity=file.opacity,
-            colours=scenario.coloured,
-            tell=found.notes.append,
-        )
-        found.sources[file.file] = robots[file].summary
-    return robots
-
-
 def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
     """EPSG code of the rasters that stay where they are; they must be of one system."""
     stay = [(e.file, raster) for e, raster in found.rasters if e.transform().keeps_xy]
@@ -235,23 +215,25 @@ def _common_epsg(scenario: Scenario, found: Findings) -> int | None:
     return next((raster.epsg for _, raster in stay if raster.crs), None)
 
 
-def _mounted(scenario: Scenario, robots: Robots) -> list[Mounted]:
+def _mounted(shapes: Shapes) -> list[Mounted]:
     """Return the sensors on their carrier."""
+    scenario = shapes.scenario
     sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
     path, noise, returns = scenario.path, scenario.noise, scenario.returns
     return [
-        section.mounted(path, _mount(section, scenario, robots), noise, returns, name)
+        section.mounted(path, _mount(section, shapes), noise, returns, name)
         for name, section in sections.items()
     ]
 
 
-def _mount(section: SensorSection, scenario: Scenario, robots: Robots) -> Pose:
+def _mount(section: SensorSection, shapes: Shapes) -> Pose:
     """Pose of a sensor in the carrier's axes."""
+    scenario = shapes.scenario
     mount: MountSection | None = getattr(section, "mount", scenario.mount)
     if mount is None or mount.link is None:
         return CENTRE if mount is None else mount.pose()
     carriers = [
-        (entry, robots[entry.robot])
+        (entry, shapes.robot(entry.robot))
         for entry in scenario.actors
         if entry.trajectory is None and entry.robot
     ]
@@ -277,17 +259,15 @@ def _joints(entry: ActorSection, scenario: Scenario) -> Path | None:
     return None if entry.joints is None else scenario.path(entry.joints)
 
 
-def _actors(
-    scenario: Scenario, standing: Standing, track: Track | None, shapes: Shapes, robots: Robots
-) -> list[Actor]:
+def _actors(shapes: Shapes, standing: Standing, track: Track | None) -> list[Actor]:
     """Build the actors; their trajectories begin with that of the survey."""
-    out: list[Actor] = []
+    scenario, out = shapes.scenario, list[Actor]()
     with prefixed(scenario.source):
         ways = [e.way(scenario.path, standing, track) for e in scenario.actors]
     for entry, way in zip(scenario.actors, ways, strict=True):
         if entry.robot:
             with prefixed(f"{scenario.source}: actor {entry.name!r}"):
-                out += _links(entry, robots[entry.robot], way, shapes)
+                out += _links(entry, shapes.robot(entry.robot), way, shapes)
         else:
             out.append(Actor(replace(shapes.of(entry), name=entry.name), way))
     return out
@@ -316,7 +296,7 @@ def _vehicles(
             f"{begin + duration_s:g} s of the file: check offset_s, translation and surfaces"
         )
     found.sources[section.file] = (
-        f"{counted(len(made), 'actor')} during the survey, of {counted(count, 'vehicle')} "
+        f"{plural(len(made), 'actor')} during the survey, of {plural(count, 'vehicle')} "
         "and persons until its end"
     )
     return made

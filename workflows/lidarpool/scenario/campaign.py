@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from itertools import chain, combinations, count, islice
+from itertools import chain, combinations, count
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -19,15 +20,23 @@ from pydantic import BaseModel, Field
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.validation import checked, dotted, fields_of, is_section, sections_in, sentences, shown
-from ..base.words import counted, did_you_mean
+from ..base.validation import checked, fields_of, is_section, sections_in, sentences, shown
+from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
-from ..export.jobs import Value
-from ..export.table import check_whole
+from ..datasets.job_table import Value
+from ..export.format_table import check_whole
 from .build import Job, build
-from .choices import COUNT_MOST, CampaignSection, Choice, Draw, Keep, Splits, read_rows
+from .campaign_sections import (
+    COUNT_MOST,
+    CampaignSection,
+    Choice,
+    JobRandom,
+    Keep,
+    Splits,
+    read_rows,
+)
 from .scenario import Scenario
-from .sections import PoolSection, file_states, missing
+from .sections import PoolSection, file_states
 from .static_scene import SceneCache
 
 _FORM = "a campaign has base:, count:, vary:, keep:, splits:"
@@ -38,7 +47,7 @@ _KEYS = re.compile(r"""^(?:["']?(?:base|vary)["']?\s*:|\{)""", re.MULTILINE)  # 
 _UNSAFE = re.compile(r"[^\w.-]+", re.ASCII)  # in a name of files
 
 
-class Campaign:
+class CampaignSpec:
     """Many jobs (surveys) from one description, into one data set.
 
     `Campaign.load` reads a campaign file, `Campaign.of_scenarios` takes scenario files as they
@@ -98,7 +107,7 @@ class Campaign:
         head = _head(keep=keep, splits=splits, seed=seed, license=license, title=title)
         self._begin(_Made(make, count, seed), head)
 
-    def _begin(self, jobs: _Jobs, head: CampaignSection) -> None:
+    def _begin(self, jobs: _JobSource, head: CampaignSection) -> None:
         self.seed, self.keep, self.splits = head.seed, head.keep, head.splits
         self.license, self.title = head.license, head.title
         self.count, self.files, self.choices = jobs.count, jobs.files, jobs.choices
@@ -106,7 +115,7 @@ class Campaign:
 
     @classmethod
     @checked
-    def load(cls, path: str | Path) -> Campaign:
+    def load(cls, path: str | Path) -> CampaignSpec:
         """Read a campaign file, with its bases and tables.
 
         Raises
@@ -135,7 +144,7 @@ class Campaign:
         seed: Seed = 0,
         license: str = "",  # noqa: A002 - as in the file
         title: str = "",
-    ) -> Campaign:
+    ) -> CampaignSpec:
         """Take scenario or mesh files as jobs, as they are; a job has the name of its file.
 
         Raises
@@ -213,7 +222,9 @@ class Campaign:
     def check_files(self) -> None:
         """Check that all files are there that jobs may be made of, or raise LidarpoolError."""
         mistakes = Mistakes()
-        mistakes.lines += missing(self.files, self.command)
+        # `Path.exists` fails at names that no file can have.
+        lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
+        mistakes.lines += [f"{self.command}: {str(path)!r} does not exist." for path in lost]
         mistakes.tell()
 
     @cached_property
@@ -248,7 +259,7 @@ def _head(**given: Any) -> CampaignSection:
         return CampaignSection.model_validate({"base": "-", **plain})
 
 
-class _Jobs:
+class _JobSource:
     """Where the jobs of a campaign come from."""
 
     count: int
@@ -274,7 +285,7 @@ class _Jobs:
         return built.job(values=self.values(number), made_of=made_of, **own)
 
 
-class _Made(_Jobs):
+class _Made(_JobSource):
     """Jobs that a function makes."""
 
     def __init__(self, make: Callable[..., Any], count: int, seed: int) -> None:
@@ -324,7 +335,7 @@ class _Made(_Jobs):
     def _made(self, number: int) -> Job:
         with prefixed(f"job {number}"):
             try:
-                made = self._make(number, Draw(self._seed, number, "make").generator())
+                made = self._make(number, JobRandom(self._seed, number, "make").generator())
             except LidarpoolError:
                 raise
             except Exception as error:  # one job's failure must not end the others
@@ -336,7 +347,7 @@ class _Made(_Jobs):
         return made
 
 
-class _Given(_Jobs):
+class _Given(_JobSource):
     """Scenario and mesh files as they are."""
 
     def __init__(self, paths: Sequence[Path]) -> None:
@@ -377,7 +388,7 @@ def _unique(stems: Iterable[str]) -> list[str]:
     return out
 
 
-class _Varied(_Jobs):
+class _Varied(_JobSource):
     """Jobs of a campaign file: a base with other values."""
 
     def __init__(self, section: CampaignSection, path: Path) -> None:
@@ -448,7 +459,7 @@ class _Varied(_Jobs):
         told: dict[str, Value | None] = {"base": base.name} if len(self._bases) > 1 else {}
         changes: dict[str, Any] = {}  # {path: value, or rows to be added}
         for text, choice in self._vary.items():
-            draw = Draw(self._seed, number, text)
+            draw = JobRandom(self._seed, number, text)
             if choice.sample is not None:
                 chosen = draw.integer(*choice.sample.count)
                 table = base.tables[text]
@@ -471,23 +482,23 @@ class _Base:
         self._where = where  # for messages
         self.scenario, self.name = Scenario.load(path), path.name
         self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
-        self._steps: dict[str, Steps] = {}
+        self._steps: dict[str, FieldSteps] = {}
         self.tables: dict[str, list[Any]] = {}
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
             with mistakes.noted(), prefixed(where):
                 self._steps[text], kind = find_field(self.scenario, text)
-            if choice.sample is None or text not in self._steps:
-                continue
-            with mistakes.noted(), prefixed(f"{where}: {text}"):
+                if choice.sample is None:
+                    continue
                 table = self.scenario.path(choice.sample.file)
-                if (key := (table, repr(kind))) not in tables:
-                    tables[key] = read_rows(table, kind)
-                self.tables[text] = tables[key]
-                if (most := choice.sample.count[1]) > (there := len(tables[key])):
-                    has = counted(there, "row")
-                    raise LidarpoolError(f"count is up to {most:,}, and {table} has {has}.")
+                with prefixed(text):
+                    if (key := (table, repr(kind))) not in tables:
+                        tables[key] = read_rows(table, kind)
+                    self.tables[text] = tables[key]
+                    if (most := choice.sample.count[1]) > (there := len(tables[key])):
+                        has = plural(there, "row")
+                        raise LidarpoolError(f"count is up to {most:,}, and {table} has {has}.")
         with mistakes.noted(), prefixed(where):
             self._check_apart()
         mistakes.tell()
@@ -508,20 +519,14 @@ class _Base:
     def check(self, source: str, mistakes: Mistakes) -> None:
         """Note values that are not valid, and find out which files jobs may be made of.
 
-        The first values of all paths are tried together, then the second, and so on; only if
-        something is wrong, each alone, to find out which.
+        The first values of all paths are tried together, then the second, and so on.
         """
         trials = {text: self._trials(text) for text in self._vary}
         for turn in range(max([1, *map(len, trials.values())])):
             changes = {text: tried[turn % len(tried)] for text, tried in trials.items()}
-            try:
-                found = self.changed(changes, f"{source}: {self._where}")
-            except LidarpoolError as error:
-                wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
-                mistakes.lines += [f"{source}: {self._where}: {line}" for line in wrong]
-                mistakes.lines += () if wrong else str(error).splitlines()
-                return
-            self.files.update(found.files)
+            with mistakes.noted():
+                found = self.changed(changes, f"{source}: {self._where} can choose")
+                self.files.update(found.files)
 
     def _trials(self, text: str) -> list[Any]:
         """Return values for a path, valid if all jobs are; of a table, all rows in pieces."""
@@ -532,18 +537,6 @@ class _Base:
         begins = range(0, len(table), max(1, most)) if most else ()
         pieces = [table[begin : begin + most] for begin in begins]
         return [table[:least], *pieces]
-
-    def _tried(self, text: str) -> Iterator[str]:
-        """Yield lines on the values of a path that are not valid in the base."""
-        choice, place = self._vary[text], dotted([key for key, _ in self._steps[text]])
-        for value in () if choice.sample else choice.ends:
-            try:
-                self.changed({text: value}, "")
-            except LidarpoolError as error:
-                told = str(error).partition("\n")[0].removeprefix(": ")
-                own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
-                given = f"{text} can be {shown(value)}"
-                yield f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}"
 
     def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
         """Return the scenario with other values, and with a seed of its noise if it has none."""
@@ -565,7 +558,7 @@ class _Base:
 
 
 def _noise_seed(seed: int, number: int) -> int:
-    return Draw(seed, number, _NOISE).bits(63) or 1
+    return JobRandom(seed, number, _NOISE).bits(63) or 1
 
 
 def _seeded(noise: Any, seed: int) -> Any:
@@ -599,10 +592,10 @@ def _hash(path: Path, *_: int) -> str:
 
 # Keys and numbers of entries, each with the value there; of a section that is left out, one of
 # defaults.
-Steps = tuple[tuple[str | int, Any], ...]
+FieldSteps = tuple[tuple[str | int, Any], ...]
 
 
-def find_field(scenario: Scenario, text: str) -> tuple[Steps, Any]:
+def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
     """Find out where a path such as ``sensors.roof.model`` leads in a scenario.
 
     Returns
@@ -665,7 +658,7 @@ def _entry(entries: Sequence[Any], rest: Sequence[str], at: str) -> tuple[int, i
         if (number := int(rest[0])) < len(entries):
             return number, 1
         raise LidarpoolError(
-            f"{at} of the base has {counted(len(entries), 'entry', 'entries')}, counted from 0, "
+            f"{at} of the base has {plural(len(entries), 'entry', 'entries')}, counted from 0, "
             f"and no entry {number}."
         )
     names = [name for one in entries if isinstance(name := getattr(one, "name", None), str)]
@@ -673,7 +666,7 @@ def _entry(entries: Sequence[Any], rest: Sequence[str], at: str) -> tuple[int, i
     return next(i for i, one in enumerate(entries) if getattr(one, "name", None) == name), used
 
 
-def put(node: Any, steps: Steps, change: Callable[[Any], Any]) -> Any:
+def put(node: Any, steps: FieldSteps, change: Callable[[Any], Any]) -> Any:
     """Return a section with what `change` makes of the value where the steps lead.
 
     The original stays as it is. Sections on the way become mappings of their own fields, to be

@@ -11,10 +11,10 @@ import yaml
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
-from ..base.words import counted
-from ..scene.drawn import Drawn
+from ..base.words import plural
 from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
+from ..scene.simplified import Drawn
 from ..scene.surroundings import Surroundings, in_the_way, is_open
 from ..sensor import Mounted, Pose
 
@@ -68,7 +68,7 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
     sides = " x ".join(f"{side:,.3g}" for side in high - low)
     note = (
         f"this looks like an object of {sides} m, not a place to stand in: "
-        f"{counted(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
+        f"{plural(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
     )
     return Placing(poses, note, around=True)
 

@@ -2,25 +2,30 @@
 
 from __future__ import annotations
 
+import os
 from collections import Counter
-from collections.abc import Iterable
-from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
-from pydantic import PrivateAttr, ValidationError
+from pydantic import PrivateAttr
 
-from ..base.declared import Several, Text, told
-from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.validation import validation_errors
+from ..base.declared import Several, Text, about
+from ..base.errors import Mistakes, prefixed
+from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
-from ..scene.meshfile import SUFFIXES
+from ..scene.files.meshfile import SUFFIXES
 from ..sensor import Material, Navigation
-from ..sensor.survey import SENSORS_MOST, CloudOptions, Steps
+from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
-from .moving import ActorSection, CarriedSection, MountSection, TrafficSection, TrajectoryEntry
+from .actor_motion import (
+    ActorSection,
+    CarriedSection,
+    MountSection,
+    TrafficSection,
+    TrajectoryEntry,
+)
 from .sections import (
     CopiesSection,
     NoiseSection,
@@ -33,7 +38,6 @@ from .sections import (
     Section,
     SensorSection,
     may_be_empty,
-    missing,
     scene_in_short,
 )
 
@@ -67,7 +71,7 @@ class Scenario(Section):
     sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
-        told(
+        about(
             "poses of the sensor, world metres, Z-up; by default 1, 2 and 3 m "
             "above the origin (default objects) or the middle of the floor (files), below the "
             "ceiling, or around an object that is no place to stand in",
@@ -78,7 +82,7 @@ class Scenario(Section):
     ] = None
     trajectory: Annotated[
         TrajectoryEntry | None,
-        told(
+        about(
             "instead of poses: the trajectory of a carrier, from a TUM, KITTI or "
             ".csv file, or points",
             "drive.tum",
@@ -86,7 +90,7 @@ class Scenario(Section):
     ] = None
     sensors: Annotated[
         dict[Text, CarriedSection],
-        told(
+        about(
             "instead of sensor: several on one carrier, by name, each with its mount",
             {"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}},
             max_length=SENSORS_MOST,
@@ -94,7 +98,7 @@ class Scenario(Section):
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
         Several[ActorSection],
-        told(
+        about(
             "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
             max_length=10_000,
@@ -102,28 +106,28 @@ class Scenario(Section):
     ] = ()
     traffic: Annotated[
         TrafficSection | None,
-        told(
+        about(
             "vehicles and persons of a SUMO simulation, as actors",
             {"file": "fcd.xml", "vehicles": [{"box": [4.5, 1.8, 1.5], "class": 10}]},
         ),
     ] = None
     mount: Annotated[
         MountSection | None,
-        told(
+        about(
             "pose of the sensor on its carrier, in the carrier's axes",
             {"position": [1, 0, 2], "pitch_deg": 10},
         ),
     ] = None
     steps: Annotated[
-        Steps | None,
-        told(
+        StepCount | None,
+        about(
             "time steps (scans) at each pose; by default along a trajectory as many as fit into it",
             36,
         ),
     ] = None
     materials: Annotated[
         Several[Material],
-        told(
+        about(
             "materials of objects, by name; the last entry for an object counts",
             [{"objects": "*", "reflectance": 0.3}, {"objects": "Window*", "transparent": "pass"}],
             max_length=100_000,
@@ -134,7 +138,7 @@ class Scenario(Section):
     weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
     navigation: Annotated[
         Navigation | None,
-        told(
+        about(
             "IMU and GNSS receiver of the carrier, with errors that drift",
             {"imu": {"rate_hz": 200}, "gnss": {"rate_hz": 10}},
         ),
@@ -190,32 +194,17 @@ class Scenario(Section):
 
         LidarpoolError as `load`.
         """
-        mistakes, made = Mistakes(), None
-        while made is None:
-            try:
-                made = Scenario.model_validate(data)
-            except ValidationError as error:
-                mistakes.lines += [
-                    f"{source}: {line}" for line in validation_errors(error, Scenario)
-                ]
-                # Validate again without the wrong sections, to find further errors.
-                wrong = {str(detail["loc"][0]) for detail in error.errors() if detail["loc"]}
-                if not wrong:
-                    mistakes.tell()
-                data = {name: value for name, value in data.items() if str(name) not in wrong}
+        with sentences(Scenario, source):
+            made = Scenario.model_validate(data)
         given = {name: getattr(made, name) for name in made.model_fields_set}
         scenario = self.model_copy(update=given)
         scenario._folder, scenario._source = self._folder if folder is None else folder, source
-        scenario._check(mistakes)
-        mistakes.tell()
+        scenario._check()
         return scenario
 
-    def _check(self, mistakes: Mistakes) -> None:
-        """Note fields that do not fit together, and missing files if there are other errors.
-
-        If nothing else is wrong, reading them reports it.
-        """
-        wrong, planning = [], self.planning
+    def _check(self) -> None:
+        """Raise LidarpoolError if fields do not fit together."""
+        mistakes, wrong, planning = Mistakes(), [], self.planning
         # The default objects have a start and a target.
         lacking = 0 if self.scene.has_seed else [planning.start, planning.target].count(None)
         if planning.enabled and lacking:
@@ -252,7 +241,7 @@ class Scenario(Section):
                 with mistakes.noted(), prefixed(self._source):
                     one = section.mounted(self.path, CENTRE, self.noise, self.returns)
                     (one.returns or self.returns).of(one.sensor.optics)
-        mistakes.lines += missing(self.files, self._source) if mistakes.lines else ()
+        mistakes.tell()
 
     @property
     def files(self) -> tuple[Path, ...]:
@@ -268,7 +257,7 @@ class Scenario(Section):
         for section in (self.sensor, *self.sensors.values()):
             files += [section.calibration]
             files += [section.model] if section.has_own_model else []
-        return self.paths(file for file in files if file)
+        return tuple(self.path(file) for file in dict.fromkeys(files) if file)
 
     @property
     def placed(self) -> tuple[CopiesSection | ActorSection, ...]:
@@ -281,19 +270,9 @@ class Scenario(Section):
         return self._source
 
     def path(self, file: str) -> Path:
-        """Path of a file that it names; LidarpoolError if that is of a user who is not known."""
-        try:
-            return self._folder / Path(file).expanduser()
-        except RuntimeError as error:
-            raise LidarpoolError(f"the file {file!r} cannot be found: {error}") from error
-
-    def paths(self, files: Iterable[str]) -> tuple[Path, ...]:
-        """Paths of files, each once, without those of users who are not known."""
-        out = []
-        for file in dict.fromkeys(files):
-            with suppress(LidarpoolError):
-                out.append(self.path(file))
-        return tuple(out)
+        """Path of a file that it names."""
+        # `Path.expanduser` fails at users who are not known.
+        return self._folder / os.path.expanduser(file)  # noqa: PTH111
 
     @property
     def links(self) -> set[str]:

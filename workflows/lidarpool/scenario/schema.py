@@ -12,7 +12,7 @@ from pydantic.fields import FieldInfo
 from pydantic.json_schema import GenerateJsonSchema
 
 from ..base.validation import fields_of, is_section
-from .choices import CampaignSection
+from .campaign_sections import CampaignSection
 from .placing import Placing, as_entry, on_one_line
 from .scenario import MESH_CLOUD, Scenario
 from .sections import Section
@@ -107,17 +107,12 @@ def _top(name: str, field: FieldInfo, given: dict[str, Any]) -> Iterator[str]:
     """Yield the lines of a section or a top-level field, `given` in place of some defaults."""
     section = field.annotation
     if not (isinstance(section, type) and is_section(section)):
-        yield from _lines(name, field, "")
+        yield from _lines(name, field, "", given)
         return
     summary = (section.__doc__ or "").partition("\n")[0].partition(";")[0].rstrip(".")
     yield from _beside(f"{name}:", summary, "")
     for inner, content in fields_of(section).items():
-        if inner in given:
-            yield from _beside(
-                f"{inner}: {on_one_line(given[inner])}", content.description or "", "  "
-            )
-        else:
-            yield from _lines(inner, content, "  ")
+        yield from _lines(inner, content, "  ", given)
 
 
 def _placed(placing: Placing) -> Iterator[str]:
@@ -134,11 +129,12 @@ def _placed(placing: Placing) -> Iterator[str]:
         yield from (f"  - {on_one_line(as_entry(pose))}" for pose in placing.poses)
 
 
-def _lines(name: str, field: FieldInfo, indent: str) -> Iterator[str]:
-    """Return a field with its default, or with examples if the default is computed."""
+def _lines(name: str, field: FieldInfo, indent: str, given: dict[str, Any]) -> Iterator[str]:
+    """Yield a field with what is given or its default, or with examples if that is computed."""
     text = field.description or ""
-    if not field.examples:
-        yield from _beside(f"{name}: {on_one_line(field.default)}", text, indent)
+    if name in given or not field.examples:
+        value = on_one_line(given.get(name, field.default))
+        yield from _beside(f"{name}: {value}", text, indent)
         return
     first, *others = field.examples
     yield from _beside(f"# {name}: {on_one_line(first)}", text, indent)

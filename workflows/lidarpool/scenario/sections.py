@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from math import inf
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import (
     AfterValidator,
@@ -20,7 +20,7 @@ from pydantic import (
 )
 
 from ..base.declared import (
-    Angle,
+    AngleDeg,
     Coordinate,
     Four,
     Seed,
@@ -30,17 +30,17 @@ from ..base.declared import (
     Three,
     Triple,
     Two,
+    about,
     by_text,
     must_be,
     one_of,
     short,
-    told,
 )
 from ..base.validation import STRICT
 from ..base.vocabulary import BACKENDS, UNITS_M
 from ..export.formats import Format
 from ..plan.planning import Search
-from ..scene.meshfile import Opacity
+from ..scene.files.meshfile import OpacityMode
 from ..scene.transform import Transform
 from ..sensor import Mounted, Noise, Pose, Returns, Sensor
 from ..sensor.beams import Rate, Step
@@ -61,6 +61,14 @@ def _upright(sides: tuple[float, float, float, float]) -> tuple[float, float, fl
     return sides
 
 
+def _in_order(ends: tuple[float, float]) -> tuple[float, float]:
+    if not 0 <= ends[1] - ends[0] < inf:
+        raise must_be("[least, largest]")
+    return ends
+
+
+T = TypeVar("T")
+Ends = Annotated[Two[T], AfterValidator(_in_order)]  # least and largest number
 Rectangle = Annotated[Four[Coordinate], AfterValidator(_upright)]
 Factors = Three[Factor]
 Scale = Annotated[
@@ -84,7 +92,7 @@ class MeshFile(Section):
 
     file: Annotated[
         str,
-        told(
+        about(
             ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), voxels of "
             "AMAPVox (.vox), or a raster of heights: .tif .asc .hgt .img .dem .dt2; from the "
             "scenario's folder",
@@ -94,38 +102,38 @@ class MeshFile(Section):
     ]
     unit: Annotated[
         Literal[tuple(UNITS_M)] | None,  # type: ignore[valid-type]
-        told(
+        about(
             "length unit of the file, or of a raster's heights; by default the one it states, else "
             "metres"
         ),
     ] = None
     up_axis: Annotated[
         Literal["x", "y", "z"] | None,
-        told("axis of the file that points up; by default that of its format"),
+        about("axis of the file that points up; by default that of its format"),
     ] = None
-    translation: Annotated[Triple, told("translation in metres, applied last")] = (0, 0, 0)
+    translation: Annotated[Triple, about("translation in metres, applied last")] = (0, 0, 0)
     rotation_deg: Annotated[
-        Three[Angle], told("rotation about the world's x, y and z axes, degrees")
+        Three[AngleDeg], about("rotation about the world's x, y and z axes, degrees")
     ] = (0, 0, 0)
-    scale: Annotated[Scale, told("one factor, or one for each axis; applied first")] = (1, 1, 1)
+    scale: Annotated[Scale, about("one factor, or one for each axis; applied first")] = (1, 1, 1)
     matrix: Annotated[
-        Four[Four[Factor]] | None, told("instead of the three: 4 rows of 4, metres")
+        Four[Four[Factor]] | None, about("instead of the three: 4 rows of 4, metres")
     ] = None
     step_m: Annotated[
         float | None,
-        told("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
+        about("of a raster: mean heights in a grid of this step, metres", gt=0, le=1e6),
     ] = None
     window: Annotated[
         Rectangle | None,
-        told("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
+        about("of a raster: take this part of it, lowest and highest x and y: [x0, y0, x1, y1]"),
     ] = None
     opacity: Annotated[
-        Opacity,
-        told("mask: light passes where the image of a material is transparent; ignore: nowhere"),
+        OpacityMode,
+        about("mask: light passes where the image of a material is transparent; ignore: nowhere"),
     ] = "mask"
     assets: Annotated[
         Text | None,
-        told(
+        about(
             "a folder besides its own from which it may take files, from the scenario's folder",
             "..",
         ),
@@ -163,67 +171,64 @@ def _pose(value: Any) -> Any:
 
 
 PoseEntry = Annotated[Pose, BeforeValidator(_pose, json_schema_input_type=Triple | Pose)]
-Place = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # x, y, perhaps z
+PointXYZ = Annotated[Several[Coordinate], Field(min_length=2, max_length=3)]  # x, y, perhaps z
 
 
 class CopySection(Section, Pose):
     """Where one of several copies stands; in YAML also just [x, y] or [x, y, z]."""
 
     position: Annotated[  # type: ignore[assignment]  # a copy's z may be left out
-        Place, told("x, y and z of the mesh's origin, metres; without z it stands on the surface")
+        PointXYZ,
+        about("x, y and z of the mesh's origin, metres; without z it stands on the surface"),
     ]
-    scale: Annotated[Scale, told("one factor, or one for each axis of the mesh")] = (1, 1, 1)
+    scale: Annotated[Scale, about("one factor, or one for each axis of the mesh")] = (1, 1, 1)
 
 
 class CopyTable(Section):
     """Places of copies from a table; in YAML also just the file's name."""
 
-    file: Annotated[Text, told("a table with a header, from the scenario's folder")]
+    file: Annotated[Text, about("a table with a header, from the scenario's folder")]
     columns: Annotated[
         dict[str, str],
-        told("{x, y, z, yaw_deg, pitch_deg, roll_deg, scale, scale_x, …: name in the file}"),
+        about("{x, y, z, yaw_deg, pitch_deg, roll_deg, scale, scale_x, …: name in the file}"),
     ] = {}
 
 
 class Scatter(Section):
     """Copies that stand upright on surfaces, at random; the same fields give the same places."""
 
-    count: Annotated[int, told("how many", ge=1, le=COPIES_MOST)]
+    count: Annotated[int, about("how many", ge=1, le=COPIES_MOST)]
     surfaces: Annotated[  # not "on", which YAML takes for true
         TextOrTexts,
-        told("names of the objects to stand on, with * and ?; by default all", min_length=1),
+        about("names of the objects to stand on, with * and ?; by default all", min_length=1),
     ] = ("*",)
     within: Annotated[
         Rectangle | None,
-        told("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]"),
+        about("a rectangle, lowest and highest x and y: [x0, y0, x1, y1]"),
     ] = None
     spacing_m: Annotated[
-        float, told("least distance between two, seen from above, metres", ge=0, le=1e6)
+        float, about("least distance between two, seen from above, metres", ge=0, le=1e6)
     ] = 0.0
-    scale: Annotated[Two[Factor], told("least and largest factor")] = (1, 1)
-    yaw_deg: Annotated[Angle | None, told("of all of them; by default each has its own")] = None
-    seed: Annotated[Seed, told("another seed gives other places")] = 0
-
-    @model_validator(mode="after")
-    def _ordered(self) -> Scatter:
-        if not 0 < self.scale[0] <= self.scale[1]:
-            raise ValueError("scale is the least and the largest factor, both above 0.")
-        return self
+    scale: Annotated[
+        Ends[Annotated[float, Field(gt=0, le=1e9)]], about("least and largest factor")
+    ] = (1, 1)
+    yaw_deg: Annotated[AngleDeg | None, about("of all of them; by default each has its own")] = None
+    seed: Annotated[Seed, about("another seed gives other places")] = 0
 
 
 class ShapeSection(Section):
     """What something looks like, a file or a box, and the class of its points."""
 
-    name: Annotated[Text | None, told("name of the object")] = None
+    name: Annotated[Text | None, about("name of the object")] = None
     file: Annotated[
-        MeshEntry | None, told("its mesh in its own axes, as in scene.files", "car.glb")
+        MeshEntry | None, about("its mesh in its own axes, as in scene.files", "car.glb")
     ] = None
     box: Annotated[
-        Three[Length] | None, told("instead of a file: length, width and height of a box, metres")
+        Three[Length] | None, about("instead of a file: length, width and height of a box, metres")
     ] = None
     semantic_class: Annotated[
         SemanticClass | None,
-        told("class of its points; by default that of its material", alias="class"),
+        about("class of its points; by default that of its material", alias="class"),
     ] = None
 
     _one_shape = one_of("file", "box")
@@ -232,21 +237,21 @@ class ShapeSection(Section):
 class CopiesSection(ShapeSection):
     """An object that stands in many places, its mesh kept once; each copy is an object."""
 
-    name: Annotated[Text, told("name of the first; the others are numbered: Tree, Tree.2, …")]
+    name: Annotated[Text, about("name of the first; the others are numbered: Tree, Tree.2, …")]
     at: Annotated[
         Several[
             Annotated[
-                CopySection, BeforeValidator(_pose, json_schema_input_type=Place | CopySection)
+                CopySection, BeforeValidator(_pose, json_schema_input_type=PointXYZ | CopySection)
             ]
         ],
-        told("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
+        about("places: [x, y], [x, y, z], or with angles and scale", max_length=COPIES_MOST),
     ] = ()
     table: Annotated[
         Annotated[CopyTable, by_text("file", CopyTable)] | None,
-        told("instead of at: a table of places", "trees.csv"),
+        about("instead of at: a table of places", "trees.csv"),
     ] = None
     scatter: Annotated[
-        Scatter | None, told("instead of at: so many on surfaces, at random", {"count": 100})
+        Scatter | None, about("instead of at: so many on surfaces, at random", {"count": 100})
     ] = None
 
     _one_list = one_of("at", "table", "scatter")
@@ -255,9 +260,9 @@ class CopiesSection(ShapeSection):
 class Ground(Section):
     """A horizontal rectangle under the scene, `margin_m` wider on each side."""
 
-    height_m: Annotated[Coordinate, told("z of the rectangle, metres")] = 0.0
+    height_m: Annotated[Coordinate, about("z of the rectangle, metres")] = 0.0
     margin_m: Annotated[
-        float, told("how much it extends beyond the scene, metres", ge=0, le=1e6)
+        float, about("how much it extends beyond the scene, metres", ge=0, le=1e6)
     ] = 5.0
 
 
@@ -269,12 +274,12 @@ class SceneSection(Section):
 
     preset: Annotated[
         Literal["seed", "none"] | None,
-        told("seed (six objects); none is the default with files", "seed"),
+        about("seed (six objects); none is the default with files", "seed"),
     ] = None
     files: Annotated[
         MeshEntries,
         short(lambda v: isinstance(v, (str, dict)), lambda v: [v], MeshEntry | MeshEntries),
-        told(
+        about(
             "mesh files and rasters of heights, by name or with unit, up_axis, scale, "
             "rotation_deg, translation",
             ["hall.glb", {"file": "part.stl", "unit": "mm", "translation": [1, 0, 0]}],
@@ -283,7 +288,7 @@ class SceneSection(Section):
     ] = ()
     copies: Annotated[
         Several[CopiesSection],
-        told(
+        about(
             "objects in many places, by lists, tables, or at random",
             [{"name": "Crate", "box": [1, 1, 1], "at": [[4, 5, 0], [6, 5, 0]], "class": 4}],
             [{"name": "Tree", "file": "tree.glb", "scatter": {"count": 100, "surfaces": "Ground"}}],
@@ -292,7 +297,7 @@ class SceneSection(Section):
     ] = ()
     ground: Annotated[
         Ground | None,
-        told("a horizontal rectangle below the scene, metres", {"height_m": 0, "margin_m": 5}),
+        about("a horizontal rectangle below the scene, metres", {"height_m": 0, "margin_m": 5}),
     ] = None
 
     @model_validator(mode="after")
@@ -315,7 +320,7 @@ class SensorSection(Section):
 
     model: Annotated[
         str | None,
-        told(
+        about(
             "a sensor model, see `lidarpool sensors`, or your own .yaml, "
             "from the scenario's folder",
             "velodyne/vlp16",
@@ -323,32 +328,33 @@ class SensorSection(Section):
     ] = None
     calibration: Annotated[
         str | None,
-        told(
+        about(
             "calibration file of a Velodyne, Ouster, Hesai, RoboSense, Livox, or a table of beams",
             "unit.json",
         ),
     ] = None
     columns: Annotated[
         int | None,
-        told("for an Ouster or a table of beams: azimuths in one turn", 512, ge=1, le=100_000),
+        about("for an Ouster or a table of beams: azimuths in one turn", 512, ge=1, le=100_000),
     ] = None
     rays_per_revolution: RaysPerRevolution = 1000
     layers: Layers = 40
     vertical_fov_deg: Fov = 60.0
     step_deg: Step = 10.0
     rate_hz: Annotated[
-        Rate | None, told("turns, lines or frames a second; by default the model's, or 10", 20.0)
+        Rate | None, about("turns, lines or frames a second; by default the model's, or 10", 20.0)
     ] = None
     min_range_m: Annotated[
-        MinRange | None, told("nearer returns are ignored; by default the model's, or 0", 0.5)
+        MinRange | None, about("nearer returns are ignored; by default the model's, or 0", 0.5)
     ] = None
     max_range_m: Annotated[
-        MaxRange | None, told("farther returns are ignored; by default the model's, or .inf", 100.0)
+        MaxRange | None,
+        about("farther returns are ignored; by default the model's, or .inf", 100.0),
     ] = None
 
     performance: Annotated[
         Literal["ideal", "datasheet"],
-        told(
+        about(
             "datasheet: noise, detection range and beam by the model's data sheet; what noise and "
             "returns say counts more"
         ),
@@ -417,13 +423,6 @@ def file_states(files: Iterable[Path]) -> tuple[tuple[Path, int, int], ...]:
     return tuple(states)
 
 
-def missing(files: Iterable[Path], source: str) -> list[str]:
-    """Lines on files that are not there."""
-    # `Path.exists` fails at names that no file can have.
-    lost = [path for path in files if not os.path.exists(path)]  # noqa: PTH110
-    return [f"{source}: {str(path)!r} does not exist." for path in lost]
-
-
 _grid = lru_cache(Sensor.grid)
 
 
@@ -437,7 +436,7 @@ class OutputSection(Section):
 
     write: Annotated[
         Several[Annotated[Format, by_text("format", Format)]],
-        told("further formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
+        about("further formats of the cloud", ["laz", {"format": "mcap", "layout": "autoware"}]),
     ] = ()
 
     @model_validator(mode="after")
@@ -470,9 +469,9 @@ class Obstacle(Section):
     `object` may have * and ?; the short form is just that name: `- Shelf*`.
     """
 
-    object: Annotated[Text | None, told("name of objects of the scene, with * and ?")] = None
-    centre: Annotated[Pair | None, told("centre of a disc, x and y, metres")] = None
-    radius_m: Annotated[float | None, told("radius of the disc, metres", gt=0, le=1e6)] = None
+    object: Annotated[Text | None, about("name of objects of the scene, with * and ?")] = None
+    centre: Annotated[Pair | None, about("centre of a disc, x and y, metres")] = None
+    radius_m: Annotated[float | None, about("radius of the disc, metres", gt=0, le=1e6)] = None
 
     @model_validator(mode="after")
     def _one_kind(self) -> Obstacle:
@@ -492,25 +491,25 @@ class _Route:
 
     enabled: Annotated[
         bool | None,
-        told("by default true if start and target are given", True),
+        about("by default true if start and target are given", True),
     ] = None
     start: Annotated[
-        Pair | None, told("x and y, metres; the default objects have one", [25, 25])
+        Pair | None, about("x and y, metres; the default objects have one", [25, 25])
     ] = None
     target: Annotated[
-        Pair | None, told("x and y, metres; the default objects have one", [-30, -20])
+        Pair | None, about("x and y, metres; the default objects have one", [-30, -20])
     ] = None
     obstacles: Annotated[
         Obstacles | None,
         short(lambda v: v == "auto", lambda v: None, Literal["auto"] | Obstacles | None),
-        told(
+        about(
             "bounding circles of all objects that are not flat (auto), or a list",
             "auto",
             ["Shelf*", {"centre": [-6, -1], "radius_m": 1}],
         ),
     ] = None
     clearance_m: Annotated[
-        float, told("distance to keep from obstacles, metres", ge=0, le=1000)
+        float, about("distance to keep from obstacles, metres", ge=0, le=1000)
     ] = 0.0
 
 
@@ -527,13 +526,13 @@ class PlanningSection(Section, Search, _Route):
 class TaskOptions:
     """Tasks of a run, on whatever cluster."""
 
-    collectors: Annotated[int, told("tasks that write the parts", ge=1, le=64)] = 2
+    collectors: Annotated[int, about("tasks that write the parts", ge=1, le=64)] = 2
     queue_capacity: Annotated[
-        int, told("how many items stage 1 may be ahead of stage 2", ge=1, le=100_000)
+        int, about("how many items stage 1 may be ahead of stage 2", ge=1, le=100_000)
     ] = 10
     batch_mb: Annotated[
         int,
-        told(
+        about(
             "most memory of a batch, the scans that a GPU worker casts at a time, megabytes",
             ge=1,
             le=1_000_000,
@@ -541,7 +540,7 @@ class TaskOptions:
     ] = 256
     backend: Annotated[
         Literal[BACKENDS],  # type: ignore[valid-type]
-        told("cuda, embree or numpy; auto takes the fastest available"),
+        about("cuda, embree or numpy; auto takes the fastest available"),
     ] = "auto"
 
 
@@ -549,11 +548,11 @@ class _Workers:
     """Workers of a local cluster; they come first."""
 
     gpu: Annotated[
-        int | None, told("workers that cast rays; by default one for each GPU", 1, ge=1, le=10_000)
+        int | None, about("workers that cast rays; by default one for each GPU", 1, ge=1, le=10_000)
     ] = None
     other: Annotated[
         int | None,
-        told("workers that plan paths; by default by the number of cores", 1, ge=1, le=10_000),
+        about("workers that plan paths; by default by the number of cores", 1, ge=1, le=10_000),
     ] = None
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,17 +11,20 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError, Mistakes, prefixed
-from ..base.words import counted
+from ..base.words import plural
 from ..scene.actors import Actor, box, one_mesh
-from ..scene.instances import Instance
-from ..scene.mesh import Mesh
-from ..scene.meshfile import Objects, load_objects
-from ..scene.nodes import Raster
+from ..scene.files.meshfile import Objects, load_objects
+from ..scene.files.scene_graph import Raster
+from ..scene.files.urdf import load_robot
+from ..scene.robot import Robot
 from ..scene.scene import Scene
+from ..scene.scene_instances import SceneInstance
+from ..scene.scene_mesh import SceneMesh
 from ..scene.shapes import seed_objects
 from ..sensor.calibrations import said, text_of
 from ..sensor.trajectory import rotations_of
 from ..sensor.trajectory_files import columns_of_table
+from .ground import Standing
 from .scenario import Scenario
 from .sections import (
     COPIES_MOST,
@@ -34,7 +36,6 @@ from .sections import (
     ShapeSection,
     file_states,
 )
-from .standing import Standing
 
 
 @dataclass
@@ -81,7 +82,7 @@ def _key(scenario: Scenario) -> object:
     names: list[str] = [entry.file for entry in section.files]
     for copies in section.copies:
         names += [one.file for one in (copies.file, copies.table) if one is not None]
-    states = file_states(scenario.paths(names))
+    states = file_states(map(scenario.path, names))
     read_by = scenario.path(""), scenario.coloured, scenario.cloud.epsg
     return section.model_dump_json(), *read_by, states
 
@@ -96,7 +97,7 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
     """
     section, found = scenario.scene, Findings()
     shapes = Shapes(scenario, found)
-    meshes: list[Mesh | Instance] = list(seed_objects()) if section.has_seed else []
+    meshes: list[SceneMesh | SceneInstance] = list(seed_objects()) if section.has_seed else []
     moving: list[Actor] = []
     mistakes = Mistakes()
     for entry in section.files:
@@ -116,13 +117,14 @@ def read_static_scene(scenario: Scenario) -> StaticScene:
 
 
 class Shapes:
-    """Meshes of a scenario, each file read once; `found` is added to."""
+    """Meshes and robots of a scenario, each file read once; `found` is added to."""
 
     def __init__(self, scenario: Scenario, found: Findings) -> None:
         self.scenario, self.found = scenario, found
-        self._made: dict[Any, Mesh] = {}  # {file or size: mesh}
+        self._made: dict[Any, SceneMesh] = {}  # {file or size: mesh}
+        self._robots: dict[MeshFile, Robot] = {}
 
-    def of(self, entry: ShapeSection) -> Mesh:
+    def of(self, entry: ShapeSection) -> SceneMesh:
         """Return the mesh of a copy, an actor or vehicles, under any name."""
         shape, made = entry.file or entry.box or (1.0, 1.0, 1.0), self._made
         if shape not in made:
@@ -135,34 +137,44 @@ class Shapes:
                 made[shape] = box(name, shape)
         return made[shape]
 
+    def robot(self, entry: MeshFile) -> Robot:
+        """Return the robot of a file; LidarpoolError if it cannot be used."""
+        if entry not in self._robots:
+            path, tell = self.scenario.path(entry.file), self.found.notes.append
+            colours = self.scenario.coloured
+            made = load_robot(path, opacity=entry.opacity, colours=colours, tell=tell)
+            self._robots[entry], self.found.sources[entry.file] = made, made.summary
+        return self._robots[entry]
+
     def read(self, entry: MeshFile) -> Objects:
         """Read the objects of a file; LidarpoolError if it cannot be used."""
         scenario, found = self.scenario, self.found
         with prefixed(scenario.source):
-            path, transform = scenario.path(entry.file), entry.transform()
-            assets = None if entry.assets is None else scenario.path(entry.assets)
-        return load_objects(
-            path,
+            transform = entry.transform()
+        objects = load_objects(
+            scenario.path(entry.file),
             **entry.model_dump(include={"unit", "up_axis", "opacity", "step_m", "window"}),
             transform=transform,
             colours=scenario.coloured,
             epsg=scenario.cloud.epsg,
-            assets=assets,
+            assets=None if entry.assets is None else scenario.path(entry.assets),
             tell=found.notes.append,
             axes=found.remarks.append,
-            tell_raster=lambda raster: found.rasters.append((entry, raster)),
-            taken=partial(found.sources.setdefault, entry.file),
         )
+        found.sources.setdefault(entry.file, objects.summary)
+        if objects.raster is not None:
+            found.rasters.append((entry, objects.raster))
+        return objects
 
 
-def _copies(shapes: Shapes, base: list[Mesh | Instance]) -> list[Instance]:
+def _copies(shapes: Shapes, base: list[SceneMesh | SceneInstance]) -> list[SceneInstance]:
     """Place the copies; they stand on other objects and on the ground, not on one another."""
     scenario, section = shapes.scenario, shapes.scenario.scene
     scene = Scene.from_meshes(base) if base else None
     if section.ground is not None and (base or _copied_to(section)):
         scene = Scene.from_meshes([*base, _ground(section, scene)])
     standing = Standing(scene)
-    out: list[Instance] = []
+    out: list[SceneInstance] = []
     mistakes = Mistakes()
     for number, entry in enumerate(section.copies):
         with mistakes.noted():
@@ -170,7 +182,7 @@ def _copies(shapes: Shapes, base: list[Mesh | Instance]) -> list[Instance]:
             with prefixed(f"{scenario.source}: scene.copies[{number}]"):
                 made = copies_of(entry, mesh, standing, scenario.path)
             if entry.file is not None:
-                words = f", {counted(len(made), 'copy', 'copies')}"
+                words = f", {plural(len(made), 'copy', 'copies')}"
                 shapes.found.sources[entry.file.file] += words
             out += made
     mistakes.tell()
@@ -187,7 +199,7 @@ def _copied_to(section: SceneSection) -> list[Floats]:
     ]
 
 
-def _ground(section: SceneSection, scene: Scene | None) -> Mesh:
+def _ground(section: SceneSection, scene: Scene | None) -> SceneMesh:
     """Two triangles under a scene, and under where copies are scattered or listed."""
     ground = section.ground
     assert ground is not None, "of a section with a ground"
@@ -196,7 +208,7 @@ def _ground(section: SceneSection, scene: Scene | None) -> Mesh:
     (x0, y0), (x1, y1) = points.min(axis=0) - ground.margin_m, points.max(axis=0) + ground.margin_m
     z = ground.height_m
     corners = np.array([[x0, y0, z], [x1, y0, z], [x1, y1, z], [x0, y1, z]])
-    return Mesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
+    return SceneMesh("Ground", corners, np.array([[0, 1, 2], [0, 2, 3]]))
 
 
 SCALE_LEAST = 1e-6
@@ -208,7 +220,9 @@ _PLACE, _ANGLES = ("x", "y", "z"), ("yaw_deg", "pitch_deg", "roll_deg")
 _SCALES = ("scale_x", "scale_y", "scale_z")
 
 
-def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, path: PathOf) -> list[Instance]:
+def copies_of(
+    entry: CopiesSection, mesh: SceneMesh, standing: Standing, path: PathOf
+) -> list[SceneInstance]:
     """Place the copies of an entry; `path` returns that of its table.
 
     Raises
@@ -232,7 +246,7 @@ def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, path: PathOf
             x, y = places[low[0], :2].tolist()
             raise LidarpoolError(
                 f"below x {x:g}, y {y:g} nothing of the scene's files or ground faces up to stand "
-                f"on ({counted(len(low), 'copy', 'copies')}): give z."
+                f"on ({plural(len(low), 'copy', 'copies')}): give z."
             )
         if (np.abs(scales) < SCALE_LEAST).any():
             raise LidarpoolError(
@@ -242,7 +256,7 @@ def copies_of(entry: CopiesSection, mesh: Mesh, standing: Standing, path: PathOf
     matrices = np.tile(np.eye(4), (len(places), 1, 1))
     matrices[:, :3, :3] = rotations_of(angles) * scales[:, None]
     matrices[:, :3, 3] = places
-    return Instance.several(mesh, matrices, entry.name)
+    return SceneInstance.several(mesh, matrices, entry.name)
 
 
 def _of_table(path: Path, columns: dict[str, str]) -> tuple[Floats, Floats, Floats]:
@@ -283,7 +297,7 @@ def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, F
     # The name, so that trees and rocks of one seed are not at the same places.
     seeds = [given.seed, *name.encode()]
     draw = np.random.Generator(np.random.PCG64([0, *seeds]))
-    room = _Room(given.spacing_m)
+    room = _TakenPlaces(given.spacing_m)
     found: list[Floats] = []
     drawn = 0
     while len(found) < given.count:
@@ -315,7 +329,7 @@ def _scattered(given: Scatter, name: str, standing: Standing) -> tuple[Floats, F
     return np.array(found), angles, np.repeat(scales[:, None], 3, axis=1)
 
 
-class _Room:
+class _TakenPlaces:
     """Places that are taken, each with so much room around it."""
 
     def __init__(self, spacing_m: float) -> None:

@@ -13,8 +13,8 @@ from ..base.validation import checked_fields
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
 from .colours import joined
-from .instances import Instance
-from .mesh import Cutout, Mesh, stacked
+from .scene_instances import SceneInstance, parts_of
+from .scene_mesh import SceneMesh, stacked
 
 SAMPLES_MOST = 200_000  # poses of all actors
 AT_ZERO = Stations((CENTRE,))
@@ -39,7 +39,7 @@ class Actor:
         If the mesh has voxels.
     """
 
-    mesh: Mesh
+    mesh: SceneMesh
     trajectory: Trajectory = AT_ZERO
 
     def __post_init__(self) -> None:
@@ -53,14 +53,16 @@ class Actor:
         """Its name."""
         return self.mesh.name
 
-    def placed(self, time_ns: float) -> Mesh:
+    def placed(self, time_ns: float) -> SceneMesh:
         """Its mesh at a time, in the scene's local coordinates; one point if it is absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
         vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Masks do not show.
-        return Mesh(self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours)
+        return SceneMesh(
+            self.name, vertices + positions[0], self.mesh.faces, colours=self.mesh.colours
+        )
 
     def samples(self, duration_ns: float, count: int) -> tuple[Floats, Floats, Floats]:
         """Return times (k,), nanoseconds, positions (k, 3) and quaternions (k, 4), for drawings.
@@ -91,13 +93,13 @@ def samples_each(actors: Sequence[Actor], most: int) -> int:
     return max(20, min(most, SAMPLES_MOST // max(len(actors), 1)))
 
 
-def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], Indices]:
+def shapes_of(actors: Iterable[Actor]) -> tuple[list[SceneMesh], Indices]:
     """Meshes (m,) of actors, each once, and which of them each actor (a,) has.
 
-    Meshes are the same if they share their arrays.
+    Meshes are the same if they share their arrays, which pickling preserves.
     """
     numbers: dict[tuple[int, ...], int] = {}  # {ids of the arrays: number of the mesh}
-    meshes: list[Mesh] = []
+    meshes: list[SceneMesh] = []
     which = []
     for mesh in (actor.mesh for actor in actors):
         parts = (mesh.vertices, mesh.faces, mesh.colours, *mesh.cutouts)
@@ -108,34 +110,24 @@ def shapes_of(actors: Iterable[Actor]) -> tuple[list[Mesh], Indices]:
     return meshes, np.array(which, np.intp)
 
 
-def one_mesh(name: str, objects: Iterable[Mesh | Instance]) -> Mesh:
+def one_mesh(name: str, objects: Iterable[SceneMesh | SceneInstance]) -> SceneMesh:
     """Join objects to one; masks are kept."""
-    flat = [one.flat() if isinstance(one, Instance) else one for one in objects]
+    flat = [one.flat() if isinstance(one, SceneInstance) else one for one in objects]
     if any(part.voxels is not None for part in flat):
         if flat[1:]:
             raise LidarpoolError(f"{name!r} has voxels, and cannot be joined to other objects.")
         return replace(flat[0], name=name)
-    vertices, _ = stacked((part.vertices, part.faces) for part in flat)
-    first, solid, cut = 0, [], []
-    cutouts: list[Cutout] = []
-    for part in flat:
-        end = len(part.faces) - sum(len(one.uv) for one in part.cutouts)
-        solid.append(part.faces[:end] + first)
-        cut.append(part.faces[end:] + first)
-        cutouts += part.cutouts
-        first += len(part.vertices)
-    faces = solid + cut
-    rows = [slice(0, len(some)) for some in solid] + [slice(len(some), None) for some in solid]
-    pieces = [
-        part.colours and part.colours.take(some) for part, some in zip(flat * 2, rows, strict=True)
-    ]
-    colours = joined(pieces, [len(some) for some in faces])
-    return Mesh(name, vertices, np.concatenate(faces), tuple(cutouts), colours)
+    parts = [part for mesh in flat for part in parts_of(mesh)]
+    parts.sort(key=lambda part: part.mask is not None)  # those with masks last
+    vertices, faces = stacked((part.vertices, part.faces) for part in parts)
+    cutouts = [cut for mesh in flat for cut in mesh.cutouts]
+    colours = joined([part.colours for part in parts], [len(part.faces) for part in parts])
+    return SceneMesh(name, vertices, faces, tuple(cutouts), colours)
 
 
-def box(name: str, size_m: tuple[float, float, float]) -> Mesh:
+def box(name: str, size_m: tuple[float, float, float]) -> SceneMesh:
     """Return a box of a length, width and height, its origin in the middle of its underside."""
     corners = np.array([(x, y, z) for z in (0, 1) for y in (-0.5, 0.5) for x in (-0.5, 0.5)])
     sides = [(0, 2, 3, 1), (4, 5, 7, 6), (0, 1, 5, 4), (2, 6, 7, 3), (0, 4, 6, 2), (1, 3, 7, 5)]
     faces = [[a, b, c] for a, b, c, _ in sides] + [[a, c, d] for a, _, c, d in sides]
-    return Mesh(name, corners * size_m, np.array(faces))
+    return SceneMesh(name, corners * size_m, np.array(faces))

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.errors import LidarpoolError
-from ..base.words import counted
+from ..base.words import plural
 
 # What has no colour is grey, of half of the light, as the default reflectance is.
 GREY = np.full((1, 1, 3), 188, np.uint8)
@@ -70,9 +69,14 @@ class Colours:
         return cls((colour,), np.zeros(faces, np.int32))
 
     @classmethod
+    def of_corners(cls, corners: Bytes) -> Colours:
+        """Give each corner of each face a colour of its own, (f, 3, 3)."""
+        return cls((WHITE,), np.zeros(len(corners), np.int32), corners=corners)
+
+    @classmethod
     def of_faces(cls, colours: Bytes) -> Colours:
         """Give each face a colour of its own, (f, 3)."""
-        return replace(cls.plain(WHITE, len(colours)), corners=colours[:, None].repeat(3, axis=1))
+        return cls.of_corners(colours[:, None].repeat(3, axis=1))
 
     def take(self, rows: Integers | slice) -> Colours:
         """Select faces."""
@@ -153,22 +157,19 @@ class Lookup:
         self._height, self._width = sizes.T
         counts = sizes.prod(axis=1)
         self._first = np.cumsum([0, *counts[:-1]])
-        # Faces with images have texture coordinates, and those with colours at their corners
-        # have these, as planes of the position.
-        own = (counts > 1)[self._image]
-        tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
-        textures, lights, at = [np.zeros((0, 8))], [np.zeros((0, 12))], 0
+        # Texture coordinates and colours at the corners are planes of the position.
+        textures: list[Floats] = []
+        lights: list[Floats] = []
+        at = 0
         for block in corners:
             rows = slice(at, at + len(block))
             if colours.uv is not None:
-                uv = colours.uv[rows][own[rows]]
-                textures.append(_planes(block[own[rows]], uv.astype(np.float64)))
+                textures.append(_planes(block, colours.uv[rows].astype(np.float64)))
             if tints is not None:
-                light = LINEAR[tints[rows][tinted[rows]]]
-                lights.append(_planes(block[tinted[rows]], light))
+                lights.append(_planes(block, LINEAR[tints[rows]]))
             at += len(block)
-        self._texture = _Planes.of(own, textures)
-        self._light = _Planes.of(tinted, lights)
+        self._texture = np.concatenate(textures) if textures else None
+        self._light = np.concatenate(lights) if lights else None
 
     def at(self, rows: Integers, points: Floats) -> UInts32:
         """Colours of points (n, 3) on faces (n,), packed; of images the nearest element."""
@@ -176,55 +177,33 @@ class Lookup:
         at = self._first.take(image)
         place = np.ascontiguousarray(points.T)
         if self._texture is not None:
-            on, (u, v) = self._texture.at(rows, place)
-            image = image[on]
+            u, v = _on_planes(self._texture, rows, place)
             width = self._width.take(image)
-            row = _element(v, self._height.take(image))
-            at[on] += row * width + _element(u, width)
+            at += _element(v, self._height.take(image)) * width + _element(u, width)
         found = self._texels.take(at)
         if self._light is not None:
-            on, light = self._light.at(rows, place)
-            tinted = LINEAR[unpacked(found[on])] * np.clip(light.T, 0, 1)
-            found[on] = packed(as_srgb(tinted))
+            light = _on_planes(self._light, rows, place)
+            found = packed(as_srgb(LINEAR[unpacked(found)] * np.clip(light.T, 0, 1)))
         return found
 
 
-class _Planes(NamedTuple):
-    """Values on faces that are linear in the position."""
-
-    place: Ints32  # (f,): row of `slopes` that each face has; -1 for none
-    slopes: Floats  # (k, 4 w): of each of w values, along x, y and z, and at zero
-    everywhere: bool
-
-    @classmethod
-    def of(cls, there: Bools, blocks: list[Floats]) -> _Planes | None:
-        """Join blocks (k, 4 w), of the faces (f,) that have some; None if there are none."""
-        if not there.any():
-            return None
-        place = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
-        return cls(place, np.concatenate(blocks), bool(there.all()))
-
-    def at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
-        """Which of the faces (n,) have values, and the values at points (3, n): (w, m)."""
-        on: Any = slice(None)
-        place = self.place.take(rows)
-        if not self.everywhere:
-            on = np.flatnonzero(place >= 0)
-            place, points = place[on], points[:, on]
-        x, y, z = points
-        out = np.empty((self.slopes.shape[1] // 4, len(x)))
-        slopes = self.slopes.take(place, axis=0).T.reshape(len(out), 4, len(x))
-        for value, (a, b, c, d) in zip(out, slopes, strict=True):
-            np.multiply(a, x, out=value)
-            value += b * y
-            value += c * z
-            value += d
-        return on, out
+def _on_planes(slopes: Floats, rows: Integers, points: Floats) -> Floats:
+    """Values (w, n) at points (3, n) of faces (n,), by the slopes (f, 4 w) of all faces."""
+    x, y, z = points
+    out = np.empty((slopes.shape[1] // 4, len(x)))
+    found = slopes.take(rows, axis=0).T.reshape(len(out), 4, len(x))
+    for value, (a, b, c, d) in zip(out, found, strict=True):
+        np.multiply(a, x, out=value)
+        value += b * y
+        value += c * z
+        value += d
+    return out
 
 
 def _planes(corners: Floats, values: Floats) -> Floats:
-    """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w), see `_Planes`.
+    """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w).
 
+    Of each value they are those along x, y and z, and the value at zero.
     Flat triangles, which are not hit, have the value of their first corner.
     """
     a, b, c = corners.transpose(1, 0, 2)
@@ -302,7 +281,7 @@ def joined(parts: Sequence[Colours | None], sizes: Iterable[int]) -> Colours | N
     return Colours(tuple(images), np.concatenate(image), uv, corners)
 
 
-def told(parts: Iterable[Colours | None]) -> str:
+def colours_summary(parts: Iterable[Colours | None]) -> str:
     """Say what the colours of meshes are: «2 textures, 1 plain colour, colours of vertices»."""
     there = [part for part in parts if part is not None]
     kinds = {
@@ -312,6 +291,6 @@ def told(parts: Iterable[Colours | None]) -> str:
         if part.images[number] is not WHITE
     }
     counts = Counter(kinds.values())
-    words = [counted(counts[kind], kind) for kind in ("texture", "plain colour") if counts[kind]]
+    words = [plural(counts[kind], kind) for kind in ("texture", "plain colour") if counts[kind]]
     words += ["colours of vertices"] * any(part.corners is not None for part in there)
     return ", ".join(words) or "no colours"

@@ -17,10 +17,10 @@ from PIL import Image
 from ..base.arrays import AnyArray, Bytes, Floats, Indices
 from ..base.errors import LidarpoolError
 from .colours import LINEAR
-from .instances import Instance
-from .mesh import Mesh
-from .meshfile import GENERATOR
+from .files.meshfile import GENERATOR
 from .scene import Scene
+from .scene_instances import SceneInstance
+from .scene_mesh import SceneMesh
 from .transform import UP_AXES
 
 _MOST_BYTES = 2**32 - 1
@@ -40,9 +40,9 @@ def glb_of(scene: Scene) -> bytes:
     """
     writer = _Writer(scene.origin)
     for name, parts in groupby(scene.meshes(), lambda one: one.name):
-        places: dict[bytes, list[Mesh | Instance]] = {}
+        places: dict[bytes, list[SceneMesh | SceneInstance]] = {}
         for one in parts:
-            key = one.matrix.tobytes() if isinstance(one, Instance) else b""
+            key = one.matrix.tobytes() if isinstance(one, SceneInstance) else b""
             places.setdefault(key, []).append(one)
         for found in places.values():
             writer.add(name, found)
@@ -72,11 +72,11 @@ class _Writer:
         parts.append(part)
         return len(parts) - 1
 
-    def add(self, name: str, parts: list[Mesh | Instance]) -> None:
+    def add(self, name: str, parts: list[SceneMesh | SceneInstance]) -> None:
         """Add an object of parts in one place."""
-        meshes = [one.mesh if isinstance(one, Instance) else one for one in parts]
+        meshes = [one.mesh if isinstance(one, SceneInstance) else one for one in parts]
         key = tuple(id(mesh) for mesh in meshes)
-        far = self._origin.any() and not isinstance(parts[0], Instance)
+        far = self._origin.any() and not isinstance(parts[0], SceneInstance)
         if key not in self._meshes:
             self._kept += meshes
             if far:
@@ -84,7 +84,7 @@ class _Writer:
             primitives = [primitive for mesh in meshes for primitive in self._primitives(mesh)]
             self._meshes[key] = self._put("meshes", {"name": name, "primitives": primitives})
         node: dict[str, Any] = {"name": name, "mesh": self._meshes[key]}
-        if isinstance(parts[0], Instance):
+        if isinstance(parts[0], SceneInstance):
             turn = np.eye(4)
             turn[:3, :3] = UP_AXES["y"].T
             node["matrix"] = (turn @ parts[0].matrix @ turn.T).T.ravel().tolist()
@@ -92,7 +92,7 @@ class _Writer:
             node["translation"] = (self._origin @ UP_AXES["y"]).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
-    def _primitives(self, mesh: Mesh) -> list[dict[str, Any]]:
+    def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
         """Return opaque triangles by their images, then those of each mask."""
         first = len(mesh.faces) - sum(len(cut.uv) for cut in mesh.cutouts)
         colours, out = mesh.colours, []
@@ -127,7 +127,7 @@ class _Writer:
 
     def _corners(
         self,
-        mesh: Mesh,
+        mesh: SceneMesh,
         rows: Indices,
         uv: AnyArray | None,
         tints: Bytes | None,

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Hashable
-from dataclasses import dataclass
-from functools import cache
+from collections.abc import Iterator
+from contextlib import AbstractContextManager, contextmanager
 from io import BytesIO
 from pathlib import Path
-from typing import Literal, TypeVar
+from typing import Literal
 
 import numpy as np
 from PIL import Image
@@ -17,7 +16,7 @@ from ..base.allowance import Allowance
 from ..base.arrays import AnyArray, Bools, Bytes, Floats, Floats32, Ints
 from ..base.words import printable
 from .colours import Colours
-from .mesh import UV_MOST, Cutout
+from .scene_mesh import UV_MOST, Cutout
 
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "GIF", "TGA")  # Pillow has more, some run programs
 HALF = 128  # least 8-bit opacity that stops light, unless a file states another
@@ -27,8 +26,6 @@ NAMED = 3  # materials that a note names
 SIDE_MOST = 4096  # pixels of an image of colours; larger ones are made smaller
 
 Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
-K = TypeVar("K", bound=Hashable)
-V = TypeVar("V")
 
 
 class MaskError(Exception):
@@ -47,7 +44,19 @@ def read_opacity(image: Path | bytes, allowance: Allowance, *, grey: bool = Fals
     MaskError
         If it cannot be decoded, or takes more than allowed.
     """
-    return _read(image, lambda opened: _decoded(opened, allowance, grey))
+    with _opened(image) as opened:
+        if not (grey or opened.has_transparency_data):
+            return None
+        pixels = opened.width * opened.height
+        if not allowance.fits(PIXEL_BYTES * pixels):
+            raise _TooLargeError
+        allowance.take(pixels)
+        if opened.has_transparency_data:
+            whole = opened if "A" in opened.getbands() else opened.convert("RGBA")
+            alpha = np.asarray(whole.getchannel("A"))
+            if alpha.min() < 255:
+                return alpha
+        return np.asarray(_of_bytes(opened).convert("L")) if grey else None
 
 
 def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) -> Bytes:
@@ -60,10 +69,20 @@ def read_colours(image: Path | bytes, allowance: Allowance, notes: MaskNotes) ->
     MaskError
         As `read_opacity`.
     """
-    return _read(image, lambda opened: _in_colour(opened, allowance, notes))
+    with _opened(image) as opened:
+        if not allowance.fits(PIXEL_BYTES * opened.width * opened.height):
+            raise _TooLargeError
+        made = _of_bytes(opened).convert("RGB")
+        if max(made.size) > SIDE_MOST:
+            notes.large.append(f"{made.width:,} x {made.height:,}")
+            made.thumbnail((SIDE_MOST, SIDE_MOST), Image.Resampling.BOX)
+        allowance.take(3 * made.width * made.height)
+        return np.asarray(made)
 
 
-def _read(image: Path | bytes, decoded: Callable[[Image.Image], V]) -> V:
+@contextmanager
+def _opened(image: Path | bytes) -> Iterator[Image.Image]:
+    """Open an image; MaskError for whatever is wrong with it, also in the body."""
     name = image.name if isinstance(image, Path) else "its image"
     source = image if isinstance(image, Path) else BytesIO(image)
     try:
@@ -72,7 +91,7 @@ def _read(image: Path | bytes, decoded: Callable[[Image.Image], V]) -> V:
             warnings.simplefilter("ignore")
             warnings.simplefilter("error", Image.DecompressionBombWarning)
             with Image.open(source, formats=FORMATS) as opened:
-                return decoded(opened)
+                yield opened
     except Image.UnidentifiedImageError as error:
         raise MaskError(f"{name} is no {', '.join(FORMATS)}") from error
     except (Image.DecompressionBombError, Image.DecompressionBombWarning, _TooLargeError) as error:
@@ -86,56 +105,11 @@ class _TooLargeError(Exception):
     pass
 
 
-def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
-    """Cache a function, and its MaskErrors."""
-
-    @cache
-    def tried(key: K) -> V | MaskError:
-        try:
-            return read(key)
-        except MaskError as error:
-            return error
-
-    def once(key: K) -> V:
-        found = tried(key)
-        if isinstance(found, MaskError):
-            raise MaskError(str(found))
-        return found
-
-    return once
-
-
-def _decoded(image: Image.Image, allowance: Allowance, grey: bool) -> Bytes | None:
-    if not (grey or image.has_transparency_data):
-        return None
-    pixels = image.width * image.height
-    if not allowance.fits(PIXEL_BYTES * pixels):
-        raise _TooLargeError
-    allowance.take(pixels)
-    if image.has_transparency_data:
-        alpha = np.asarray(
-            (image if "A" in image.getbands() else image.convert("RGBA")).getchannel("A")
-        )
-        if alpha.min() < 255:
-            return alpha
-    if not grey:
-        return None
-    if image.mode.startswith("I;16"):
-        return (np.asarray(image) >> 8).astype(np.uint8)
-    return np.asarray(image.convert("L"))
-
-
-def _in_colour(image: Image.Image, allowance: Allowance, notes: MaskNotes) -> Bytes:
-    if not allowance.fits(PIXEL_BYTES * image.width * image.height):
-        raise _TooLargeError
-    if image.mode.startswith("I;16"):  # which Pillow would clip
-        image = Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
-    image = image.convert("RGB")
-    if max(image.size) > SIDE_MOST:
-        notes.large.append(f"{image.width:,} x {image.height:,}")
-        image.thumbnail((SIDE_MOST, SIDE_MOST), Image.Resampling.BOX)
-    allowance.take(3 * image.width * image.height)
-    return np.asarray(image)
+def _of_bytes(image: Image.Image) -> Image.Image:
+    """Image of 8 bits from one of 16, which Pillow would clip."""
+    if not image.mode.startswith("I;16"):
+        return image
+    return Image.fromarray((np.asarray(image) >> 8).astype(np.uint8))
 
 
 class Texture:
@@ -238,13 +212,13 @@ class MaskNotes:
         self.large: list[str] = []  # sizes of images of colours that are made smaller
         self.gone: list[str] = []  # files of materials that are not there
 
-    def instead(self, material: str) -> _Instead:
+    def instead(self, material: str) -> AbstractContextManager[None]:
         """Note errors within a `with` block; the triangles can be read all the same."""
-        return _Instead(self.unread, material)
+        return _noted(self.unread, material)
 
-    def without_colour(self, material: str) -> _Instead:
+    def without_colour(self, material: str) -> AbstractContextManager[None]:
         """Note errors within a `with` block; the triangles have no colour then."""
-        return _Instead(self.grey, material)
+        return _noted(self.grey, material)
 
     def lines(self) -> list[str]:
         """Return notes, as clauses that follow the file's name."""
@@ -268,21 +242,15 @@ class MaskNotes:
         return out
 
 
-@dataclass
-class _Instead:
-    """Notes errors as what is wrong with a material."""
-
-    unread: dict[str, str]
-    material: str
-
-    def __enter__(self) -> None:
-        pass
-
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> bool:
-        if isinstance(error, Exception):
-            why = str(error) if isinstance(error, MaskError) else "it is broken"
-            self.unread.setdefault(self.material, why)
-        return isinstance(error, Exception)
+@contextmanager
+def _noted(unread: dict[str, str], material: str) -> Iterator[None]:
+    """Note errors as what is wrong with a material."""
+    try:
+        yield
+    except MaskError as error:
+        unread.setdefault(material, str(error))
+    except Exception:
+        unread.setdefault(material, "it is broken")
 
 
 def _some(names: list[str]) -> str:

@@ -15,13 +15,13 @@ from numpy.typing import ArrayLike
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked
-from ..base.words import counted, did_you_mean, printable
+from ..base.words import did_you_mean, plural, printable
 from ..sensor import Pose, Stations, Trajectory
 from ..sensor.calibrations import text_of
 from ..sensor.trajectory import presence_ns, velocities
 from ..sensor.trajectory_files import columns_of_table, head_of_table
 from .actors import AT_ZERO, Actor, one_mesh
-from .mesh import Mesh
+from .scene_mesh import SceneMesh
 from .transform import rotation_about
 
 _LATE_S = 1e-3  # the beams of the last firing are fired a little after the survey's end
@@ -93,7 +93,7 @@ class Robot:
     name: str
     links: tuple[str, ...]
     joints: Mapping[str, Joint]
-    meshes: Mapping[str, Mesh]
+    meshes: Mapping[str, SceneMesh]
 
     def __repr__(self) -> str:
         return f"<Robot {self.name}: {self.summary}>"
@@ -104,12 +104,12 @@ class Robot:
         triangles = sum(len(mesh.faces) for mesh in self.meshes.values())
         verb = "moves" if len(self.moving) == 1 else "move"
         moving = ", ".join(self.moving[:6]) + ", …" * (len(self.moving) > 6)
-        return f"{counted(len(self.links), 'link')}, {counted(triangles, 'triangle')}; " + (
+        return f"{plural(len(self.links), 'link')}, {plural(triangles, 'triangle')}; " + (
             f"{len(self.moving):,} of its joints {verb}: {moving}" if moving else "no joint moves"
         )
 
     @cached_property
-    def _made(self) -> dict[frozenset[str], dict[str, Mesh]]:
+    def _made(self) -> dict[frozenset[str], dict[str, SceneMesh]]:
         return {}  # see `_bodies`
 
     @cached_property
@@ -173,13 +173,13 @@ class Robot:
             for body, mesh in self._bodies(frozenset(without)).items()
         )
 
-    def _bodies(self, without: frozenset[str]) -> dict[str, Mesh]:
+    def _bodies(self, without: frozenset[str]) -> dict[str, SceneMesh]:
         """Return {link that moves by itself: all that is fixed to it}, made once.
 
         Actors that share arrays share a tree. Each is named by its first link with triangles.
         """
         if without not in self._made:
-            parts: dict[str, list[Mesh]] = {}
+            parts: dict[str, list[SceneMesh]] = {}
             names: dict[str, str] = {}
             owner = {self.links[0]: (self.links[0], np.eye(4))}  # {link: its body, its place}
             for link in self.links:

@@ -14,15 +14,15 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Ints32
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked, checked_fields, shown
-from ..base.words import counted
+from ..base.words import plural
 from ..sensor import Pose, Track
 from . import colours as coloured
 from .actors import Actor
 from .colours import Colours, within
-from .instances import Instance, Instances, Part, parts_of
-from .mesh import Cutout, Mesh, points_array, stacked
-from .meshfile import Objects, Opacity, load_objects
-from .rasters import Window
+from .files.meshfile import Objects, OpacityMode, load_objects
+from .files.rasters import Window
+from .scene_instances import Instances, MeshPart, SceneInstance, parts_of
+from .scene_mesh import Cutout, SceneMesh, compacted, points_array, stacked
 from .shapes import seed_objects
 from .transform import Transform
 
@@ -78,8 +78,8 @@ class Scene:
 
     def __repr__(self) -> str:
         sides = " x ".join(f"{side:,.2f}" for side in np.ptp(self.bounds, axis=0))
-        objects = counted(len(self.all_names), "object")
-        return f"<Scene: {objects}, {counted(self.triangles, 'triangle')}, {sides} m>"
+        objects = plural(len(self.all_names), "object")
+        return f"<Scene: {objects}, {plural(self.triangles, 'triangle')}, {sides} m>"
 
     def __post_init__(self) -> None:
         vertices = points_array("the scene", self.vertices)
@@ -125,7 +125,7 @@ class Scene:
         unit: str | None = None,
         up_axis: str | None = None,
         transform: Transform | None = None,
-        opacity: Opacity = "mask",
+        opacity: OpacityMode = "mask",
         colours: bool = False,
         step_m: float | None = None,
         window: Window | None = None,
@@ -154,7 +154,7 @@ class Scene:
             Whether to read base colours and their images (.glb, .gltf, .obj, .dae, .usd, CityJSON
             without images), and colours of vertices (.glb, .gltf, .obj, .ply, .off, .usd).
         step_m, window, epsg
-            Of a raster: see `lidarpool.scene.meshfile.load_objects`.
+            Of a raster: see `lidarpool.scene.files.meshfile.load_objects`.
         assets
             A folder: files that the file names are read from here and below, and from its own
             folder and below.
@@ -199,7 +199,7 @@ class Scene:
 
     @classmethod
     @checked
-    def from_meshes(cls, meshes: Iterable[Mesh | Instance]) -> Scene:
+    def from_meshes(cls, meshes: Iterable[SceneMesh | SceneInstance]) -> Scene:
         """Make a scene of objects, each mesh one object.
 
         Parameters
@@ -215,31 +215,33 @@ class Scene:
         """
         objects = list(meshes)
         for one in objects:
-            if not isinstance(one, (Mesh, Instance)):
+            if not isinstance(one, (SceneMesh, SceneInstance)):
                 raise LidarpoolError(
-                    f"meshes holds {shown(one)}; each must be a Mesh(name, vertices, faces), or an "
-                    "Instance of one."
+                    f"meshes holds {shown(one)}; each must be a SceneMesh(name, vertices, faces), "
+                    "or a SceneInstance of one."
                 )
         if not objects:
             raise LidarpoolError("A scene needs at least one object with triangles.")
-        plain: list[tuple[int, Mesh]] = []  # (object, mesh without masks and voxels)
+        plain: list[tuple[int, SceneMesh]] = []  # (object, mesh without masks and voxels)
         shared: list[tuple[int, int, Floats]] = []  # (object, part, matrix)
-        parts: list[Part] = []
-        known: dict[Mesh, list[int]] = {}  # {mesh of instances: its parts}
+        parts: list[MeshPart] = []
+        known: dict[SceneMesh, list[int]] = {}  # {mesh of instances: its parts}
         for number, one in enumerate(objects):
-            if isinstance(one, Mesh) and not one.cutouts and one.voxels is None:
+            if isinstance(one, SceneMesh) and not one.cutouts and one.voxels is None:
                 plain.append((number, one))
                 continue
-            mesh, matrix = (one, np.eye(4)) if isinstance(one, Mesh) else (one.mesh, one.matrix)
+            mesh, matrix = (
+                (one, np.eye(4)) if isinstance(one, SceneMesh) else (one.mesh, one.matrix)
+            )
             if mesh not in known:
                 made = list(parts_of(mesh))
                 known[mesh] = list(range(len(parts), len(parts) + len(made)))
                 parts += made
             for part in known[mesh]:
-                if isinstance(one, Mesh) and parts[part].mask is None and one.voxels is None:
+                if isinstance(one, SceneMesh) and parts[part].mask is None and one.voxels is None:
                     solid = parts[part]
                     corners = solid.faces.astype(np.int64)
-                    mesh = Mesh(one.name, solid.vertices, corners, colours=solid.colours)
+                    mesh = SceneMesh(one.name, solid.vertices, corners, colours=solid.colours)
                     plain.append((number, mesh))
                 else:
                     shared.append((number, part, matrix))
@@ -322,8 +324,7 @@ class Scene:
         """Names of the objects that stop light only in part, in order."""
         owners = set()
         if (shared := self.instances) is not None:
-            cut = np.array([part.mask is not None for part in shared.parts])
-            owners = set(shared.owner[cut[shared.part]].tolist())
+            owners = set(shared.owners(lambda part: part.mask is not None).tolist())
         own = len(self.names)
         owners |= {own + i for i, actor in enumerate(self.actors) if actor.mesh.cutouts}
         return tuple(name for i, name in enumerate(self.all_names) if i in owners)
@@ -344,8 +345,7 @@ class Scene:
             grey = np.array([image is coloured.GREY for image in own.images])
             found[self.face_object[~grey[own.image]]] = True
         if (shared := self.instances) is not None:
-            some = np.array([part.colours is not None for part in shared.parts])
-            found[shared.owner[some[shared.part]]] = True
+            found[shared.owners(lambda part: part.colours is not None)] = True
         found[len(self.names) :] = [actor.mesh.colours is not None for actor in self.actors]
         return found
 
@@ -354,8 +354,7 @@ class Scene:
         """Whether each object, actors after the others, has voxels: (objects,)."""
         found = np.zeros(len(self.names) + len(self.actors), np.bool_)
         if (shared := self.instances) is not None:
-            some = np.array([part.voxels is not None for part in shared.parts])
-            found[shared.owner[some[shared.part]]] = True
+            found[shared.owners(lambda part: part.voxels is not None)] = True
         return found
 
     @property
@@ -404,23 +403,22 @@ class Scene:
             colours=coloured.joined([self.colours, *(mesh.colours for mesh in meshes)], sizes),
         )
 
-    def meshes(self) -> tuple[Mesh | Instance, ...]:
+    def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
         """Return the objects that have triangles, in world coordinates and in order.
 
         Of an object with masks, each part is one.
         """
         order = np.argsort(self.face_object, kind="stable")
         ends = np.cumsum(np.bincount(self.face_object, minlength=len(self.names)))[:-1]
-        out: list[list[Mesh | Instance]] = [[] for _ in self.names]
+        out: list[list[SceneMesh | SceneInstance]] = [[] for _ in self.names]
         for name, rows, found in zip(self.names, np.split(order, ends), out, strict=True):
             if len(rows):
-                used, faces = np.unique(self.faces[rows], return_inverse=True)
+                points, faces = compacted(self.vertices, self.faces[rows])
                 own = self.colours and self.colours.take(rows)
-                points = self.vertices[used] + self.origin
-                found.append(Mesh(name, points, faces.reshape(-1, 3), colours=own))
+                found.append(SceneMesh(name, points + self.origin, faces, colours=own))
         if (shared := self.instances) is not None:
             meshes = [
-                Mesh(
+                SceneMesh(
                     self.names[shared.owner[np.argmax(shared.part == number)]],
                     part.vertices,
                     part.faces.astype(np.int64),
@@ -434,7 +432,7 @@ class Scene:
                 shared.part, shared.transforms, shared.owner, strict=True
             ):
                 placed = Transform(matrix[:, :3], matrix[:, 3] + self.origin)
-                out[owner].append(Instance(meshes[number], placed, self.names[owner]))
+                out[owner].append(SceneInstance(meshes[number], placed, self.names[owner]))
         return tuple(one for found in out for one in found)
 
     @cached_property

@@ -12,12 +12,12 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 
 from ..base.errors import LidarpoolError, explained
-from .drawn import Drawn
+from .files.meshfile import OWN
 from .glb_file import glb_of
-from .instances import Instance
-from .mesh import stacked
-from .meshfile import OWN
 from .scene import Scene
+from .scene_instances import SceneInstance
+from .scene_mesh import stacked
+from .simplified import Drawn
 
 SUFFIXES = (".ply", ".glb", ".obj")
 
@@ -91,7 +91,7 @@ def _encoded(suffix: str, scene: Scene) -> bytes:
         return glb_of(scene)
     objects = trimesh.Scene()
     for name, parts in groupby(scene.meshes(), lambda one: one.name):
-        flat = [one.flat() if isinstance(one, Instance) else one for one in parts]
+        flat = [one.flat() if isinstance(one, SceneInstance) else one for one in parts]
         vertices, faces = stacked((mesh.vertices, mesh.faces) for mesh in flat)
         objects.add_geometry(trimesh.Trimesh(vertices, faces, process=False), name, name)
     text = export_obj(objects, include_normals=False, include_texture=False)

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats, Ints
-from ..base.errors import LidarpoolError
-from .mesh import Mesh
+from .scene_mesh import SceneMesh
 
 SEED_RADIUS_M = 2.0
 SEED_RINGS = 80
@@ -50,7 +49,7 @@ SEED_OUTLINES: dict[str, tuple[tuple[float, float], ...]] = {
 }  # fmt: skip
 
 
-def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[Mesh, ...]:
+def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tuple[SceneMesh, ...]:
     """Make the six objects of the default survey: sphere, vase, bell, pawn, spindle, bowl.
 
     Each stands on z = 0 at its position in `SEED_POSITIONS`, has a radius of `SEED_RADIUS_M` and
@@ -65,11 +64,11 @@ def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tupl
     for (name, profile), (x, y) in zip(profiles.items(), SEED_POSITIONS, strict=True):
         profile[:, 0] *= SEED_RADIUS_M / profile[:, 0].max()
         mesh = revolve(profile, segments, name=name)
-        meshes.append(Mesh(name, mesh.vertices + np.array([x, y, 0.0]), mesh.faces))
+        meshes.append(SceneMesh(name, mesh.vertices + np.array([x, y, 0.0]), mesh.faces))
     return tuple(meshes)
 
 
-def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
+def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneMesh:
     """Rotate a profile about the z axis to a closed surface.
 
     `profile` (n, 2), n >= 3, has radius and height in metres, from the lower pole on the axis round
@@ -78,20 +77,8 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
 
     The mesh has `2 * (n - 2) * segments` triangles, outward normals, one vertex at each pole and
     none doubled at the seam: it is watertight if the profile does not cross itself.
-
-    Raises
-    ------
-    LidarpoolError
-        If the profile or `segments` is not as above.
     """
     line = np.asarray(profile, dtype=np.float64)
-    if line.ndim != 2 or line.shape[1:] != (2,) or len(line) < 3 or not (line[1:-1, 0] > 0).all():
-        raise LidarpoolError(
-            f"A profile of shape {line.shape} cannot be revolved: it needs three or more "
-            "(radius, height) pairs, with positive radii between its ends."
-        )
-    if segments < 3:
-        raise LidarpoolError(f"segments is {segments}; it must be at least 3.")
     rings = len(line) - 2
     azimuth = 2 * np.pi * np.arange(segments) / segments
     radius, height = line[1:-1].T
@@ -101,7 +88,22 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> Mesh:
     around[..., 2] = height[:, None]
     poles = [[0.0, 0.0, line[0, 1]], [0.0, 0.0, line[-1, 1]]]
     vertices = np.concatenate([around.reshape(-1, 3), poles])
-    return Mesh(name, vertices, _revolved_faces(rings, segments))
+    return SceneMesh(name, vertices, _revolved_faces(rings, segments))
+
+
+def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
+    """Make a ball around zero that is drawn apart at its equator by a height, which may be zero."""
+    angles = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
+    ball, up = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), [0, height / 2]
+    middle = segments // 4
+    profile = np.concatenate([ball[: middle + bool(height)] - up, ball[middle:] + up])
+    return revolve(profile, segments, name)
+
+
+def cylinder(radius: float, height: float, segments: int, name: str) -> SceneMesh:
+    """Make an upright cylinder around zero."""
+    half = height / 2
+    return revolve([(0, -half), (radius, -half), (radius, half), (0, half)], segments, name)
 
 
 def _revolved_faces(rings: int, segments: int) -> Ints:

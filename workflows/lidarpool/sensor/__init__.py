@@ -5,7 +5,7 @@ from .materials import Material
 from .navigation import Gnss, Imu, Navigation
 from .noise import Noise
 from .optics import Optics, Returns
-from .rays import ListedSensor, Prism, PrismSensor
+from .ray_sensors import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, Sensor
 from .survey import Mounted, ScanSpec, Survey
 from .trajectory import Pose, Stations, Track, Trajectory

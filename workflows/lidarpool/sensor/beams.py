@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import told
+from ..base.declared import about
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked, checked_fields
 
@@ -108,9 +108,9 @@ class Head(Protocol):
         """Azimuth of the head at firings, radians: (k,)."""
 
 
-Step = Annotated[float, told("degrees that the head turns in one time step", gt=0, le=360)]
+Step = Annotated[float, about("degrees that the head turns in one time step", gt=0, le=360)]
 Rate = Annotated[float, Field(gt=0, le=1e6)]
-Motion = Literal["sine", "triangle", "sawtooth"]
+MirrorMotion = Literal["sine", "triangle", "sawtooth"]
 Width = Annotated[float, Field(gt=0, le=360)]
 Duty = Annotated[float, Field(gt=0, le=1)]
 
@@ -211,7 +211,7 @@ class Mirror(Spin):
     Azimuth 0 is in the middle of a line.
     """
 
-    motion: Motion = "triangle"  # "sine" and "triangle" swing, "sawtooth" is a polygon
+    motion: MirrorMotion = "triangle"  # "sine" and "triangle" swing, "sawtooth" is a polygon
     width_deg: Width = 60.0  # length of a line
     # Share of each cycle in which it fires: a polygon's facets cover more than is used.
     duty: Duty = 1.0

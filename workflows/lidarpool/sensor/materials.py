@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import Share, TextOrTexts, allowed, told, written_as
+from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.words import did_you_mean
@@ -75,39 +75,39 @@ class Material:
     objects: Annotated[
         str | Sequence[str],
         written_as(TextOrTexts),
-        told("names of objects, with * and ?", min_length=1),
+        about("names of objects, with * and ?", min_length=1),
     ]
     reflectance: Annotated[
-        Share | Literal["texture"] | None,
+        UnitShare | Literal["texture"] | None,
         allowed("0 to 1, or texture"),
-        told(
+        about(
             "share of light that is scattered; by default 0.5, for glass and mirrors "
             "0; texture: the luminance of the colour that was hit"
         ),
     ] = None
-    semantic_class: Annotated[SemanticClass, told("value of the column class", alias="class")] = 0
+    semantic_class: Annotated[SemanticClass, about("value of the column class", alias="class")] = 0
     retro: Annotated[
-        bool, told("whether light returns in its own direction, as from traffic signs")
+        bool, about("whether light returns in its own direction, as from traffic signs")
     ] = False
     transparent: Annotated[
-        Transparent, told("the rest of the light passes through (pass), or is reflected (mirror)")
+        Transparent, about("the rest of the light passes through (pass), or is reflected (mirror)")
     ] = "none"
     scale: Annotated[
-        float, told("with reflectance: texture, a factor of the luminance", gt=0, le=100)
+        float, about("with reflectance: texture, a factor of the luminance", gt=0, le=100)
     ] = 1.0
     material: Annotated[
         str | None,
-        told("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
+        about("instead of reflectance: a material of the table of reflectances", "asphalt, dry"),
     ] = None
     roughness: Annotated[
-        float | None, told("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1)
+        float | None, about("adds a gloss, as of paint or metal; by default none", ge=0.1, le=1)
     ] = None
     metalness: Annotated[
-        Share, told("with roughness: 1 for metals, which scatter by their gloss alone")
+        UnitShare, about("with roughness: 1 for metals, which scatter by their gloss alone")
     ] = 0.0
     refractive_index: Annotated[
         float | None,
-        told(
+        about(
             "with transparent: pass, light is refracted and slower within the closed "
             "surface, as 1.33 for water; by default it goes straight on",
             1.33,
@@ -116,11 +116,11 @@ class Material:
         ),
     ] = None
     attenuation_per_m: Annotated[
-        float, told("with refractive_index, extinction within the surface", ge=0, le=1e6)
+        float, about("with refractive_index, extinction within the surface", ge=0, le=1e6)
     ] = 0.0
     leaf_area_density: Annotated[
         float | None,
-        told(
+        about(
             "the closed surface is full of leaves: their one-sided area, m²/m³; "
             "reflectance is theirs",
             0.8,
@@ -130,7 +130,7 @@ class Material:
     ] = None
     leaf_angle: Annotated[
         LeafAngle,
-        told(
+        about(
             "with leaf_area_density, or of voxels, how leaves are inclined: spherical, "
             "planophile, erectophile, plagiophile, extremophile, uniform, or Campbell's ratio "
             "of axes"

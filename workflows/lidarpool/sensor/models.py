@@ -20,17 +20,17 @@ from ..base.errors import LidarpoolError
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
 from ..base.yamlfile import load_yaml
-from .beams import Beams, Duty, Mirror, Motion, Rate, Spin, Step, Width
+from .beams import Beams, Duty, Mirror, MirrorMotion, Rate, Spin, Step, Width
 from .calibrations import UNUSABLE, Calibration, read_calibration, said
 from .noise import TARGET_REFLECTANCE, THRESHOLD_SIGMAS, Noise
 from .optics import LIGHT_M_NS, Mode, Optics, Returns
-from .rays import ListedSensor, Prism, PrismSensor
+from .ray_sensors import ListedSensor, Prism, PrismSensor
 from .sensor import LineSensor, MaxRange, MinRange, Sensor
 
 _BUILT_IN = files("lidarpool.sensor") / "data"
 
 
-class _Part(BaseModel):
+class _ModelSection(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
@@ -51,19 +51,19 @@ def _numbers(value: Any) -> Any:
 
 
 Numbers = Annotated[tuple[float, ...], BeforeValidator(_numbers)]
-Place = tuple[float, float, float]
+OffsetXYZ = tuple[float, float, float]
 # 55.296 is not exact in binary, nor 500/9 in decimal.
 Exact = Annotated[Fraction, BeforeValidator(lambda value: Fraction(str(value)))]
 Positive = Annotated[float, Field(gt=0)]
 
 
-class BeamTable(_Part):
+class BeamTable(_ModelSection):
     """Beams in the maker's order; see `Beams`."""
 
     elevation_deg: Numbers = ()
     azimuth_deg: Numbers = ()
     time_us: Numbers = ()
-    origin_m: Place | tuple[Place, ...] = ()
+    origin_m: OffsetXYZ | tuple[OffsetXYZ, ...] = ()
 
     def beams(self) -> Beams:
         """Make them; one straight ahead if there are no elevations."""
@@ -83,23 +83,15 @@ class BeamTable(_Part):
         return np.repeat(origin, count, axis=0) if len(origin) == 1 else origin
 
 
-class MirrorPart(_Part):
+class MirrorPart(_ModelSection):
     """See `Mirror`."""
 
-    motion: Motion
+    motion: MirrorMotion
     width_deg: Width
     duty: Duty = 1.0
 
 
-class PrismPart(_Part, Prism):
-    """See `Prism`."""
-
-
-class OpticsPart(_Part, Optics):
-    """See `Optics`."""
-
-
-class Precision(_Part):
+class RangePrecision(_ModelSection):
     """Standard deviation of the ranges of a surface, at right angles."""
 
     sigma_m: Positive
@@ -107,7 +99,7 @@ class Precision(_Part):
     reflectance: Annotated[float, Field(gt=0, le=1)]
 
 
-class Detection(_Part):
+class Detection(_ModelSection):
     """Range at which a share of the pulses on a surface, at right angles, return."""
 
     range_m: Positive
@@ -122,7 +114,7 @@ class Detection(_Part):
         return float(same * max(needed, 0.0) ** 0.5)
 
 
-class Performance(_Part):
+class Performance(_ModelSection):
     """What a data sheet says of a sensor's noise and returns; see `datasheet`.
 
     The precision of ranges is either `range_m` and `range_per_m`, as of `Noise`, or that of two
@@ -131,7 +123,7 @@ class Performance(_Part):
 
     range_m: Annotated[float, Field(ge=0)] | None = None
     range_per_m: Annotated[float, Field(ge=0)] = 0.0
-    precision: tuple[Precision, Precision] | None = None
+    precision: tuple[RangePrecision, RangePrecision] | None = None
     angle_deg: Annotated[float, Field(ge=0)] | None = None
     detection: Detection | None = None
     false_alarms: Annotated[float, Field(gt=0, lt=0.5)] | None = None  # share of pulses
@@ -187,7 +179,7 @@ class Performance(_Part):
         return float(np.sqrt(s - slope * x)), float(np.sqrt(slope))
 
 
-class SensorModel(_Part):
+class SensorModel(_ModelSection):
     """Data file of a sensor. `docs/how-to/sensor.md` describes its fields."""
 
     name: str
@@ -202,8 +194,8 @@ class SensorModel(_Part):
     range_m: tuple[float, float] | None = None
     beams: BeamTable = BeamTable()
     mirror: MirrorPart | None = None
-    prisms: tuple[PrismPart, ...] = ()
-    optics: OpticsPart = OpticsPart()
+    prisms: tuple[Prism, ...] = ()
+    optics: Optics = Optics()
     performance: Performance | None = None
     listed: bool = False
 
@@ -416,15 +408,14 @@ def load_sensor(
         "min_range_m": low if min_range_m is None else min_range_m,
         "max_range_m": high if max_range_m is None else max_range_m,
         "name": described.name if unit is None else f"{described.name}, {unit.file}",
-        "optics": Optics(**described.optics.model_dump()),
+        "optics": described.optics,
     }
     head = Spin(firings, step_deg, rate, described.clockwise, described.zero_deg)
     if unit is not None and (unit.rays is not None or described.listed or described.prisms):
         return _listed(described, unit, head, common)
     beams = described.beams.beams() if unit is None else _calibrated(described, unit)
     if described.prisms:
-        prisms = tuple(Prism(**prism.model_dump()) for prism in described.prisms)
-        return PrismSensor(beams, head, prisms=prisms, **common)
+        return PrismSensor(beams, head, prisms=described.prisms, **common)
     if described.mirror is not None:
         mirror = described.mirror.model_dump()
         head = Mirror(firings, step_deg, rate, zero_deg=described.zero_deg, **mirror)

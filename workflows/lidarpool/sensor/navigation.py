@@ -17,23 +17,26 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from itertools import accumulate
-from typing import Annotated, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import numpy as np
 from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import Seed, told
+from ..base.declared import Seed, about
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .noise import Purpose, named_seed, normal
 from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, velocities
 
+if TYPE_CHECKING:
+    from .survey import Survey
+
 BLOCK = 1 << 14  # samples that are made at a time
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-360, le=360)]
-Place = Annotated[
+GeodeticPosition = Annotated[
     tuple[Latitude, Longitude, Annotated[float, Field(ge=-1e5, le=1e6)]], Strict(False)
 ]
 TurnNoise = Annotated[float, Field(ge=0, le=100)]  # of a gyroscope
@@ -57,27 +60,27 @@ class Imu:
     """
 
     rate_hz: Annotated[
-        float, told("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
+        float, about("samples a second; update_rate of kalibr", ge=0.001, le=100_000)
     ] = 200.0
-    mount: Annotated[Pose, AT_CENTRE, told("its pose in the carrier's axes")] = CENTRE
-    gyroscope_noise_density: Annotated[TurnNoise, told("angle random walk, rad/s/sqrt(Hz)")] = 0.0
+    mount: Annotated[Pose, AT_CENTRE, about("its pose in the carrier's axes")] = CENTRE
+    gyroscope_noise_density: Annotated[TurnNoise, about("angle random walk, rad/s/sqrt(Hz)")] = 0.0
     gyroscope_bias: Annotated[
         TurnNoise,
-        told(
+        about(
             "standard deviation of a bias that wanders about zero (Gauss-Markov of "
             "first order), rad/s"
         ),
     ] = 0.0
-    gyroscope_bias_time_s: Annotated[Correlation, told("its correlation time")] = 300.0
-    gyroscope_random_walk: Annotated[TurnNoise, told("of the bias, rad/s^2/sqrt(Hz)")] = 0.0
+    gyroscope_bias_time_s: Annotated[Correlation, about("its correlation time")] = 300.0
+    gyroscope_random_walk: Annotated[TurnNoise, about("of the bias, rad/s^2/sqrt(Hz)")] = 0.0
     accelerometer_noise_density: Annotated[
-        SpeedNoise, told("velocity random walk, m/s^2/sqrt(Hz)")
+        SpeedNoise, about("velocity random walk, m/s^2/sqrt(Hz)")
     ] = 0.0
     accelerometer_bias: Annotated[
-        SpeedNoise, told("standard deviation of a bias that wanders about zero, m/s^2")
+        SpeedNoise, about("standard deviation of a bias that wanders about zero, m/s^2")
     ] = 0.0
-    accelerometer_bias_time_s: Annotated[Correlation, told("its correlation time")] = 300.0
-    accelerometer_random_walk: Annotated[SpeedNoise, told("of the bias, m/s^3/sqrt(Hz)")] = 0.0
+    accelerometer_bias_time_s: Annotated[Correlation, about("its correlation time")] = 300.0
+    accelerometer_random_walk: Annotated[SpeedNoise, about("of the bias, m/s^3/sqrt(Hz)")] = 0.0
 
 
 @dataclass(frozen=True)
@@ -93,24 +96,24 @@ class Gnss:
         If a number is outside its range.
     """
 
-    rate_hz: Annotated[float, told("positions a second", ge=0.0001, le=1000)] = 10.0
-    mount: Annotated[Pose, AT_CENTRE, told("pose of its antenna in the carrier's axes")] = CENTRE
+    rate_hz: Annotated[float, about("positions a second", ge=0.0001, le=1000)] = 10.0
+    mount: Annotated[Pose, AT_CENTRE, about("pose of its antenna in the carrier's axes")] = CENTRE
     horizontal_m: Annotated[
-        Deviation, told("standard deviation of white noise to the east and north")
+        Deviation, about("standard deviation of white noise to the east and north")
     ] = 0.0
-    vertical_m: Annotated[Deviation, told("the same, up")] = 0.0
+    vertical_m: Annotated[Deviation, about("the same, up")] = 0.0
     drift_horizontal_m: Annotated[
         Deviation,
-        told(
+        about(
             "standard deviation of an error that drifts (Gauss-Markov of first order), "
             "to the east and north"
         ),
     ] = 0.0
-    drift_vertical_m: Annotated[Deviation, told("the same, up")] = 0.0
-    drift_time_s: Annotated[Correlation, told("correlation time of the drift")] = 600.0
+    drift_vertical_m: Annotated[Deviation, about("the same, up")] = 0.0
+    drift_time_s: Annotated[Correlation, about("correlation time of the drift")] = 600.0
     origin: Annotated[
-        Place | None,
-        told(
+        GeodeticPosition | None,
+        about(
             "latitude and longitude, degrees, and ellipsoidal height, metres, of the "
             "world's zero, x to the east and y to the north; by default by cloud.epsg",
             [48.7758, 9.1829, 290.0],
@@ -136,7 +139,7 @@ class Navigation:
 
     imu: Annotated[
         Imu | None,
-        told(
+        about(
             "inertial measurement unit: angular velocities and specific forces in imu.csv, "
             "/imu/data_raw",
             {"rate_hz": 200, "gyroscope_noise_density": 1.7e-4},
@@ -144,35 +147,15 @@ class Navigation:
     ] = None
     gnss: Annotated[
         Gnss | None,
-        told(
+        about(
             "GNSS receiver: positions in gnss.csv, /gnss/fix",
             {"rate_hz": 10, "horizontal_m": 0.02, "drift_horizontal_m": 0.5},
         ),
     ] = None
     gravity_m_s2: Annotated[
-        float, told("gravity, downwards along the world's z axis", ge=-100, le=100)
+        float, about("gravity, downwards along the world's z axis", ge=-100, le=100)
     ] = 9.80665
-    seed: Annotated[Seed, told("the same seed gives the same errors")] = 0
-
-
-class Moving(Protocol):
-    """The part of a `Survey` that is asked here."""
-
-    @property
-    def navigation(self) -> Navigation | None:
-        """Instruments."""
-
-    @property
-    def carrier(self) -> str:
-        """Name of the carrier."""
-
-    @property
-    def path(self) -> Trajectory:
-        """Trajectory of the carrier, of one station."""
-
-    @property
-    def duration_ns(self) -> float:
-        """How long the survey lasts."""
+    seed: Annotated[Seed, about("the same seed gives the same errors")] = 0
 
 
 class ImuSamples(NamedTuple):
@@ -205,7 +188,7 @@ def check_navigation(navigation: Navigation, path: Trajectory, epsg: int | None)
         )
 
 
-def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
+def imu_samples(survey: Survey, block: int = BLOCK) -> Iterator[ImuSamples]:
     """Yield the samples of a survey's IMU, so many at a time; how many changes nothing.
 
     A sample ends at each whole multiple of its interval within the survey.
@@ -248,7 +231,7 @@ def imu_samples(survey: Moving, block: int = BLOCK) -> Iterator[ImuSamples]:
         )
 
 
-def fixes(survey: Moving, block: int = BLOCK) -> Iterator[Fixes]:
+def fixes(survey: Survey, block: int = BLOCK) -> Iterator[Fixes]:
     """Yield the positions of a survey's GNSS receiver, so many at a time, from its start on."""
     navigation, path = survey.navigation, survey.path
     if navigation is None or navigation.gnss is None:

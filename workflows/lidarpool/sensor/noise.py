@@ -18,7 +18,7 @@ from numpy.typing import ArrayLike, NDArray
 from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Indices, Integers
-from ..base.declared import Seed, Share, told
+from ..base.declared import Seed, UnitShare, about
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .materials import at_right_angles
@@ -65,7 +65,6 @@ class Purpose(Enum):
     WALK = 43  # steps of its random walk
     SAMPLES = 50  # stream of the samples of a waveform
     SAMPLE = 51  # noise of a sample
-    CHOICE = 1000  # points of a cloud that are compared
 
 
 @dataclass(frozen=True)
@@ -84,17 +83,19 @@ class Noise:
         If a number is outside its range, or needs a detection range and there is none.
     """
 
-    range_m: Annotated[Metres, told("standard deviation of ranges, metres", 0.02)] = 0.0
+    range_m: Annotated[Metres, about("standard deviation of ranges, metres", 0.02)] = 0.0
     range_per_m: Annotated[
-        float, told("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
+        float, about("standard deviation added for each metre of range", 0.0002, ge=0, le=1)
     ] = 0.0
     angle_deg: Annotated[
-        float, told("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10)
+        float, about("standard deviation of beam directions, in both axes", 0.05, ge=0, le=10)
     ] = 0.0
-    dropout: Annotated[Share, told("share of returns that are lost, whatever their energy")] = 0.0
+    dropout: Annotated[
+        UnitShare, about("share of returns that are lost, whatever their energy")
+    ] = 0.0
     detection_range_m: Annotated[
         float | None,
-        told(
+        about(
             "range at which a surface of 10 % reflectance returns half the pulses; "
             "weaker returns are lost",
             100.0,
@@ -102,17 +103,17 @@ class Noise:
             le=1e8,
         ),
     ] = None
-    seed: Annotated[Seed, told("the same seed gives the same noise")] = 0
+    seed: Annotated[Seed, about("the same seed gives the same noise")] = 0
     overlap_m: Annotated[
         Metres,
-        told(
+        about(
             "from here on the receiver sees the whole beam; nearer, rain, snow, fog "
             "and dust do not return more"
         ),
     ] = 10.0
     range_at_threshold_m: Annotated[
         Metres,
-        told(
+        about(
             "standard deviation of the range of a return at the threshold of "
             "detection, metres; falls as its energy grows, added in squares",
             0.05,
@@ -120,7 +121,7 @@ class Noise:
     ] = 0.0
     walk_m: Annotated[
         float,
-        told(
+        about(
             "range walk: a return 1.65 times as strong as the threshold of detection "
             "appears so much nearer, one 10,000 times as strong 4.3 times as much",
             0.02,
@@ -130,7 +131,7 @@ class Noise:
     ] = 0.0
     false_alarm_hz: Annotated[
         float,
-        told(
+        about(
             "rate of false alarms, dark counts and sun, while the receiver waits for returns",
             200.0,
             ge=0,
@@ -138,8 +139,8 @@ class Noise:
         ),
     ] = 0.0
     stray_light: Annotated[
-        Share,
-        told(
+        UnitShare,
+        about(
             "blooming of retro-reflectors: share of their light that a beam 1 degree "
             "beside them receives; falls with the square of the angle",
             1e-6,
@@ -147,10 +148,10 @@ class Noise:
     ] = 0.0
 
     crosstalk: Annotated[
-        bool, told("whether it receives pulses of the other sensors of the survey")
+        bool, about("whether it receives pulses of the other sensors of the survey")
     ] = False
     velocity_m_s: Annotated[
-        float, told("standard deviation of radial velocities, m/s", ge=0, le=1000)
+        float, about("standard deviation of radial velocities, m/s", ge=0, le=1000)
     ] = 0.0
 
     def __post_init__(self) -> None:

@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats
-from ..base.declared import allowed, told
+from ..base.declared import about, allowed
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .disc import SUBRAYS, Beam, Profile
@@ -26,10 +26,10 @@ Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "all"]
 
 
-Angle = Annotated[float, Field(ge=0, le=1000)]
+AngleMrad = Annotated[float, Field(ge=0, le=1000)]
 # Full angle of a beam's cone, at 1/e² of its maximum; or two, across and up.
 Divergence = Annotated[
-    Angle | Annotated[Sequence[Angle], Field(min_length=2, max_length=2)],
+    AngleMrad | Annotated[Sequence[AngleMrad], Field(min_length=2, max_length=2)],
     allowed("0 to 1000, or two such: [across, up]"),
 ]
 Diameter = Annotated[float, Field(ge=0, le=10)]
@@ -43,19 +43,21 @@ class Optics:
     """Light and resolution of a sensor."""
 
     wavelength_nm: Annotated[
-        float, told("of the laser; 905 if no source states it", ge=200, le=20_000)
+        float, about("of the laser; 905 if no source states it", ge=200, le=20_000)
     ] = 905.0
     divergence_mrad: Annotated[
-        Divergence | None, told("full angle of the beam, or two, across and up; None if unknown")
+        Divergence | None, about("full angle of the beam, or two, across and up; None if unknown")
     ] = None
-    pulse_ns: Annotated[Pulse, told("length of a pulse")] = 5.0
+    pulse_ns: Annotated[Pulse, about("length of a pulse")] = 5.0
     resolution_m: Annotated[
-        Precision, told("of reported ranges: default step for rounding positions")
+        Precision, about("of reported ranges: default step for rounding positions")
     ] = 0.01
     beam_profile: Annotated[
-        Profile, told("how light is spread over the beam, where it has sub-rays")
+        Profile, about("how light is spread over the beam, where it has sub-rays")
     ] = "even"
-    exit_diameter_m: Annotated[Diameter, told("width of the beam where it leaves the sensor")] = 0.0
+    exit_diameter_m: Annotated[Diameter, about("width of the beam where it leaves the sensor")] = (
+        0.0
+    )
 
     def __post_init__(self) -> None:
         if isinstance(self.divergence_mrad, (Sequence, np.ndarray)):
@@ -76,19 +78,19 @@ class Returns:
     """
 
     mode: Annotated[
-        Mode, told("returns reported for a pulse; dual: strongest and last", "dual")
+        Mode, about("returns reported for a pulse; dual: strongest and last", "dual")
     ] = "strongest"
     subrays: Annotated[
         Literal[SUBRAYS],  # type: ignore[valid-type]
-        told("rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance", 1),
+        about("rays in a beam: 1, 7, 19, 37, 61, … 217; auto by performance", 1),
     ] = 1
     divergence_mrad: Annotated[
         Divergence | None,
-        told("full angle of the beam, or two, across and up; by default the sensor's", 3.0),
+        about("full angle of the beam, or two, across and up; by default the sensor's", 3.0),
     ] = None
     pulse_ns: Annotated[
         Pulse | None,
-        told(
+        about(
             "length of the pulse, in waveforms at half of its maximum: surfaces less "
             "than half of it apart are one return; by default the sensor's, or 5",
             5.0,
@@ -96,25 +98,25 @@ class Returns:
     ] = None
     beam_profile: Annotated[
         Profile | None,
-        told("how light is spread over the beam; by default the sensor's, or even", "gaussian"),
+        about("how light is spread over the beam; by default the sensor's, or even", "gaussian"),
     ] = None
     exit_diameter_m: Annotated[
         Diameter | None,
-        told("width of the beam where it leaves the sensor; by default the sensor's, or 0", 0.01),
+        about("width of the beam where it leaves the sensor; by default the sensor's, or 0", 0.01),
     ] = None
     waveform: Annotated[
         Processing,
-        told(
+        about(
             "how returns are found in the waveform: peaks, or gaussian decomposition; "
             "none: hits within half of the pulse are one return"
         ),
     ] = "none"
     sample_ns: Annotated[
-        float, told("time between two samples of the waveform", ge=0.001, le=1000)
+        float, about("time between two samples of the waveform", ge=0.001, le=1000)
     ] = 1.0
     bandwidth_mhz: Annotated[
         float | None,
-        told(
+        about(
             "of the receiver of waveforms, at -3 dB; by default without limit",
             300.0,
             ge=0.1,

@@ -12,17 +12,18 @@ from numpy.typing import ArrayLike
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
-from ..base.declared import told
+from ..base.declared import about
 from ..base.errors import LidarpoolError
 from ..base.validation import checked, checked_fields
 from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
 from .optics import LIGHT_M_NS, Optics
 
-RaysPerRevolution = Annotated[int, told("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
-Layers = Annotated[int, told("for a grid: elevations (rings)", ge=1, le=CHANNELS_MOST)]
-Fov = Annotated[float, told("for a grid: degrees, half of it below the horizon", gt=0, le=180)]
+RaysPerRevolution = Annotated[int, about("for a grid: azimuths in one turn", ge=1, le=10_000_000)]
+Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=CHANNELS_MOST)]
+Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", gt=0, le=180)]
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
+_STEPS_MOST = 1 << 32  # among which turns are looked for: months of time steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,26 +176,12 @@ class Sensor:
         >>> Sensor.grid(step_deg=10).steps_of_turn(2)
         range(72, 108)
         """
-        first, stop = (self._first_step(n, self._steps_in_turn) for n in (number, number + 1))
-        return range(first, stop)
-
-    @cached_property
-    def _steps_in_turn(self) -> int:
-        return self._first_step(1, 1)
-
-    def _first_step(self, number: int, each: int) -> int:
-        """Find the first time step of a turn, if `each` turn has about so many."""
 
         def turn(step: int) -> int:
             return int(self.turns([step])[0])
 
-        low = high = number * each
-        back = ahead = 1
-        while low and turn(low) >= number:
-            low, back = max(0, low - back), 2 * back
-        while turn(high) < number:
-            high, ahead = high + ahead, 2 * ahead
-        return bisect_left(range(high + 1), number, lo=low, key=turn)
+        first, stop = (bisect_left(range(_STEPS_MOST), n, key=turn) for n in (number, number + 1))
+        return range(first, stop)
 
     def directions(self, firings: Ints) -> Floats:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import AwareDatetime, Field, Strict
 
-from ..base.declared import FILLED_IN, Several, told, written_as
+from ..base.declared import FILLED_IN, Several, about, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields, shown
 from ..columns.table import (
@@ -35,7 +35,7 @@ from .weather import EXIT_M, FAINTEST, Air, Weather, reach
 
 STEPS = 36  # default at each pose: one turn of most sensors
 STEPS_MOST = 10_000_000  # along a trajectory
-Steps = Annotated[int, Field(ge=1, le=STEPS_MOST)]
+StepCount = Annotated[int, Field(ge=1, le=STEPS_MOST)]
 OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
 SENSORS_MOST = 255  # the type of the column
 PARTICLES_MOST = 100  # that a pulse may return from
@@ -71,7 +71,7 @@ class Mounted:
     sensor: Sensor
     mount: Pose = CENTRE
     name: str = ""
-    steps: Steps | None = None
+    steps: StepCount | None = None
     returns: Returns | None = None
     noise: Noise | None = None
 
@@ -123,7 +123,7 @@ class CloudOptions:
     keep_every: Annotated[
         int,
         FILLED_IN,
-        told(
+        about(
             "keep every n-th hit of a scan; by default every hit, of a scene with the "
             "default objects every 5th",
             5,
@@ -134,16 +134,16 @@ class CloudOptions:
     precision_m: Annotated[
         Precision,
         FILLED_IN,
-        told("step in metres that points are rounded to; by default the sensor's, or 0.01", 0.01),
+        about("step in metres that points are rounded to; by default the sensor's, or 0.01", 0.01),
     ] = None  # type: ignore[assignment]
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
-        told("world; or sensor: its axes when it fired, as sensor drivers have them"),
+        about("world; or sensor: its axes when it fired, as sensor drivers have them"),
     ] = "world"
     columns: Annotated[
         Sequence[str | Column],
         written_as(Several[Literal[OPTIONAL_NAMES]]),
-        told(
+        about(
             "columns in addition to x, y, z, scan, channel and object: "
             + ", ".join(OPTIONAL_NAMES),
             ["time", "range", "intensity"],
@@ -151,7 +151,7 @@ class CloudOptions:
     ] = ()
     waveform_samples: Annotated[
         int,
-        told(
+        about(
             "samples of the waveform that are recorded around each return, for LAS and "
             "LAZ; 0 for none",
             80,
@@ -161,7 +161,7 @@ class CloudOptions:
     ] = 0
     epsg: Annotated[
         int | None,
-        told(
+        about(
             "EPSG code of the world's coordinate system, for LAS and LAZ, that rasters "
             "are brought to; by default theirs",
             25832,
@@ -172,7 +172,7 @@ class CloudOptions:
     start: Annotated[
         datetime | None,
         written_as(Annotated[AwareDatetime, Strict(False)] | None),
-        told(
+        about(
             "when the survey starts, with its time zone, for LAS, LAZ and bags",
             "2026-11-21T10:00:00Z",
         ),
@@ -229,7 +229,7 @@ class Survey(CloudOptions, Weather):
 
     sensor: Sensor = field(default_factory=Sensor.grid)
     poses: Sequence[Any] = ()
-    steps: Steps | None = None
+    steps: StepCount | None = None
     trajectory: Trajectory | None = None
     sensors: Sequence[Mounted] = ()
     materials: Sequence[Material] = ()

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices
-from ..base.declared import Angle, Triple, short, told, written_as
+from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked_fields, shown
 from .spline import knots_of, on_curve
@@ -35,10 +35,10 @@ class Pose:
     Angles are in degrees, in aerospace order.
     """
 
-    position: Annotated[tuple[float, float, float], written_as(Triple), told("x, y and z, metres")]
-    yaw_deg: Annotated[Angle, told("rotation about z, first")] = 0.0
-    pitch_deg: Annotated[Angle, told("rotation about the new y, second")] = 0.0
-    roll_deg: Annotated[Angle, told("rotation about the new x, last")] = 0.0
+    position: Annotated[tuple[float, float, float], written_as(Triple), about("x, y and z, metres")]
+    yaw_deg: Annotated[AngleDeg, about("rotation about z, first")] = 0.0
+    pitch_deg: Annotated[AngleDeg, about("rotation about the new y, second")] = 0.0
+    roll_deg: Annotated[AngleDeg, about("rotation about the new x, last")] = 0.0
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "position", tuple(map(float, self.position)))
@@ -112,7 +112,7 @@ CENTRE = Pose((0.0, 0.0, 0.0))  # mount of a sensor without a carrier
 class InstrumentPose(Pose):
     """Position and angles of an instrument in the carrier's axes, as a file has them."""
 
-    position: Annotated[Triple, told("x, y and z, metres")] = (0, 0, 0)
+    position: Annotated[Triple, about("x, y and z, metres")] = (0, 0, 0)
 
 
 # A pose in a file whose position may be left out.

@@ -14,7 +14,7 @@ from typing import Annotated, Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Floats
-from ..base.declared import told
+from ..base.declared import about
 from ..base.validation import checked_fields
 from .materials import REFERENCE_M, extinction
 
@@ -47,7 +47,7 @@ class Weather:
 
     visibility_km: Annotated[
         float | None,
-        told(
+        about(
             "meteorological visibility, of fog and haze alone; by default without extinction",
             10.0,
             ge=0.001,
@@ -56,7 +56,7 @@ class Weather:
     ] = None
     fog_lidar_ratio_sr: Annotated[
         float | None,
-        told(
+        about(
             "extinction over back-scatter of what limits visibility_km, for returns "
             "from it: 65 (Hahner et al. 2021), of clean droplets 18.8; by default none return",
             65.0,
@@ -64,12 +64,14 @@ class Weather:
             le=1000,
         ),
     ] = None
-    rain_mm_h: Annotated[float, told("rain; drops return light, and take some", ge=0, le=300)] = 0.0
+    rain_mm_h: Annotated[float, about("rain; drops return light, and take some", ge=0, le=300)] = (
+        0.0
+    )
     snow_mm_h: Annotated[
-        float, told("dry snow, melted; flakes return light, and take some", ge=0, le=50)
+        float, about("dry snow, melted; flakes return light, and take some", ge=0, le=50)
     ] = 0.0
     dust_mg_m3: Annotated[
-        float, told("mineral dust; it returns light, and takes some", ge=0, le=1e5)
+        float, about("mineral dust; it returns light, and takes some", ge=0, le=1e5)
     ] = 0.0
 
     @property

@@ -8,11 +8,10 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from raybeam import Pattern, ScanReturns
 
-from ..base.arrays import Bools, Bytes, Floats, Ints, Ints32, UInts32
+from ..base.arrays import Bools, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..scene.scene import Scene
 from ..sensor import Returns, Sensor, Survey
 from ..sensor.disc import Beam
@@ -51,7 +50,7 @@ class Echoes(ScanReturns):
     # (k,): full width at half maximum in the waveform, ns, and height; None without waveforms.
     width: Floats | None = None
     amplitude: Floats | None = None
-    waveform: NDArray[np.void] | None = None  # (k,): recorded, but for the location
+    waveform: Records | None = None  # (k,): recorded, but for the location
 
 
 class EchoCaster:

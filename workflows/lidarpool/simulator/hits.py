@@ -7,9 +7,19 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, Bools, Bytes, Floats, Indices, Integers, Ints, Ints32, UInts32
+from ..base.arrays import (
+    AnyArray,
+    Bools,
+    Bytes,
+    Floats,
+    Indices,
+    Integers,
+    Ints,
+    Ints32,
+    Records,
+    UInts32,
+)
 from ..columns.table import CAUSES
 
 NO_SURFACE = -1  # triangle and object of what is no surface
@@ -36,7 +46,7 @@ class Hits(NamedTuple):
     velocity: Floats | None = None  # radial, m/s, if a column has it; NaN if unknown
     # Full width at half maximum in the waveform, ns; None if returns are made without.
     width: Floats | None = None
-    waveform: NDArray[np.void] | None = None  # of returns: recorded, see `recorded`
+    waveform: Records | None = None  # of returns: recorded, see `recorded`
 
     def take(self, rows: Bools | Indices) -> Hits:
         """Select some of them."""

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, UInts32
+from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..columns.table import Column
 from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
@@ -335,7 +335,7 @@ class BatchReturns:
         return self.found.width
 
     @property
-    def waveform(self) -> NDArray[np.void]:
+    def waveform(self) -> Records:
         """Recorded waveform, see `lidarpool.columns.waveforms.record`."""
         made = self.found.waveform
         assert made is not None  # or there would be no such column

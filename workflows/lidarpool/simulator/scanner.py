@@ -262,7 +262,7 @@ class Scanner:
         Parameters
         ----------
         name
-            Of an actor, or of an object that is an `Instance` in the scene, such as a copy of a
+            Of an actor, or of an object that is a `SceneInstance` in the scene, such as a copy of a
             scenario.
         pose
             Where it stands from now on: of its mesh's own axes, in the scene's local coordinates.
@@ -281,8 +281,8 @@ class Scanner:
         if 0 <= number < standing and self._movable[number]:
             if path.moves:
                 raise LidarpoolError(
-                    f"{name!r} is an Instance, which stands still during a sweep: give a pose, or "
-                    "make it an Actor."
+                    f"{name!r} is a SceneInstance, which stands still during a sweep: give a pose, "
+                    "or make it an Actor."
                 )
             self._move_instance(number, path.pose(0))
             return
@@ -290,9 +290,7 @@ class Scanner:
             names = [*list(self._numbers)[standing:], *compress(scene.names, self._movable)]
             hint = did_you_mean(name, names) or f" There are {', '.join(names[:5]) or 'none'}."
             if number >= 0:
-                hint = (
-                    " It is part of the scene, which stands still: make it an Actor or an Instance."
-                )
+                hint = " It is part of the standing scene: make it an Actor or a SceneInstance."
             raise LidarpoolError(f"There is no actor or instance {name!r}.{hint}")
         with self._lock:
             self._actors[number - standing] = replace(

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices
-from ..scene.instances import Instances
+from ..scene.scene_instances import Instances
 
 BLOCK_RAYS = 1 << 13  # that go through grids at a time, to fit a cache
 _LEVEL = 1e-30  # along an axis, light this slow meets no other voxel

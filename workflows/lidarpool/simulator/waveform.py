@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import Floats, Ints
+from ..base.arrays import Floats, Ints, Records
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import Purpose, normal, raw
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
@@ -439,7 +439,7 @@ def recorded(
     each: int,
     count: int,
     noise: tuple[float, int, Keys] | None = None,
-) -> NDArray[np.void]:
+) -> Records:
     """Record the waveform around each return, `count` samples: (n,), see `record`.
 
     A window begins where the echo of its first return does, and returns of the same pulse share it

@@ -29,9 +29,9 @@ from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
 from ..scene.actors import shapes_of
-from ..scene.instances import Instances, Part, parts_of
-from ..scene.mesh import Mesh as ActorMesh
 from ..scene.scene import Scene
+from ..scene.scene_instances import Instances, MeshPart, parts_of
+from ..scene.scene_mesh import SceneMesh as ActorMesh
 from ..sensor import Trajectory
 from ..sensor.trajectory import presence_ns
 from .motion import Clock, Poses, into_axes, products
@@ -263,7 +263,7 @@ def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCa
     )
 
 
-def _mesh_of(part: Part) -> Mesh:
+def _mesh_of(part: MeshPart) -> Mesh:
     opacity = None if part.mask is None or part.uv is None else Opacity(part.mask, part.uv)
     return Mesh(part.vertices, part.faces, opacity)
 

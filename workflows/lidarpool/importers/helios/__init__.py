@@ -1,5 +1,5 @@
 """Surveys of HELIOS++ as scenarios."""
 
-from .survey import Imported, import_survey
+from .survey_xml import Imported, import_survey
 
 __all__ = ["Imported", "import_survey"]

@@ -1,0 +1,157 @@
+"""A page in Dask's dashboard: partitions, stages, workers and pipes, as tables.
+
+The scheduler makes it, and it reloads every two seconds, without scripts.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+from distributed import Client
+from distributed.diagnostics.plugin import SchedulerPlugin
+from tornado import web
+from tornado.template import Template
+
+from .errors import PoolError
+from .fence import fences_of
+from .internals.scheduler import serve, serve_no_longer
+from .pipe import pipes_of
+from .stats import NAME as STATISTICS
+from .stats import StageStats, forget_statistics, running_on, slots_of, statistics_of, stats_of
+from .steward import NAME as STEWARD
+from .workers import on_scheduler
+
+NAME = "poolpart-page"
+PATH = "partitions"
+
+# Names come from users: tornado escapes all that is written into a template.
+_PAGE = Template("""<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta http-equiv="refresh" content="2">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<title>Partitions</title>
+<style>
+:root { color-scheme: light dark; }
+body { max-width: 70rem; margin: 1.5rem auto; font: 14px/1.5 system-ui, sans-serif; }
+table { border-collapse: collapse; margin-bottom: 2rem; font-variant-numeric: tabular-nums; }
+caption { text-align: left; font-size: 1.2rem; font-weight: 600; }
+th, td { padding: .2rem 1rem .2rem 0; border-bottom: 1px solid #8885; text-align: right; }
+th:first-child, td:first-child { text-align: left; }
+</style>
+{% for title, head, rows in tables %}{% if rows %}<table>
+<caption>{{ title }}</caption>
+<tr>{% for cell in ["", *head] %}<th>{{ cell }}</th>{% end %}</tr>
+{% for row in rows %}<tr>{% for cell in row %}<td>{{ str(cell)[:200] }}</td>{% end %}</tr>
+{% end %}</table>
+{% end %}{% end %}""")
+_COUNTS = ("waiting", "queued", "running", "done", "failed", "seconds")
+_OF_A_WORKER = ("partition", "slots", "busy", "tasks given", "status", "address")
+
+
+def page_of(scheduler: Any) -> bytes:
+    """HTML of the current page."""
+    workers = list(scheduler.workers.values())
+    names = {name for worker in workers for name, slots in worker.resources.items() if slots}
+    names |= fences_of(scheduler) | {name for name, _ in statistics_of(scheduler).ended if name}
+    partitions, stages, pipes = [], [], []
+    for p in stats_of([*sorted(names), ""], scheduler):
+        title = f"{_shown(p.name)}{' (exclusive)' * p.exclusive}"
+        partitions.append([title, p.workers, p.slots, p.busy, *_counts(p)])
+        stages += [[name, _shown(p.name), *_counts(stage)] for name, stage in p.stages.items()]
+    for name, pipe in pipes_of(scheduler).items():
+        state = f"failed: {pipe.failure}" if pipe.failure else "closed" if pipe.closed else "open"
+        pipes.append([name, len(pipe.items), state])
+    tables = [
+        ("Partitions", ["workers", "slots", "busy", *_COUNTS], partitions),
+        ("Stages", ["partition", *_COUNTS], stages),
+        ("Workers", _OF_A_WORKER, [_worker(worker) for worker in workers]),
+        ("Pipes", ["depth", "state"], pipes),
+    ]
+    return _PAGE.generate(tables=tables)
+
+
+def _shown(partition: str) -> str:
+    return partition or "remainder"
+
+
+def _counts(stats: StageStats) -> list[object]:
+    return [*(getattr(stats, count) for count in _COUNTS[:-1]), f"{stats.seconds:.1f}"]
+
+
+def _worker(worker: Any) -> list[object]:
+    partition = next((name for name, slots in worker.resources.items() if slots), "")
+    slots, busy = slots_of(worker, partition), running_on(worker, partition)[1]
+    given, status = len(worker.processing), worker.status.name
+    return [worker.name, _shown(partition), slots, busy, given, status, worker.address]
+
+
+class _Handler(web.RequestHandler):
+    """Sends the page; the browser may load and run nothing else."""
+
+    def initialize(self, scheduler: Any) -> None:
+        self.scheduler = scheduler
+
+    def get(self) -> None:
+        self.set_header("Cache-Control", "no-store")
+        self.set_header("Content-Security-Policy", "default-src 'none'; style-src 'unsafe-inline'")
+        self.finish(page_of(self.scheduler))
+
+
+class PageOwners(SchedulerPlugin):
+    """Serves the page, until the last client that wanted it has gone."""
+
+    name = NAME
+
+    def __init__(self, scheduler: Any) -> None:
+        self.owners: set[str] = set()  # clients, by id
+        self.began_to_count = STATISTICS not in scheduler.plugins
+        # A `dask scheduler --dashboard-prefix` is part of the path.
+        handlers = [(r"(?:/.*)?/" + PATH, _Handler, {"scheduler": scheduler})]
+        self.page = web.Application(handlers)
+        serve(scheduler, self.page)
+
+    def remove_client(self, scheduler: Any, client: str) -> None:
+        """Record that a client has gone, or no longer wants the page."""
+        self.owners.discard(client)
+        if not self.owners:
+            close_page(scheduler)
+            if self.began_to_count and STEWARD not in scheduler.plugins:
+                forget_statistics(scheduler)
+
+
+def partitions_page(client: Client) -> str:
+    """Add the page to the dashboard of the client's cluster, see `Pool.page`; returns its URL."""
+    on_scheduler(client, _open, owner=client.id)
+    try:
+        link = client.dashboard_link
+    except KeyError:  # no such service
+        link = None
+    if not link:
+        raise PoolError(
+            f"The scheduler at {client.scheduler.address} has no HTTP server for a page: start "
+            "it with a dashboard address, such as 127.0.0.1:8787."
+        )
+    return f"{link.removesuffix('/').removesuffix('/status')}/{PATH}"
+
+
+async def _open(owner: str, dask_scheduler: Any = None) -> None:
+    if owner not in dask_scheduler.clients:  # killed, and already removed
+        return
+    if NAME not in dask_scheduler.plugins:
+        dask_scheduler.add_plugin(PageOwners(dask_scheduler))
+    dask_scheduler.plugins[NAME].owners.add(owner)
+    statistics_of(dask_scheduler)
+
+
+async def leave_page(owner: str, dask_scheduler: Any = None) -> None:
+    """Remove the page, unless others want it, as when its client leaves; on the scheduler."""
+    if NAME in dask_scheduler.plugins:
+        dask_scheduler.plugins[NAME].remove_client(dask_scheduler, owner)
+
+
+def close_page(scheduler: Any) -> None:
+    """Stop serving the page."""
+    if NAME in scheduler.plugins:
+        serve_no_longer(scheduler, scheduler.plugins[NAME].page)
+        scheduler.remove_plugin(NAME)

@@ -1,0 +1,299 @@
+"""What runs in the event loop of a scheduler: placing, moving and retiring, requests, pages."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import Counter, defaultdict
+from collections.abc import Callable, Collection, Iterable
+from contextlib import suppress
+from typing import Any
+
+from distributed import Status
+from distributed.core import clean_exception
+from distributed.protocol.pickle import dumps
+from distributed.protocol.serialize import Serialize, Serialized, deserialize
+from tornado import web
+
+Resources = dict[str, float]
+
+
+# -- where the scheduler places tasks ----------------------------------------------------
+
+
+def show(scheduler: Any, worker: Any, resources: Resources) -> None:
+    """Let the scheduler place tasks by these resources of a worker, and no others."""
+    for name in worker.resources.keys() | resources.keys():
+        declaring = scheduler.resources.setdefault(name, {})
+        declaring.pop(worker.address, None)
+        if name in resources:
+            declaring[worker.address] = resources[name]
+        elif not declaring:
+            del scheduler.resources[name]
+    worker.resources = dict(resources)
+    recount(worker)
+
+
+def recount(worker: Any) -> None:
+    """Recount the resources in use.
+
+    Dask forgets them when a worker declares something while it is busy, and counts a task
+    that was moved by work stealing against the worker that it was moved from.
+    """
+    # Also resources that it no longer declares: a stolen task may still come.
+    worker.used_resources = defaultdict(float, dict.fromkeys(worker.resources, 0))
+    for task in worker.processing:
+        for name, quantity in (task.resource_restrictions or {}).items():
+            worker.used_resources[name] += quantity
+
+
+def wake(scheduler: Any, worker: Any) -> None:
+    """Send tasks that wait for such a worker to it, as the scheduler does when one joins.
+
+    The scheduler does not when a running worker gets a resource: the tasks would wait for ever.
+    """
+    if worker in scheduler.running:
+        stimulus = f"poolpart-{worker.address}-{time.time()}"
+        scheduler.transitions(
+            scheduler.bulk_schedule_unrunnable_after_adding_worker(worker), stimulus
+        )
+
+
+def open_to_all(scheduler: Any, worker: Any) -> None:
+    """Send tasks to a worker that a fence no longer closes to them."""
+    scheduler.check_idle_saturated(worker)
+    if worker.status is Status.running:
+        wake(scheduler, worker)
+        scheduler.stimulus_queue_slots_maybe_opened(stimulus_id=f"poolpart-opened-{time.time()}")
+
+
+def asks_for(task: Any, names: Collection[str]) -> bool:
+    """Whether a task takes a slot of one of these partitions."""
+    return not (task.resource_restrictions or {}).keys().isdisjoint(names)
+
+
+def lift_restrictions(scheduler: Any, names: Collection[str]) -> None:
+    """Let any worker recompute results that are still held, if they are lost.
+
+    No worker has the task's resource any more: the task would wait for ever.
+    """
+    for task in scheduler.tasks.values():
+        if asks_for(task, names):
+            kept = {n: q for n, q in task.resource_restrictions.items() if n not in names}
+            task.resource_restrictions = kept or None
+
+
+# -- moving waiting tasks, by the protocol of work stealing --------------------------------
+#
+# A worker gives up a task on request unless the task runs; then another worker gets it.
+
+
+def held_by(scheduler: Any, worker: Any, names: Collection[str]) -> list[str]:
+    """Keys of a worker's tasks that need these resources, and of those on their way there."""
+    tasks = {task for task in worker.processing if asks_for(task, names)}
+    if stealing := scheduler.extensions.get("stealing"):
+        moves = stealing.in_flight.items()
+        tasks |= {t for t, m in moves if m["thief"] is worker and asks_for(t, names)}
+    return [task.key for task in tasks]
+
+
+def hand_off(scheduler: Any, worker: Any, names: Collection[str], asked: set[Any]) -> None:
+    """Move a worker's tasks that have not started to other members of their partition.
+
+    A task that no other worker may take stays, and ends here. `names` are the partitions that the
+    worker leaves; `asked` are tasks that were requested already, and is extended.
+    """
+    stealing = scheduler.extensions.get("stealing")
+    if stealing is None:
+        return
+    given = Counter[Any]()  # by new worker: the scheduler counts a task when the old one agrees
+    for task in list(worker.processing - worker.long_running):
+        if task in asked or task.actor or not asks_for(task, names):
+            continue
+        asked.add(task)
+        if others := (scheduler.valid_workers(task) or set()) - {worker}:
+            thief = min(others, key=lambda o: (len(o.processing) + given[o]) / o.nthreads)
+            given[thief] += 1
+            stealing.move_task_request(task, worker, thief)
+
+
+# -- workers that a cluster gives back ----------------------------------------------------
+#
+# From the step of the event loop in which one is found idle, it gets no tasks. What
+# `retire_workers` does comes later: it waits for a lock, and for its turn.
+
+
+def is_idle(scheduler: Any, worker: Any) -> bool:
+    """Whether nothing is lost with a worker: it has no task, and no result that is only there."""
+    if worker.status is not Status.running or worker.processing or worker.actors:
+        return False
+    stealing = scheduler.extensions.get("stealing")
+    moves = stealing.in_flight.values() if stealing else ()
+    if any(move["thief"] is worker for move in moves):  # a task is on its way
+        return False
+    return all(len(task.who_has) > 1 for task in worker.has_what)
+
+
+def takes_tasks(worker: Any) -> bool:
+    """Whether a worker gets tasks, or will in a moment: one that joins is not ready at once."""
+    return worker.status in (Status.running, Status.init)
+
+
+def shut(scheduler: Any, worker: Any) -> None:
+    """Let a worker get no more tasks."""
+    stimulus = f"poolpart-shut-{time.time()}"
+    scheduler.handle_worker_status_change(Status.closing_gracefully, worker, stimulus)
+
+
+def reopen(scheduler: Any, worker: Any) -> None:
+    """Let a worker get tasks again that `shut`, or a retirement in vain, has kept from it."""
+    if scheduler.workers.get(worker.address) is worker:
+        stimulus = f"poolpart-reopened-{time.time()}"
+        message = {"op": "worker-status-change", "status": "running", "stimulus_id": stimulus}
+        scheduler.stream_comms[worker.address].send(message)
+        scheduler.handle_worker_status_change(Status.running, worker, stimulus)
+
+
+async def retire(scheduler: Any, workers: Collection[Any]) -> bool:
+    """Close workers; False if some stay, because they have results that nobody else can take."""
+    addresses = [worker.address for worker in workers]
+    done = await scheduler.retire_workers(workers=addresses, close_workers=True, remove=True)
+    return len(done) == len(addresses)
+
+
+def turn_away(scheduler: Any, worker: Any) -> None:
+    """Close a worker that is just joining, before it gets tasks."""
+    shut(scheduler, worker)
+    scheduler.close_worker(worker.address)
+
+
+def is_bound(task: Any) -> bool:
+    """Whether a task may run on certain workers only."""
+    return bool(task.worker_restrictions or task.host_restrictions) and not task.loose_restrictions
+
+
+def waiting_for_workers(scheduler: Any) -> Collection[Any]:
+    """Tasks that could run, and for which there is no worker."""
+    tasks: Collection[Any] = scheduler.unrunnable
+    return tasks
+
+
+async def ask_of_cluster(cluster: Any, function: Callable[..., Any], **arguments: Any) -> Any:
+    """Call `function(**arguments, dask_scheduler=…)` on a cluster's scheduler, without a client."""
+    packed = {"function": dumps(function), "args": dumps(()), "kwargs": dumps(arguments)}
+    answer = await cluster.scheduler_comm.run_function(**packed, wait=True)
+    if answer["status"] != "OK":
+        raise clean_exception(**answer)[1]
+    return _unpacked(answer["result"])
+
+
+async def call(scheduler: Any, address: str, function: Callable[..., Any], **arguments: Any) -> Any:
+    """Call a function in the event loop of a worker, passed as `dask_worker`.
+
+    OSError if nobody answers there, or the function raises something.
+    """
+    answer = await scheduler.rpc(address).run(function=dumps(function), kwargs=dumps(arguments))
+    if answer["status"] != "OK":
+        raise OSError(answer["exception_text"])
+    return _unpacked(answer["result"])
+
+
+def _unpacked(result: Any) -> Any:
+    """Unpack a reply, which may come as it is: as bytes, or unpacked from the same process."""
+    if isinstance(result, Serialized):
+        return deserialize(result.header, result.frames)
+    return result.data if isinstance(result, Serialize) else result
+
+
+def tell_of_plugin(scheduler: Any, name: str, plugin: bytes | None) -> list[asyncio.Future[Any]]:
+    """Give a plugin to all workers, also later ones before they get tasks, or take it from all.
+
+    Returns the requests under way. A worker that does not answer, at the end of a cluster, is left.
+    """
+
+    # Nested, so that it is sent by value. A worker that is closing takes its plugins off itself;
+    # of two that take one off, Dask's writes a traceback into the log.
+    def remove(dask_worker: Any = None) -> None:
+        closing = dask_worker.status.name in ("closing", "closed")
+        if not closing and (found := dask_worker.plugins.pop(name, None)):
+            found.teardown(dask_worker)
+
+    async def tell(address: str) -> None:
+        with suppress(OSError, RuntimeError):  # `Scheduler.broadcast` would print it
+            if plugin is None:
+                await call(scheduler, address, remove)
+            else:
+                await getattr(scheduler.rpc(address), "plugin-add")(name=name, plugin=plugin)
+
+    if plugin is None:
+        scheduler.worker_plugins.pop(name, None)
+    else:
+        scheduler.worker_plugins[name] = plugin
+    # Each by itself: one that is stopped keeps none of the others.
+    return [asyncio.ensure_future(tell(address)) for address in scheduler.workers]
+
+
+# -- requests to a scheduler, which pipes are made of -------------------------------------
+#
+# `run_on_scheduler` pickles its function for each request, which takes twice the time of a handler.
+
+
+def handlers_of(scheduler: Any) -> dict[str, Any]:
+    """Handlers of a scheduler, by request; they and their callers exchange plain data."""
+    handlers: dict[str, Any] = scheduler.handlers
+    return handlers
+
+
+class QueueAndVariable:
+    """A `distributed.Queue` and a `distributed.Variable` of one name, used on their scheduler.
+
+    The queue has no limit: what puts and takes here never waits.
+    """
+
+    def __init__(self, scheduler: Any, name: str) -> None:
+        self._queues = scheduler.extensions["queues"]
+        self._variables = scheduler.extensions["variables"]
+        self.name = name
+        self._queues.create(name=name)
+        self._queue = self._queues.queues[name]
+
+    @staticmethod
+    def exists(scheduler: Any, name: str) -> bool:
+        """Whether the cluster has a queue or a variable of a name."""
+        extensions = scheduler.extensions
+        return name in extensions["queues"].queues or name in extensions["variables"].variables
+
+    def __len__(self) -> int:
+        return int(self._queue.qsize())
+
+    def put(self, items: Iterable[bytes]) -> None:
+        """Put items into the queue."""
+        for item in items:
+            self._queue.put_nowait({"type": "msgpack", "value": item})
+
+    def take(self) -> list[bytes]:
+        """Take all items out of the queue."""
+        return [self._queue.get_nowait()["value"] for _ in range(len(self))]
+
+    def set(self, value: dict[str, Any]) -> None:
+        """Set the variable to plain data."""
+        self._variables.variables[self.name] = {"type": "msgpack", "value": value}
+
+    def delete(self) -> None:
+        """Delete both, whoever refers to them."""
+        while self.name in self._queues.queues:
+            self._queues.release(name=self.name, client="poolpart")
+        self._variables.variables.pop(self.name, None)
+
+
+# -- the scheduler's HTTP server ---------------------------------------------------------
+
+
+def serve(scheduler: Any, application: web.Application) -> None:
+    """Add pages to the scheduler's HTTP server."""
+    scheduler.http_application.add_application(application)
+
+
+def serve_no_longer(scheduler: Any, application: web.Application) -> None:
+    """Remove them."""
+    scheduler.http_application.applications.remove(application)

@@ -1,0 +1,99 @@
+"""What runs on a worker: the slots that it declares, and those that a task lends."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from distributed.worker import thread_state
+from distributed.worker_state_machine import UnpauseEvent
+
+from .scheduler import Resources
+
+
+def has_running_tasks(dask_worker: Any = None) -> bool:
+    """Whether a worker runs anything, also cancelled tasks, which its scheduler has forgotten."""
+    return bool(dask_worker.state.all_running_tasks)
+
+
+# -- what a worker declares --------------------------------------------------------------
+
+
+class _Available(dict[str, float]):
+    """Slots that a worker has available: 0, rather than an error, of what it does not declare.
+
+    The request to declare and tasks use different connections: a cancelled task may still be on
+    its way, and a worker would break down if it got a task for an unknown resource.
+    """
+
+    def __missing__(self, name: str) -> float:
+        return 0.0
+
+
+def declare_on_worker(resources: Resources, dask_worker: Any = None) -> bool:
+    """Declare these resources, and none of any other; runs on a worker.
+
+    Returns False if tasks still hold a resource that is removed. Such a task may be cancelled but
+    still running, and unknown to the scheduler.
+    """
+    state = dask_worker.state
+    total, available = state.total_resources, state.available_resources
+    # Not what is available: a task may have lent its slots, and takes them back.
+    held = {name for task in state.all_running_tasks for name in resources_of(task)}
+    if held & (total.keys() - resources.keys()):
+        return False
+    left = {name: available.get(name, 0) - total.get(name, 0) for name in resources}
+    state.available_resources = _Available({n: q + left[n] for n, q in resources.items()})
+    state.total_resources = dict(resources)
+    return True
+
+
+def resources_of(task: Any) -> Resources:
+    """Resources that a task of this worker takes while it runs."""
+    return {name: slots for name, slots in (task.resource_restrictions or {}).items() if slots}
+
+
+def resources_here(worker: Any) -> tuple[str, ...]:
+    """Names of the resources that a worker has; runs on the worker."""
+    return tuple(sorted(name for name, slots in worker.state.total_resources.items() if slots))
+
+
+# -- slots that a task lends while it waits -------------------------------------------------
+#
+# What Dask does when a task secedes and rejoins, also several times: the worker counts it as
+# long-running from the first time to its end, so that a task in its place may start but have to
+# wait for a thread; its resources stay taken throughout.
+
+
+def task_of_thread() -> tuple[Any, Any] | None:
+    """Worker and state of the task that runs in this thread; None in any other thread."""
+    if (key := getattr(thread_state, "key", None)) is None:
+        return None
+    worker = thread_state.execution_state["worker"]
+    task = worker.state.tasks.get(key)  # an actor's method is no task
+    return None if task is None else (worker, task)
+
+
+def free_slots(worker: Any, slots: Resources) -> None:
+    """Let waiting tasks of a worker have these slots; runs in its event loop."""
+    for name, number in slots.items():
+        worker.state.available_resources[name] += number
+    if worker.state.running:  # or it is paused, and starts them when it goes on
+        worker.handle_stimulus(UnpauseEvent(stimulus_id=f"poolpart-lent-{time.time()}"))
+
+
+def take_slots(worker: Any, slots: Resources) -> None:
+    """Keep these slots from waiting tasks, also if there are fewer now; runs in its event loop."""
+    for name, number in slots.items():
+        worker.state.available_resources[name] -= number
+
+
+def slots_here(worker: Any, name: str) -> tuple[float, float]:
+    """Slots of a worker that are available, below 0 if reserved, and all."""
+    return worker.state.available_resources[name], worker.state.total_resources[name]
+
+
+def answer_to(worker: Any, question: str, answer: Callable[..., Any]) -> None:
+    """Add a handler to a worker, unless it has it."""
+    worker.handlers.setdefault(question, answer)

@@ -1,0 +1,122 @@
+"""Options, output and logs of several commands."""
+
+from __future__ import annotations
+
+import json
+import logging
+import sys
+import warnings
+from collections.abc import Callable, Iterable, Mapping
+from functools import partial, reduce, wraps
+from pathlib import Path
+from typing import Any
+
+import click
+
+from ..base.storage import Storage, is_url
+from ..base.vocabulary import BACKENDS
+
+Command = Callable[..., None]
+
+
+class StoragePath(click.Path):
+    """A folder or file, or the storage of a URL."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(path_type=Path, **options)
+
+    def convert(self, value: Any, param: click.Parameter | None, ctx: click.Context | None) -> Any:
+        """Give a Path, or a Storage."""
+        return Storage.at(value) if is_url(value) else super().convert(value, param, ctx)
+
+
+flag = partial(click.option, is_flag=True)
+out = click.option(
+    "--out",
+    type=StoragePath(),
+    default=Path("lidarpool-out"),
+    show_default=True,
+    help="Folder for the results, made if it does not exist, or a URL such as s3://bucket/run.",
+)
+backend = click.option(
+    "--backend",
+    type=click.Choice(BACKENDS),
+    help="Ray caster of stage 2; by default the scenario's, else the fastest available.",
+)
+job = click.option(
+    "--job", "number", type=click.IntRange(0), metavar="N", help="Of a campaign: this job alone."
+)
+no_plan = flag("--no-plan", help="Leave out path planning.")
+cluster = click.option(
+    "--cluster",
+    metavar="FILE",
+    type=click.Path(path_type=Path),
+    help="Start this cluster for the run: Slurm, PBS, SSH; see docs/how-to/queues.md.",
+)
+
+
+overwrite = flag("--overwrite", help="Replace existing files.")
+as_json = flag("--json", "as_json", help="Print the figures as one JSON document.")
+result = click.argument("result", metavar="FOLDER", type=StoragePath())
+copies = click.option(
+    "--out", type=StoragePath(file_okay=False), help="Folder for the files.  [default: FOLDER]"
+)
+
+
+def together(*added: Callable[[Command], Command]) -> Callable[[Command], Command]:
+    """Return what adds options to a command, in their order."""
+    return lambda command: reduce(lambda made, option: option(made), reversed(added), command)
+
+
+def scheduler(command: Command) -> Command:
+    """Add --scheduler and its certificates, which the command gets as `scheduler` and `files`."""
+
+    @wraps(command)
+    def with_files(*arguments: Any, **given: Any) -> None:
+        from ..run.connection import TlsFiles
+
+        if given.get("cluster") is not None and given["scheduler"] is not None:
+            raise click.UsageError(
+                "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
+            )
+        files = TlsFiles(*(given.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
+        if any(files) and given["scheduler"] is None:
+            raise click.UsageError(
+                "--tls-ca, --tls-cert and --tls-key are for the cluster of --scheduler: give its "
+                "address, tls://host:8786."
+            )
+        command(*arguments, files=files, **given)
+
+    file = click.Path(exists=True, dir_okay=False, path_type=Path)
+    for name, what in (
+        ("key", "Private key of that certificate, if its file does not hold it."),
+        ("cert", "Own certificate for an encrypted cluster, a PEM file."),
+        ("ca", "Certificate of the authority of an encrypted cluster, a PEM file."),
+    ):
+        click.option(f"--tls-{name}", type=file, help=what)(with_files)
+    return click.option(
+        "--scheduler", metavar="ADDRESS", help="Use this Dask cluster, tcp://host:8786."
+    )(with_files)
+
+
+def show(figures: Mapping[str, Any], lines: Iterable[str], as_json: bool) -> None:
+    """Print figures as one JSON document, or else what they say as lines of text."""
+    if as_json:
+        lines = [json.dumps(figures, indent=1, allow_nan=False, default=str)]
+    for line in lines:
+        click.echo(line)
+
+
+def set_logs(shown: bool) -> None:
+    """Show log messages and warnings of libraries in this process, or drop them.
+
+    The command itself tells users what matters. For a log file, redirect the output of `-v`. In
+    workers that share the terminal, too: the driver reports a failed task once, and Dask's worker
+    would log it as well, with a traceback.
+    """
+    logging.disable(logging.NOTSET if shown else logging.CRITICAL)
+    if shown:
+        for handler in logging.getLogger("distributed").handlers:
+            handler.setLevel(logging.INFO)  # a local cluster has raised it
+    elif not sys.warnoptions:
+        warnings.simplefilter("ignore")

@@ -1,0 +1,1 @@
+"""Comparison of two clouds or recordings of one place, and its page."""

@@ -1,0 +1,353 @@
+"""Clouds and recordings of ours and of other programs, sweep by sweep."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from importlib import import_module
+from itertools import islice
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..base.allowance import check_fits
+from ..base.arrays import AnyArray, Floats, Indices, Ints
+from ..base.errors import LidarpoolError, explained, prefixed
+from ..base.fingerprint import fingerprint
+from ..base.words import did_you_mean, natural, printable
+from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
+from ..columns.cloud_file import CloudFile
+from ..columns.parts import StoredCloud
+from ..datasets.dataset import INDEX_FILE
+from ..datasets.loader import sweeps
+from ..export.formats import Format
+from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
+from ..scene.files.polygon_files import read_ply_columns
+
+KINDS = (
+    "the folder of a result or data set, a .ply, a .pcd or a folder of them, a .las or .laz, or a "
+    "bag of ROS 2 (.mcap or its folder)"
+)
+# What programs call the number of a beam, and the light that came back; the first there is.
+_RINGS = ("ring", "channel", "laser_id", "laser_number", "line", "beam")
+_LIGHTS = ("intensity", "reflectivity", "i")
+_POINT_CLOUD = "sensor_msgs/msg/PointCloud2"
+_RECORD = 54  # least bytes of a variable-length record of .las
+
+Columns = Mapping[str, AnyArray]
+# Positions (n, 3), columns, and the pose of their axes in the world (4, 4); None if unknown.
+Read = tuple[AnyArray, Columns, Floats | None]
+
+
+@dataclass(frozen=True, eq=False)
+class Turn:
+    """Points of a sweep, or of a part of a cloud."""
+
+    points: Floats  # (n, 3): metres
+    rings: Ints | None = None  # (n,)
+    light: Floats | None = None  # (n,): intensities, of any scale
+    rays: Ints | None = None  # (n,): which ray and return; not of parts
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def part(self, rows: Indices) -> Turn:
+        """Select points."""
+        columns: Any = self.points, self.rings, self.light
+        some: Any = (None if one is None else one[rows] for one in columns)
+        return Turn(*some)
+
+    @classmethod
+    def joined(cls, parts: list[Turn]) -> Turn:
+        """Concatenate parts of one recording, which have the same columns."""
+        if not parts:
+            return cls(np.empty((0, 3)))
+        columns: Any = zip(*((part.points, part.rings, part.light) for part in parts), strict=True)
+        whole: Any = (None if one[0] is None else np.concatenate(one) for one in columns)
+        return cls(*whole)
+
+
+@dataclass(frozen=True, eq=False)
+class Recording:
+    """A recording of sweeps; or a cloud without any (`whole`), in parts instead."""
+
+    name: str
+    count: int  # of sweeps, or of parts
+    read: Callable[[int], Read]
+    light: str | None = None  # the column of intensities, if it has another name than usual
+    whole: bool = False
+    points: int | None = None  # how many there are, if that is known before they are read
+    times: Callable[[], Iterable[float]] | None = None  # start of each sweep, ns
+    notes: tuple[str, ...] = ()
+    thinned: bool = False  # whether hits were left out, so that gaps say nothing
+    firings: str = ""  # recordings with the same have the same rays; "" for unknown
+
+    def turn(self, number: int, *, in_world: bool = False) -> Turn:
+        """Read a sweep in its sensor's axes or the world's; LidarpoolError if it cannot be."""
+        with _reading(self.name):
+            points, columns, pose = self.read(number)
+            if self.light is not None and self.light not in columns:
+                raise LidarpoolError(
+                    f"it has no column {self.light!r} to compare as intensity."
+                    + (did_you_mean(self.light, columns) or f" It has {', '.join(columns)}.")
+                )
+        places = np.asarray(points, np.float64)
+        # Drivers write NaN or zeros for pulses without a return.
+        there = np.isfinite(places).all(axis=1) & places.any(axis=1)
+        places = places[there]
+        if in_world and not self.whole:
+            if pose is None:
+                raise LidarpoolError(
+                    f"{self.name} is in the axes of its sensor, and does not say where that was: "
+                    "compare it with a recording of sweeps."
+                )
+            places = places @ pose[:3, :3].T + pose[:3, 3]
+        lights = _LIGHTS if self.light is None else (self.light,)
+        rings, light = (
+            next((columns[name][there] for name in names if name in columns), None)
+            for names in (_RINGS, lights)
+        )
+        return Turn(
+            places,
+            None if rings is None else np.asarray(rings).astype(np.int64),
+            None if light is None else np.asarray(light).astype(np.float64),
+            _rays(columns)[there] if self.firings and not in_world else None,
+        )
+
+
+def open_recording(
+    place: str | Path | Cloud | StoredCloud,
+    sensor: str | None = None,
+    light: str | None = None,
+    name: str = "the cloud",
+) -> Recording:
+    """Open a cloud or recording: `KINDS`, or a cloud in memory.
+
+    Parameters
+    ----------
+    place
+        Its path; or a cloud, which has sweeps if it is of a result.
+    sensor
+        Of several: name of a sensor, or topic of a bag.
+    light
+        Column of the intensity, if it has another name than usual.
+    name
+        Of a cloud in memory, for errors and reports.
+
+    Raises
+    ------
+    LidarpoolError
+        If it is none, or cannot be opened.
+    """
+    if isinstance(place, Cloud | StoredCloud):
+        return _of_cloud(name, place, place.sweeps, sensor, light)
+    path, name, kind = Path(place), str(place), Path(place).suffix.lower()
+    if not path.exists():
+        raise LidarpoolError(f"{name} does not exist: give {KINDS}.")
+    if path.is_dir():
+        if (path / "cloud.ply").exists():
+            return _of_ply(path / "cloud.ply", name, sensor, light)
+        if (path / INDEX_FILE).exists():
+            return _of_data_set(path, name, sensor, light)
+        if (path / "metadata.yaml").exists():
+            return _of_bag(path, name, sensor, light)
+        if files := sorted(path.glob("*.pcd"), key=lambda file: natural(file.name)):
+            return _of_pcd(files, name, light)
+    elif kind == ".ply":
+        return _of_ply(path, name, sensor, light)
+    elif kind == ".pcd":
+        return _of_pcd([path], name, light)
+    elif kind in (".las", ".laz"):
+        return _of_las(path, name, light)
+    elif kind == ".mcap":
+        return _of_bag(path, name, sensor, light)
+    raise LidarpoolError(f"{name} cannot be compared: give {KINDS}.")
+
+
+def _of_cloud(
+    name: str, cloud: CloudLike, of: Callable[[], Sweeps] | None, sensor: str | None,
+    light: str | None, **more: Any,
+) -> Recording:  # fmt: skip
+    """Open a cloud of ours, in parts or as the sweeps of a sensor."""
+    if of is None:
+
+        def part(number: int) -> Read:
+            chunk = next(cloud.chunks(CHUNK_POINTS, number * CHUNK_POINTS))
+            return chunk.positions, chunk.columns, None
+
+        parts = -(-len(cloud) // CHUNK_POINTS)
+        return Recording(name, parts, part, light, True, len(cloud), **more)
+    there = of()
+    which = there.sensors.index(_chosen(name, "sensors", there.sensors, sensor))
+    numbers = np.flatnonzero(there.sensor == which).tolist()
+
+    def sweep(number: int) -> Read:
+        at = numbers[number]
+        points = next(there.points(cloud, at, at + 1))
+        return there.in_sensor(at, points.positions), points.columns, there.pose.matrix(at)
+
+    times = there.begins_ns[numbers] + (there.start_ns or 0)
+    columns = {column.name for column in cloud.table}
+    if told := columns & {"time", "ray"}:
+        poses = there.pose.positions[numbers], there.pose.quaternions[numbers]
+        known = max(told), "return_number" in columns  # time rather than ray, as `_rays`
+        more["firings"] = fingerprint(known, there.scans[numbers], there.begins_ns[numbers], poses)
+    return Recording(name, len(numbers), sweep, light, times=lambda: times, **more)
+
+
+def _rays(columns: Columns) -> Ints:
+    """Return numbers (n,) that differ for all rays of a sweep, and for the returns of each."""
+    if "time" in columns:
+        rays = columns["time"].astype(np.int64) << 16 | columns["channel"]
+    else:
+        rays = columns["scan"].astype(np.int64) << 32 | columns["ray"]
+    _, first, ray = np.unique(rays, return_index=True, return_inverse=True)
+    order: Ints = np.arange(len(rays)) - first[ray]  # returns of a ray are together
+    return rays << 8 | columns.get("return_number", order)
+
+
+def _of_ply(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:
+    """Open a .ply, with the sweeps beside it if it is of a result."""
+    try:
+        cloud = CloudFile(path)
+    except LidarpoolError:  # text, or of another program
+
+        def read(_: int) -> Read:
+            check_fits(path)
+            columns = read_ply_columns(path.read_bytes())
+            return _places(columns), columns, None
+
+        return Recording(name, 1, read, light, whole=True)
+    if not (beside := path.with_name(SWEEPS_FILE)).exists():
+        return _of_cloud(name, cloud, None, sensor, light)
+    try:
+        report = json.loads(path.with_name("report.json").read_bytes())
+        every = int(report["parameters"]["keep_every"])
+    except (OSError, ValueError, TypeError, LookupError):
+        every = 1
+    note = (
+        f"{name} keeps one of {every} hits, so its gaps are no lost returns: run it with "
+        "keep_every 1 to compare these"
+    )
+    more = {"notes": (note,), "thinned": True} if every > 1 else {}
+    return _of_cloud(name, cloud, partial(Sweeps.load, beside), sensor, light, **more)
+
+
+def _of_data_set(path: Path, name: str, sensor: str | None, light: str | None) -> Recording:
+    saved = sweeps(path, sensors=None if sensor is None else [sensor])
+
+    def read(number: int) -> Read:
+        sweep = saved[number]
+        return sweep.points, sweep.columns, sweep.pose
+
+    return Recording(name, len(saved), read, light)
+
+
+def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
+    """Open files of a sweep each; VIEWPOINT says where its sensor was."""
+    Format("pcd").check_installed()
+
+    def read(number: int) -> Read:
+        from pypcd4.pypcd4 import PointCloud  # an extra
+
+        check_fits(files[number])
+        file = PointCloud.from_path(files[number])
+        rows, (*place, w, x, y, z) = file.pc_data, file.metadata.viewpoint
+        if len(rows) != file.metadata.points:
+            raise ValueError(f"{file.metadata.points:,} points announced, {len(rows):,} there")
+        columns = {name: rows[name] for name in rows.dtype.names or ()}
+        pose = Placed(np.array([place]), np.array([[x, y, z, w]])).matrix(0)
+        return _places(columns), columns, pose
+
+    return Recording(name, len(files), read, light)
+
+
+def _of_las(path: Path, name: str, light: str | None) -> Recording:
+    Format("las").check_installed()
+    laspy: Any = import_module("laspy")
+    with _reading(name):
+        with path.open("rb") as start:
+            first, records = struct.unpack("<II", start.read(104)[96:])
+        if _RECORD * records > first:  # laspy would go through four thousand million of them
+            raise ValueError("its header is wrong")
+        with laspy.open(path, read_evlrs=False) as file:
+            count = file.header.point_count
+
+    def read(number: int) -> Read:
+        wanted = min(CHUNK_POINTS, count - number * CHUNK_POINTS)
+        with laspy.open(path, read_evlrs=False) as file:
+            file.seek(number * CHUNK_POINTS)
+            points = file.read_points(wanted)
+        if len(points) != wanted:
+            raise ValueError(f"{count:,} points announced, and there are fewer")
+        columns = {name: np.asarray(points[name]) for name in points.point_format.dimension_names}
+        return np.stack([points.x, points.y, points.z], axis=1), columns, None
+
+    return Recording(name, -(-count // CHUNK_POINTS), read, light, True, count)
+
+
+def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Recording:
+    """Open a topic of PointCloud2, a sweep each, in the axes of their frame."""
+    Format("mcap").check_installed()
+    from rosbags.rosbag2 import Reader
+
+    from ..export.ros import columns_of
+
+    with _reading(name):
+        bag = Reader(path)
+        bag.open()
+    there = {one.topic: one for one in bag.connections if one.msgtype == _POINT_CLOUD}
+    connection = there[_chosen(name, "topics of PointCloud2", there, topic)]
+    coming: tuple[int, Iterator[Any]] = 0, iter(())  # the next sweep, and messages from there on
+
+    def read(number: int) -> Read:
+        nonlocal coming
+        if not 0 < coming[0] <= number:
+            coming = 0, bag.messages([connection])
+        _, _, data = next(islice(coming[1], number - coming[0], None))
+        coming = number + 1, coming[1]
+        columns = columns_of(data)
+        return _places(columns), columns, None
+
+    def times() -> Iterator[float]:
+        return (time for _, time, _ in bag.messages([connection]))
+
+    return Recording(name, connection.msgcount, read, light, times=times)
+
+
+@contextmanager
+def _reading(name: str) -> Iterator[None]:
+    """Turn what readers of files raise into a LidarpoolError of a line."""
+    try:
+        with explained(f"{name} cannot be read"), prefixed(name):
+            yield
+    except LidarpoolError:
+        raise
+    except Exception as error:  # libraries raise whatever they stumble over
+        reason = printable(str(error)) or type(error).__name__
+        raise LidarpoolError(f"{name} is broken or cut short ({reason}).") from error
+
+
+def _places(columns: Columns) -> Floats:
+    if missing := [axis for axis in "xyz" if axis not in columns]:
+        raise ValueError(f"its points have no {', '.join(missing)}")
+    return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
+
+
+def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> str:
+    """Return the sensor or topic that is wanted, or the only one."""
+    known = list(there)
+    if wanted is None and len(known) == 1:
+        return known[0]
+    if wanted is not None and wanted in known:
+        return wanted
+    listed = f"{name} has the {what} {', '.join(known)}" if known else f"{name} has no {what}"
+    if wanted is None:
+        advice = "choose one (--sensor-a, --sensor-b)" if known else "record one"
+        raise LidarpoolError(f"{listed}: {advice}.")
+    raise LidarpoolError(f"{listed}, not {wanted!r}." + did_you_mean(wanted, known))

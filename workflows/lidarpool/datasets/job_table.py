@@ -1,0 +1,371 @@
+"""The table of the jobs of a data set, and what is counted of a job's points.
+
+`jobs.csv` has a row for each job: number, name, split, then what was varied, then what came of it,
+then the points of each class. A varied value is written as JSON writes it, so that it is read with
+its type: ``12``, ``0.5``, ``true``; text stands as it is unless it looks like one of these, as
+``"12"`` does. Nothing stands where a job has no such value.
+"""
+
+from __future__ import annotations
+
+import codecs
+import csv
+import hashlib
+import json
+import re
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from importlib.util import find_spec
+from itertools import islice
+from typing import IO, Any
+
+import numpy as np
+
+from ..base.errors import LidarpoolError, explained
+from ..base.storage import Storage
+from ..columns.cloud import Cloud, CloudLike
+
+Value = bool | int | float | str
+
+TABLE_FILE, PARQUET_FILE = "jobs.csv", "jobs.parquet"
+ROW_GROUP = 2_000  # rows of jobs.parquet in memory at a time
+ERROR_MOST = 4_000  # letters of an error in the table: csv.reader refuses cells of 131,072
+
+_HEAD = {"number": int, "name": str, "split": str}
+_TAIL = {
+    "error": str,
+    "scans": int,
+    "sweeps": int,
+    "rays": int,
+    "hits": int,
+    "points": int,
+    "seconds": float,
+    "sha256": str,
+}
+_CLASS = re.compile(r"class_(\d+)", re.ASCII)
+_UTF8 = codecs.getwriter("utf-8")
+_ESCAPED = "backslashreplace"  # of text that may hold parts of names that are no UTF-8
+# Before the name of a varied value that would look like another column.
+_VARIED = "varied."
+
+
+@dataclass(frozen=True)
+class JobRow:
+    """One job of a campaign.
+
+    Parameters
+    ----------
+    number
+        From 0.
+    name
+        Its name in files.
+    split
+        Its split, such as "train"; "" without splits.
+    values
+        {path: value} of what was varied; of a sample of things, how many.
+    error
+        Why it failed; "" for a job that is done.
+    scans, sweeps, rays, hits, points
+        How many.
+    seconds
+        Of casting, all its tasks. The only entry that differs between runs.
+    sha256
+        Of its points, see `Tally`: the same on any cluster.
+    classes
+        {class: points}; empty if the points have no column ``class``.
+    """
+
+    number: int
+    name: str
+    split: str = ""
+    values: Mapping[str, Value] = field(default_factory=dict)
+    error: str = ""
+    scans: int = 0
+    sweeps: int = 0
+    rays: int = 0
+    hits: int = 0
+    points: int = 0
+    seconds: float = 0.0
+    sha256: str = ""
+    classes: Mapping[int, int] = field(default_factory=dict)
+
+    @property
+    def done(self) -> bool:
+        """Whether its points are in the data set."""
+        return not self.error
+
+    @classmethod
+    def of(cls, data: dict[str, Any]) -> JobRow:
+        """Make a row of what JSON gives of one."""
+        classes = {int(number): count for number, count in data.pop("classes").items()}
+        return cls(classes=classes, **data)
+
+
+class Tally:
+    """What is counted of the points of a job, a piece at a time and in order.
+
+    Examples
+    --------
+    >>> cloud = Cloud(np.zeros((3, 3)), {"class": np.array([6, 2, 6])})
+    >>> tally = Tally.of(cloud)
+    >>> tally.points, tally.classes
+    (3, {2: 1, 6: 2})
+    >>> again = Tally()
+    >>> for piece in cloud.chunks(2):
+    ...     again.add(piece)
+    >>> again.sha256 == tally.sha256
+    True
+    """
+
+    def __init__(self) -> None:
+        self.points = 0
+        self._classes: Counter[int] = Counter()
+        self._columns: dict[str, Any] = {}  # {name and type: hash of the values}
+
+    @classmethod
+    def of(cls, cloud: CloudLike) -> Tally:
+        """Count a whole cloud."""
+        tally = cls()
+        for chunk in cloud.chunks():
+            tally.add(chunk)
+        return tally
+
+    def add(self, chunk: Cloud) -> None:
+        """Count the next points.
+
+        LidarpoolError if they have other columns than those before.
+        """
+        if not len(chunk):
+            return
+        # Points of a file and of a run are of different types.
+        arrays = {"positions <f8": chunk.positions.astype("<f8", copy=False)}
+        for column in chunk.table:
+            values = chunk.columns[column.name]
+            little = values.dtype.newbyteorder("<")
+            arrays[f"{column.name} {little.str}"] = values.astype(little, copy=False)
+        if not self.points:
+            self._columns = {name: hashlib.sha256() for name in arrays}
+        if self._columns.keys() != arrays.keys():
+            raise LidarpoolError(
+                f"Points of one job have the columns {', '.join(self._columns)} and then "
+                f"{', '.join(arrays)}: give all the same."
+            )
+        for name, array in arrays.items():
+            self._columns[name].update(np.ascontiguousarray(array))
+        if "class" in chunk.columns:
+            counts = np.bincount(chunk["class"])
+            self._classes.update({int(k): int(counts[k]) for k in np.flatnonzero(counts)})
+        self.points += len(chunk)
+
+    @property
+    def classes(self) -> dict[int, int]:
+        """Points of each class that has any, {class: points}; empty without a column ``class``."""
+        return dict(sorted(self._classes.items()))
+
+    @property
+    def sha256(self) -> str:
+        """Hash of positions and columns, 64 hexadecimal digits.
+
+        It is that of the columns' names, types and hashes, one a line, positions first: the same
+        for float32 and float64 positions of equal value, and however the points were divided.
+        """
+        lines = (f"{name} {digest.hexdigest()}\n" for name, digest in self._columns.items())
+        return hashlib.sha256("".join(lines).encode()).hexdigest()
+
+
+def write_table(place: Storage, names: Sequence[str], jobs: Callable[[], Iterable[JobRow]]) -> None:
+    """Write the table of jobs: jobs.csv, and jobs.parquet if pyarrow is installed.
+
+    Rows are not held in memory: they are read once for the columns, and again for each file.
+
+    Parameters
+    ----------
+    place
+        Folder of the data set, which must exist.
+    names
+        Names of the varied values, in the order of their columns.
+    jobs
+        Gives the rows in order, the same each time.
+
+    Raises
+    ------
+    LidarpoolError
+        If a row has a value that is not in `names`, or the table cannot be written.
+    """
+    with explained(f"The table of jobs cannot be written to {place}", "make room or see to rights"):
+        classes, kinds = _columns(names, jobs())
+        header = [*_HEAD, *map(_column_of, names), *_TAIL, *(f"class_{n}" for n in classes)]
+        with place.writing(TABLE_FILE) as file:
+            writer = csv.writer(_UTF8(file, _ESCAPED), lineterminator="\n")
+            writer.writerow(header)
+            for row in jobs():
+                writer.writerow(_cells(row, names, classes))
+        if find_spec("pyarrow") is not None:
+            with place.writing(PARQUET_FILE) as file:
+                _write_parquet(file, header, names, kinds, iter(jobs()))
+
+
+def read_table(place: Storage) -> Iterator[JobRow]:
+    """Yield the rows of jobs.csv in order.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no such table, or it is damaged.
+    """
+    where = place.path(TABLE_FILE)
+    if place.is_local:
+        place.local(TABLE_FILE)  # refuses a link
+    with explained(f"{where} cannot be read", "give the folder of a data set"):
+        system, folder = place.file_system()
+        how = {"encoding": "utf-8", "newline": ""}
+        with system.open(f"{folder}/{TABLE_FILE}", "r", **how) as file:
+            reader = csv.reader(file, strict=True)
+            try:
+                header = next(reader, [])
+                first, last = len(_HEAD), header.index("error")
+                tail = header[last : last + len(_TAIL)]
+                if header[:first] != [*_HEAD] or tail != [*_TAIL]:
+                    raise ValueError("it is not a table of jobs")
+                names = [name.removeprefix(_VARIED) for name in header[first:last]]
+                for cells in reader:
+                    yield _row(header, names, cells)
+            except (ValueError, csv.Error) as error:
+                raise LidarpoolError(
+                    f"{where} is damaged near line {reader.line_num} ({error}): "
+                    "--resume writes that of an unfinished campaign anew; --overwrite makes a "
+                    "finished one again."
+                ) from error
+
+
+def _column_of(name: str) -> str:
+    """Name of the column of a varied value."""
+    taken = name in _HEAD or name in _TAIL or _CLASS.fullmatch(name) or name.startswith(_VARIED)
+    return f"{_VARIED}{name}" if taken else name
+
+
+def _columns(
+    names: Sequence[str], jobs: Iterable[JobRow]
+) -> tuple[list[int], dict[str, set[type]]]:
+    """Return the classes in the rows, and the types of each varied value."""
+    classes: set[int] = set()
+    kinds: dict[str, set[type]] = {name: set() for name in names}
+    for row in jobs:
+        if others := [name for name in row.values if name not in kinds]:
+            raise LidarpoolError(
+                f"Job {row.name} has a value {others[0]!r}, which is not among those that vary: "
+                f"{', '.join(names) or 'none'}."
+            )
+        classes.update(row.classes)
+        for name, value in row.values.items():
+            kinds[name].add(_kind(value))
+    return sorted(classes), kinds
+
+
+def _cells(row: JobRow, names: Sequence[str], classes: Sequence[int]) -> Iterator[str]:
+    """Cells of a row of jobs.csv."""
+    for name, kind in (_HEAD | _TAIL).items():
+        if name == "error":
+            for value in names:
+                yield _written(row.values[value]) if value in row.values else ""
+        entry = getattr(row, name)
+        # Before Python 3.13, csv.writer left a bare carriage return unquoted.
+        yield "\n".join(entry[:ERROR_MOST].splitlines()) if kind is str else json.dumps(entry)
+    for number in classes:
+        yield str(int(row.classes.get(number, 0)))
+
+
+def _row(header: Sequence[str], names: Sequence[str], cells: Sequence[str]) -> JobRow:
+    """Read a row of jobs.csv; ValueError if it is none."""
+    if len(cells) != len(header):
+        raise ValueError(f"{len(cells)} cells in {len(header)} columns")
+    first, stop = len(_HEAD), len(_HEAD) + len(names)
+    fixed = dict(zip(header[:first], cells, strict=False))
+    fixed |= dict(zip(header[stop:], cells[stop:], strict=True))
+    kinds = _HEAD | _TAIL
+    given: dict[str, Any] = {name: kind(fixed[name]) for name, kind in kinds.items()}
+    classes = {
+        int(found[1]): int(text)
+        for name, text in fixed.items()
+        if (found := _CLASS.fullmatch(name)) and text != "0"
+    }
+    varied = zip(names, cells[first:stop], strict=True)
+    values = {name: _read(text) for name, text in varied if text}
+    return JobRow(values=values, classes=classes, **given)
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as an object of Python, which a function may have made with NumPy."""
+    return value.item() if isinstance(value, np.generic) else value
+
+
+def _kind(value: Any) -> type:
+    plain = _plain(value)
+    kind = type(plain)
+    if kind is int and not -(2**63) <= plain < 2**63:
+        return str
+    if kind not in (bool, int, float, str):
+        raise LidarpoolError(
+            f"A varied value is {value!r}, a {kind.__name__}: give a number, text, true or false."
+        )
+    return kind
+
+
+def _written(value: Any) -> str:
+    """Write a varied value as a cell that is read with its type."""
+    plain = _plain(value)
+    if not isinstance(plain, str):
+        return json.dumps(plain)
+    # Quotes as well for letters that a line of a file cannot show or hold.
+    return plain if plain and plain.isprintable() and _read(plain) == plain else json.dumps(plain)
+
+
+def _read(text: str) -> Value:
+    """Read a cell of a varied value."""
+    try:
+        value = json.loads(text) if text.lstrip()[:1] not in "[{" else text
+    except ValueError:
+        return text
+    return value if isinstance(value, bool | int | float | str) else text
+
+
+def _write_parquet(
+    file: IO[bytes],
+    header: Sequence[str],
+    names: Sequence[str],
+    kinds: Mapping[str, set[type]],
+    rows: Iterator[JobRow],
+) -> None:
+    """Write jobs.parquet. A value that is text in some rows and not in others is text in all."""
+    import pyarrow as pa
+    import pyarrow.parquet as pq
+
+    plain = {int: pa.int64(), float: pa.float64(), str: pa.string(), bool: pa.bool_()}
+
+    def type_of(name: str) -> Any:
+        there = kinds[name]
+        if len(there) == 1:
+            return plain[next(iter(there))]
+        return pa.float64() if there == {int, float} else pa.string()
+
+    types = {_column_of(name): type_of(name) for name in names}
+    types |= {name: plain[kind] for name, kind in (_HEAD | _TAIL).items()}
+    schema = pa.schema([(name, types.get(name, pa.int64())) for name in header])
+    columns = {_column_of(name): name for name in names}
+
+    def cell(row: JobRow, name: str) -> Any:
+        if found := _CLASS.fullmatch(name):
+            return row.classes.get(int(found[1]), 0)
+        value = getattr(row, name) if name not in columns else row.values.get(columns[name])
+        if value is None or types[name] != pa.string():
+            plain = _plain(value)
+            # An older pyarrow refuses whole numbers beyond 2^53 as floats.
+            return float(plain) if types[name] == pa.float64() and value is not None else plain
+        text = value if isinstance(value, str) else json.dumps(_plain(value))
+        return text.encode("utf-8", _ESCAPED).decode()
+
+    with pq.ParquetWriter(file, schema) as writer:
+        while group := list(islice(rows, ROW_GROUP)):
+            table = {name: [cell(row, name) for row in group] for name in header}
+            writer.write_table(pa.table(table, schema=schema))

@@ -1,0 +1,321 @@
+"""Reads data sets of many jobs, sweep by sweep, for training."""
+
+from __future__ import annotations
+
+import json
+import operator
+import os
+import threading
+from bisect import bisect_right
+from collections import OrderedDict
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+from pydantic import Field
+
+from ..base.archives import open_archive
+from ..base.arrays import AnyArray, Floats
+from ..base.errors import LidarpoolError
+from ..base.storage import Storage
+from ..base.validation import checked
+from ..base.words import did_you_mean
+from ..export.boxes import type_of
+from ..export.format_table import DATA_SETS
+from ..export.formats import Format
+from ..export.pieces import Entry
+from ..export.reading import Reader
+from ..export.sweeps import SWEEPS_FILE, Sweeps
+from ..sensor.trajectory import matrices, quaternions_of
+from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
+from .job_table import JobRow, read_table
+from .sweep_data import Sweep, SweepBoxes
+
+_OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
+
+
+@dataclass(frozen=True)
+class _Run:
+    """Sweeps of a sensor of a job, which are consecutive in the job's `Sweeps`."""
+
+    job: JobRow
+    first: int
+    count: int
+
+
+class SavedSweeps:
+    """A sequence of the sweeps of a data set in an order; see `sweeps`.
+
+    An item is read when it is asked for. Several threads may ask, and processes that this one
+    forks or that get a pickled copy.
+    """
+
+    def __init__(
+        self, place: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
+    ) -> None:
+        self._place, self._written, self._runs = place, written, runs
+        self._ends = np.cumsum([run.count for run in runs], dtype=np.int64)
+        self._order = None  # int64 (n,): 8 bytes for each sweep
+        if shuffle is not None:
+            self._order = np.random.default_rng(shuffle).permutation(len(self))
+        self._local = threading.local()
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: value for name, value in self.__dict__.items() if name != "_local"}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__ |= state | {"_local": threading.local()}
+
+    def __repr__(self) -> str:
+        return f"<{len(self):,} sweeps of {self._place} ({self._written.row.data_set})>"
+
+    def __len__(self) -> int:
+        return int(self._ends[-1]) if len(self._ends) else 0
+
+    def __iter__(self) -> Iterator[Sweep]:
+        return (self[index] for index in range(len(self)))
+
+    def __getitem__(self, index: int) -> Sweep:
+        """Read a sweep.
+
+        LidarpoolError if a file is missing or damaged; IndexError if there is no such sweep.
+        """
+        at = operator.index(index)
+        at += len(self) if at < 0 else 0
+        if not 0 <= at < len(self):
+            raise IndexError(f"there is no sweep {index} of {len(self)}")
+        if self._order is not None:
+            at = int(self._order[at])
+        run = self._runs[bisect_right(self._ends, at)]
+        number = run.first + at - (int(self._ends[bisect_right(self._ends, at)]) - run.count)
+        return self._opened(run.job).read(number)
+
+    def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
+        """Return a `torch.utils.data.IterableDataset` of the sweeps.
+
+        The workers of a DataLoader share the sweeps, and so do the ranks of torch.distributed if
+        that is initialised when the loader begins. Each sweep is read by one of them.
+
+        Parameters
+        ----------
+        transform
+            Makes an item of a sweep. By default a dict of tensors: `points`, `pose`, the columns
+            (whole numbers as int64), `boxes` (k, 7: centre, length, width, height, yaw),
+            `box_objects`; and `box_types`, `job`, `sensor`, `number`, `time_ns`.
+        even
+            Whether to leave out the last sweeps, fewer than there are ranks, so that all ranks have
+            the same number: with one more on some, training with DistributedDataParallel waits for
+            ever.
+
+        Raises
+        ------
+        LidarpoolError
+            If torch is not installed.
+        """
+        if find_spec("torch") is None:
+            raise LidarpoolError("This needs PyTorch: pip install torch.")
+        from .torch_sweeps import TorchSweeps
+
+        return TorchSweeps(self, transform, even)
+
+    def _opened(self, job: JobRow) -> _OpenJob:
+        """Return a job that is open in this thread."""
+        local = self._local
+        if getattr(local, "process", None) != os.getpid():  # a fork shares the positions of files
+            local.process, local.jobs = os.getpid(), OrderedDict()
+        jobs: OrderedDict[int, _OpenJob] = local.jobs
+        if job.number not in jobs:
+            jobs[job.number] = _OpenJob(self._place, self._written, job)
+            if len(jobs) > _OPEN_JOBS:
+                jobs.popitem(last=False)[1].reader.close()
+        jobs.move_to_end(job.number)
+        return jobs[job.number]
+
+
+class _OpenJob:
+    """What is kept of a job while its sweeps are read."""
+
+    def __init__(self, place: Storage, written: Format, job: JobRow) -> None:
+        self.place, self.job, row = place, job, written.row
+        name = job_file(row.data_set, job.name, SWEEPS_FILE)
+        self.sweeps = Sweeps.load(place.path(name), partial(place.read, name))
+        self.boxes: dict[str, AnyArray] = {}
+        if self.sweeps.actors:
+            name = job_file(row.data_set, job.name, BOXES_FILE)
+            with open_archive(place.path(name), partial(place.read, name)) as arrays:
+                self.boxes = arrays
+        entry = Entry(job.number, job.name)
+        self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
+
+    def read(self, sweep: int) -> Sweep:
+        """Read a sweep."""
+        job, sweeps = self.job, self.sweeps
+        file = self.place.path(self.reader.file(sweep))
+        try:
+            points, columns = self.reader.read(sweep)
+        except Exception as error:  # libraries of five formats have many kinds
+            raise _unreadable(file, error) from error
+        pose = sweeps.pose.matrix(sweep)
+        return Sweep(
+            job.name, job.number, job.split, job.values,
+            sweeps.sensors[sweeps.sensor[sweep]], int(sweeps.numbers[sweep]),
+            round(sweeps.begins_ns[sweep]), points, columns, pose,
+            self._boxes(sweep, pose[:3, :3]), (*sweeps.objects, *sweeps.actors),
+        )  # fmt: skip
+
+    def _boxes(self, sweep: int, turn: Floats) -> SweepBoxes:
+        sweeps, kept = self.sweeps, self.boxes
+        there = np.flatnonzero(kept["there"][sweep]) if kept else np.empty(0, np.intp)
+        if not len(there):
+            none = np.empty(0, np.int32)
+            place = np.empty((0, 3))
+            return SweepBoxes((), (), none, place, np.empty((0, 4)), place, none.astype(np.int64))
+        names = tuple(sweeps.actors[actor] for actor in there)
+        turns = turn.T @ matrices(kept["quaternions"][sweep, there])
+        sizes = sweeps.actor_bounds[there, 1] - sweeps.actor_bounds[there, 0]
+        return SweepBoxes(
+            names,
+            tuple(map(type_of, names)),
+            (len(sweeps.objects) + there).astype(np.int32),
+            sweeps.pose.inward(sweep, kept["centres"][sweep, there]),
+            quaternions_of(turns),
+            sizes,
+            kept["points"][sweep, there],
+        )
+
+
+@checked
+def sweeps(
+    place: str | Path,
+    *,
+    split: str | Sequence[str] | None = None,
+    jobs: Sequence[int | str] | None = None,
+    sensors: Sequence[str] | None = None,
+    shuffle: Annotated[int, Field(ge=0)] | None = None,
+) -> SavedSweeps:
+    """Open a data set that a campaign has written, sweep by sweep.
+
+    Parameters
+    ----------
+    place
+        Folder or URL of the data set.
+    split
+        Only the jobs of this split, or these.
+    jobs
+        Only these jobs, by number or name.
+    sensors
+        Only the sweeps of these sensors, by name.
+    shuffle
+        A seed: the sweeps of all jobs are in an order that follows from it. Without, they are in
+        the order of jobs, sensors and time. Give another seed for each epoch.
+
+    Returns
+    -------
+    A sequence of `Sweep`, which reads each when it is asked for. Going through it again gives the
+    same order. In memory are a row for each job, 8 bytes for each sweep if shuffled, and poses
+    and boxes of 16 jobs.
+
+    Raises
+    ------
+    LidarpoolError
+        If there is no data set, it is unfinished or damaged, a package that its format needs is
+        not installed, or there is no such split, job or sensor.
+    """
+    storage = replace(Storage.at(place), named="")  # links of the user's own are welcome
+    head = read_index(storage)
+    written = Format(DATA_SETS[head["format"]], head["layout"])
+    written.check_installed()
+    of_sensors = {row["number"]: row["sensors"] for row in head["jobs"]}
+    rows = [job for job in read_table(storage) if job.number in of_sensors]
+    rows = _chosen(rows, split, jobs, storage)
+    there = list(dict.fromkeys(name for job in rows for name, _ in of_sensors[job.number]))
+    if sensors is not None:
+        _check_known("sensor", sensors, there, storage)
+    runs = []
+    for job in rows:
+        first = 0
+        for name, count in of_sensors[job.number]:
+            if count and (sensors is None or name in sensors):
+                runs.append(_Run(job, first, count))
+            first += count
+    return SavedSweeps(storage, written, runs, shuffle)
+
+
+def read_index(place: Storage) -> dict[str, Any]:
+    """Read the index of a finished data set; LidarpoolError if there is none."""
+    try:
+        head: dict[str, Any] = json.loads(place.read(INDEX_FILE))
+        if head["version"] != VERSION:
+            raise ValueError(f"it is of version {head['version']}, not {VERSION}")
+        if head["format"] not in DATA_SETS:
+            raise ValueError(f"its format is {head['format']!r}")
+    except FileNotFoundError as error:
+        if ".jobs" in place.entries():
+            raise LidarpoolError(
+                f"{place} is an unfinished data set: lidarpool run CAMPAIGN --out {place} --resume "
+                "continues it."
+            ) from error
+        raise LidarpoolError(
+            f"{place} is no data set of lidarpool, which has a {INDEX_FILE}: give the --out of a "
+            "campaign."
+        ) from error
+    except OSError as error:
+        raise _unreadable(place.path(INDEX_FILE), error) from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise LidarpoolError(
+            f"{place.path(INDEX_FILE)} is damaged or of another version of lidarpool ({error}): "
+            "run the campaign again with --resume."
+        ) from error
+    return head
+
+
+def _chosen(
+    rows: list[JobRow],
+    split: str | Sequence[str] | None,
+    jobs: Sequence[int | str] | None,
+    place: Storage,
+) -> list[JobRow]:
+    """Select jobs of these splits, and with these numbers or names."""
+    if split is not None:
+        splits = [split] if isinstance(split, str) else list(split)
+        _check_known("split", splits, dict.fromkeys(row.split for row in rows), place)
+        rows = [row for row in rows if row.split in splits]
+    if jobs is not None:
+        wanted = {operator.index(job) if not isinstance(job, str) else job for job in jobs}
+        known = {row.number for row in rows} | {row.name for row in rows}
+        if missing := [job for job in jobs if job not in known]:
+            raise LidarpoolError(
+                f"{place} has no job {missing[0]!r}"
+                + ("" if split is None else f" in split {split!r}")
+                + " that is done: jobs.csv lists all, with their splits and errors."
+            )
+        rows = [row for row in rows if row.number in wanted or row.name in wanted]
+    return rows
+
+
+def _check_known(what: str, wanted: Sequence[str], there: Any, place: Storage) -> None:
+    """Check that there are splits or sensors of these names, or raise LidarpoolError."""
+    names = [name for name in there if name]
+    for name in wanted:
+        if name not in there:
+            known = f" It has {', '.join(names)}." if names else f" It names no {what}s."
+            raise LidarpoolError(
+                f"{place} has no {what} {name!r}.{did_you_mean(name, names) or known}"
+            )
+
+
+def _unreadable(file: str, error: Exception) -> LidarpoolError:
+    """Return the error of a file that is missing or damaged, in a line."""
+    if isinstance(error, LidarpoolError):
+        return error
+    if isinstance(error, OSError) and error.strerror:
+        return LidarpoolError(f"{file} cannot be read: {error.strerror}.")
+    reason = (str(error).splitlines() or [type(error).__name__])[0].rstrip(". ")[:120]
+    return LidarpoolError(
+        f"{file} is missing or damaged ({reason}): get it again, or remove its job from the data "
+        "set and run the campaign with --resume."
+    )

@@ -1,0 +1,74 @@
+"""Sweeps for PyTorch; imported by `SavedSweeps.torch` alone, since torch may not be installed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+import torch.distributed
+import torch.utils.data
+
+from .sweep_data import Sweep
+
+if TYPE_CHECKING:
+    from _typeshed import SupportsLenAndGetItem
+
+
+class TorchSweeps(torch.utils.data.IterableDataset):
+    """Items made of sweeps, divided between ranks, then between the workers of each."""
+
+    def __init__(
+        self,
+        sweeps: SupportsLenAndGetItem[Sweep],
+        transform: Callable[[Sweep], Any] | None,
+        even: bool,
+    ) -> None:
+        self.sweeps, self.transform, self.even = sweeps, transform or tensors, even
+        self._rank: tuple[int, int] | None = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Workers that are spawned do not know their rank; this is called as they start.
+        return self.__dict__ | {"_rank": self._ranks()}
+
+    def _ranks(self) -> tuple[int, int]:
+        """Rank of this process, and how many there are."""
+        if self._rank is not None:
+            return self._rank
+        there = torch.distributed
+        if not (there.is_available() and there.is_initialized()):
+            return 0, 1
+        return there.get_rank(), there.get_world_size()
+
+    def _share(self) -> range:
+        """Return the indices of the sweeps of this rank."""
+        rank, ranks = self._ranks()
+        count = len(self.sweeps)
+        return range(rank, count - count % ranks if self.even else count, ranks)
+
+    def __iter__(self) -> Iterator[Any]:
+        worker = torch.utils.data.get_worker_info()
+        first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
+        for index in self._share()[first::step]:
+            yield self.transform(self.sweeps[index])
+
+
+def tensors(sweep: Sweep) -> dict[str, Any]:
+    """Make a dict of tensors, as `SavedSweeps.torch` describes it."""
+    boxes = sweep.boxes
+    rows = np.column_stack([boxes.centres, boxes.sizes, boxes.yaw]).astype(np.float32)
+    arrays = {
+        name: array.astype(np.int64) if array.dtype.kind in "iu" else array
+        for name, array in sweep.columns.items()
+    }
+    arrays |= {"points": sweep.points, "pose": sweep.pose, "boxes": rows}
+    arrays["box_objects"] = boxes.objects.astype(np.int64)
+    return {
+        **{name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()},
+        "box_types": list(boxes.types),
+        "job": sweep.job,
+        "sensor": sweep.sensor,
+        "number": sweep.number,
+        "time_ns": sweep.time_ns,
+    }

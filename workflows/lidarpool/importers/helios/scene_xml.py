@@ -1,0 +1,266 @@
+"""Scenes of HELIOS++ as entries of `scene.files`."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cached_property, partial
+from pathlib import Path
+from typing import Any
+from xml.etree.ElementTree import Element
+
+import numpy as np
+
+from ...base.arrays import Floats
+from ...base.errors import LidarpoolError, prefixed
+from ...scene.actors import one_mesh
+from ...scene.files.meshfile import load_meshes
+from ...scene.floor import heights_at
+from ...scene.scene import Scene, unique_names
+from ...scene.scene_instances import SceneInstance
+from ...scene.scene_mesh import SceneMesh
+from ...scene.simplified import Drawn
+from ...scene.transform import Transform
+from ...sensor import Pose
+from .files import Assets, clean, number, rotation
+
+# Loaders whose files hold no triangles.
+_UNREAD = ("geotiffloader", "xyzloader")
+_LOADERS = ("objloader", "detailedvoxels")
+
+
+@dataclass
+class HeliosPart:
+    """One mesh file of a scene and its placement: rotated, scaled, moved."""
+
+    file: Path
+    up_axis: str | None
+    turn: Floats
+    scale: float
+    offset: Floats
+    falls: bool  # until it stands on the ground
+    library: Path | None = None  # of the material of voxels, and its name there
+    material: str = ""
+
+    @cached_property
+    def materials(self) -> list[dict[str, str]]:
+        """Material values that HELIOS++ reads for its faces."""
+        text = _text(self.file)
+        used = {self.material, *re.findall(r"^\s*usemtl\s+(\S+)", text, re.MULTILINE)}
+        found: dict[str, dict[str, str]] = {}
+        named = re.findall(r"^\s*mtllib\s+(.+?)\s*$", text, re.MULTILINE)
+        libraries = [self.file.parent / name for name in named]
+        libraries += [self.library] if self.library else []
+        for library in libraries:
+            values: dict[str, str] = {}
+            for words in (line.split() for line in _text(library).splitlines()):
+                if words[:1] == ["newmtl"] and len(words) > 1:
+                    values = found.setdefault(words[1], {})
+                elif len(words) > 1 and words[0].startswith("helios_"):
+                    values[words[0].removeprefix("helios_")] = words[1]
+        return [values for name, values in found.items() if name in used]
+
+    def kind(self, spectra: Callable[[str], float | None]) -> dict[str, Any]:
+        """Reflectance and class, where all its faces have the same."""
+        kinds = []
+        for values in self.materials:
+            share = None
+            if "reflectance" in values:
+                share = number(values, "reflectance", 0)
+                share = share if share <= 1 else share / 100
+            elif "spectra" in values:
+                share = spectra(values["spectra"])
+            kind: dict[str, Any] = {}
+            if share is not None:
+                kind["reflectance"] = clean(np.clip(share, 0, 1))
+            if "classification" in values:
+                kind["class"] = int(number(values, "classification", 0))
+            kinds.append(kind)
+        return kinds[0] if kinds and all(kind == kinds[0] for kind in kinds) else {}
+
+    @property
+    def is_ground(self) -> bool:
+        """Whether platforms and parts can stand on it."""
+        return any(values.get("isGround", "").lower() in ("true", "1") for values in self.materials)
+
+    def meshes(self) -> tuple[SceneMesh | SceneInstance, ...]:
+        """Read it, in the world."""
+        placed = Transform(self.turn * self.scale, self.offset)
+        return load_meshes(self.file, up_axis=self.up_axis, transform=placed, tell=lambda _: None)
+
+    def entry(self, name: str) -> dict[str, Any]:
+        """Entry of `scene.files`, the file under a name."""
+        angles = Pose.of((0, 0, 0), self.turn)
+        degrees = (angles.roll_deg, angles.pitch_deg, angles.yaw_deg)
+        placement = {
+            "up_axis": (self.up_axis, None),
+            "scale": (clean(self.scale), 1.0),
+            "rotation_deg": (clean(degrees), [0.0, 0.0, 0.0]),
+            "translation": (clean(self.offset), [0.0, 0.0, 0.0]),
+        }
+        changed = {key: value for key, (value, usual) in placement.items() if value != usual}
+        return {"file": name, **changed}
+
+
+class HeliosScene:
+    """The parts of a scene, and the ground among them."""
+
+    def __init__(self, element: Element, assets: Assets) -> None:
+        self._assets = assets
+        self.unread: list[str] = []
+        self._missing: set[str] = set()
+        self._moving: dict[str, list[str]] = {"dmotion": [], "swap": []}  # parts by their motion
+        self.parts: list[HeliosPart] = []
+        name = f"scene {element.get('id')!r}"
+        for index, part in enumerate(element.findall("part")):
+            with prefixed(f"{name}, part {index}"):
+                self.parts += self._read(part, f"part {index}", assets)
+        if not self.parts:
+            raise LidarpoolError(
+                f"{name} has no part that can be read: only those of {' and '.join(_LOADERS)} are."
+            )
+        for one in self.parts:
+            if one.falls:
+                self._let_fall(one)
+
+    def _read(self, part: Element, name: str, assets: Assets) -> Iterator[HeliosPart]:
+        for tag, moving in self._moving.items():
+            if part.find(tag) is not None:
+                moving.append(name)
+        files: list[Path] = []
+        up, turn, scale, offset, falls = None, np.eye(3), 1.0, np.zeros(3), False
+        library, material = None, ""
+        for step in part.findall("filter"):
+            kind = step.get("type", "").lower()
+            given = {param.get("key", ""): param for param in step.findall("param")}
+            text = {key: param.get("value", "") for key, param in given.items()}
+            mode = text.get("intersectionMode", "transmittive").lower()
+            why = "no triangles" if kind in _UNREAD else ""
+            if kind == "detailedvoxels" and mode != "transmittive":
+                why = f"intersectionMode {mode}"
+            if why:
+                what = text.get("filepath") or text.get("efilepath", "")
+                self.unread.append(f"{name}, {kind} of {what}: {why}, left out")
+                return
+            if kind in _LOADERS:
+                files, up = _files(text, assets), text.get("up")
+                if kind == "detailedvoxels":
+                    up, material = None, text.get("matname", "")
+                    library = assets.file(text["matfile"]) if "matfile" in text else None
+                    if "ladlut" in text:
+                        self.unread.append(f"{name}, ladlut: leaf angles are spherical")
+            elif kind == "rotate":
+                turn = rotation(given.get("rotation")) @ turn
+            elif kind == "scale":
+                (scale,) = _numbers(text.get("scale", ""), 1)
+                scale = scale or 1.0
+            elif kind == "translate":
+                offset = _numbers(text.get("offset", ""), 3)
+                falls = text.get("onGround", "0") != "0"
+            else:
+                raise LidarpoolError(
+                    f"the filter {kind!r} is not known; there are {', '.join(_LOADERS)}, rotate, "
+                    f"scale, translate, {', '.join(_UNREAD)}."
+                )
+        if not files:
+            raise LidarpoolError("no filter loads a file.")
+        up = up if up in ("y", "z") else None
+        for file in files:
+            yield HeliosPart(file, up, turn, float(scale), offset.copy(), falls, library, material)
+
+    @cached_property
+    def _ground(self) -> Scene | None:
+        meshes = [mesh for part in self.parts if part.is_ground for mesh in part.meshes()]
+        return Drawn.of(Scene.from_meshes(meshes)).scene if meshes else None
+
+    def height(self, x: float, y: float) -> float:
+        """Height of the lowest ground at a place; 0 where there is none."""
+        found = np.zeros(0) if self._ground is None else heights_at(self._ground, x, y)
+        if not len(found):
+            self._missing.add(f"{x:g}, {y:g}")
+            return 0.0
+        return float(found.min())
+
+    def _let_fall(self, part: HeliosPart) -> None:
+        """Move a part up or down so that its lowest point stands on the ground."""
+        points = one_mesh("", part.meshes()).vertices
+        x, y, z = points[points[:, 2].argmin()].tolist()
+        part.offset[2] += self.height(x, y) - z
+
+    def materials(self, wavelength_nm: float) -> list[dict[str, Any]]:
+        """List what objects are made of, where the faces of a file are all of one kind."""
+        kinds = [part.kind(partial(self._reflectance, wavelength_nm)) for part in self.parts]
+        if not any(kinds):
+            return []
+        meshes = [part.meshes() for part in self.parts]
+        names = iter(unique_names([mesh.name for of in meshes for mesh in of]))
+        own = [
+            {"objects": next(names), **kind}
+            for of, kind in zip(meshes, kinds, strict=True)
+            for _ in of
+        ]
+        return [{"objects": "*"}, *(entry for entry in own if len(entry) > 1)]
+
+    def _reflectance(self, wavelength_nm: float, name: str) -> float | None:
+        """Reflectance at a wavelength, by the spectrum of a name; None where there is none."""
+        for place in self._assets.places:
+            for folder in (place / "spectra", place / "data" / "spectra"):
+                text = _text(folder / f"{name}.txt")
+                rows = re.findall(r"^([\d.]+)\s+([\d.]+)\s*$", text, re.MULTILINE)
+                if rows:  # micrometres and per cent
+                    lengths, shares = np.array(sorted((float(x), float(y)) for x, y in rows)).T
+                    return float(np.interp(wavelength_nm / 1000, lengths, shares) / 100)
+        self.unread.append(f"the spectrum {name!r}, which is not there: its reflectance is 0.5")
+        return None
+
+    def left_out(self) -> list[str]:
+        """List the unsupported features, after everything was read."""
+        out = []
+        for tag, parts in self._moving.items():
+            if len(parts) == 1:
+                out.append(f"<{tag}> of {parts[0]}: it stands as it is at first")
+            elif parts:
+                several = f"{len(parts)} parts, {parts[0]} to {parts[-1]}"
+                out.append(f"<{tag}> of {several}: they stand as they are at first")
+        out += self.unread
+        if self._missing:
+            places = "; ".join(sorted(self._missing))
+            out.append(f"onGround at {places}: no ground there, so z is 0")
+        return out
+
+
+def _files(text: dict[str, str], assets: Assets) -> list[Path]:
+    """Files of a loader: by name, or those in a folder whose names an expression fits."""
+    if "efilepath" not in text:
+        return [assets.file(text.get("filepath", ""))]
+    folder, _, names = text["efilepath"].rpartition("/")
+    try:
+        fits = re.compile(names)
+    except re.error as error:
+        raise LidarpoolError(f"efilepath is {text['efilepath']!r}: {error}.") from error
+    for place in assets.places:
+        if (place / folder).is_dir():
+            found = sorted(p for p in (place / folder).iterdir() if fits.fullmatch(p.name))
+            if found:
+                return found
+    raise LidarpoolError(f"no file fits the efilepath {text['efilepath']!r}.")
+
+
+def _text(path: Path) -> str:
+    """Content of a file that may be missing; then empty."""
+    try:
+        return path.read_text("utf-8", "replace")
+    except (OSError, ValueError):  # a zero in the name
+        return ""
+
+
+def _numbers(text: str, count: int) -> Floats:
+    """Numbers with ; between them."""
+    try:
+        values = np.array([float(word) for word in text.split(";")])
+    except ValueError:
+        values = np.full(0, np.nan)
+    if values.shape != (count,) or not np.isfinite(values).all():
+        raise LidarpoolError(f"{text!r} is not {count} number{'s' * (count > 1)}.")
+    return values

@@ -1,0 +1,366 @@
+"""The finished picture: a rendered image with axes, legend, colour bar and title."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import re
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.cm import ScalarMappable
+from matplotlib.collections import LineCollection
+from matplotlib.colors import ListedColormap, LogNorm, Normalize
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patheffects import withStroke
+from matplotlib.ticker import LogLocator
+
+from ..base.arrays import AnyFloats, Floats
+from ..base.errors import explained
+from ..base.storage import Storage
+from . import theme
+from .shot import SurfaceView
+
+DPI = 200
+FONT = "DejaVu Sans"  # comes with matplotlib
+MANY_POSES = 40  # more sensors than this are small dots
+PATH_PIECES = 200  # of which the way of a sensor is drawn
+MOST_NAMES = 12  # of actors beside what they name
+NAME_ABOVE, NAME_ROOM = 26.0, (150.0, 26.0)  # pixels of a picture 1600 wide
+LEGEND_ROWS = 30
+LEGEND_LETTERS = 18
+# Of the numbers along the axes, in pixels of a picture 1600 wide.
+TICK = 7.0  # length of a tick mark
+BESIDE, BELOW = 14.0, 24.0  # from an edge to the numbers right or left of it, and under it
+LETTER = 12.0  # width of a digit
+TITLE = 32.0  # from the numbers to the title
+APART = 34.0  # numbers stand at least this far apart
+SHORTEST_AXIS = 36.0  # a shorter height axis has no room for numbers
+
+
+class Page:
+    """One picture under construction; its size is (width, height) in pixels."""
+
+    def __init__(self, size: tuple[int, int]) -> None:
+        self.size = size
+        self.figure = Figure(figsize=(size[0] / DPI, size[1] / DPI), dpi=DPI, facecolor=theme.PAGE)
+        self.unit = size[0] / 1600  # fonts and lines grow with the picture
+
+    def show(self, shot: SurfaceView, image: AnyFloats) -> Axes:
+        """Fill the page with a painted shot, its ground's grid, its axes and its sensors.
+
+        The returned axes have the shot's pixels as coordinates.
+        """
+        colours, opacity = image[..., :3], image[..., 3:]
+        plain = np.divide(colours, opacity, out=np.zeros_like(colours), where=opacity > 0)
+        bytes_ = np.round(255 * np.concatenate([plain, opacity], axis=2)).astype(np.uint8)
+        self.figure.figimage(bytes_, zorder=-1)
+        axes = self.figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        axes.set(xlim=(0, self.size[0]), ylim=(self.size[1], 0))
+        grid = shot.runs(_grid(shot), shot.on_ground)
+        axes.add_collection(LineCollection(grid, colors=theme.LINE, linewidths=0.6 * self.unit))
+        self._label_axes(axes, shot)
+        self._sensors(axes, shot)
+        self._actors(axes, shot)
+        return axes
+
+    def _label_axes(self, axes: Axes, shot: SurfaceView) -> None:
+        """Write numbers and titles along the ground's near edges and up from its left corner."""
+        taken: list[Floats] = []
+        for k, (start, end, outward) in enumerate(_axis_edges(shot)):
+            axis = shot.stage.axes[k]
+            ends, _ = shot.camera.project([start, end])
+            if k == 2 and np.linalg.norm(ends[1] - ends[0]) < SHORTEST_AXIS * self.unit:
+                return
+            clear = BESIDE * abs(outward[0]) + BELOW * abs(outward[1])
+            places = np.repeat(start[None], len(axis.ticks), axis=0)
+            places[:, k] = axis.ticks
+            lines = [ends] if k == 2 else []
+            for pixel, text in zip(shot.camera.project(places)[0], axis.labels, strict=True):
+                wide = LETTER / 2 * len(text) * abs(outward[0])
+                place = pixel + (clear + wide) * self.unit * outward
+                apart = (APART + 4 * max(0, len(text) - 3)) * (0.7 if k == 2 else 1.0) * self.unit
+                if all(np.linalg.norm(place - other) >= apart for other in taken):
+                    taken.append(place)
+                    lines.append(np.stack([pixel, pixel + TICK * self.unit * outward]))
+                    self._text(axes, place, text, 6.6, theme.MUTED)
+            marks = LineCollection(lines, colors=theme.MUTED, linewidths=0.6 * self.unit)
+            axes.add_collection(marks)
+            along = ends[1] - ends[0]
+            angle = (90 - math.degrees(math.atan2(along[1], along[0]))) % 180 - 90
+            widest = max((len(text) for text in axis.labels), default=0)
+            away = (clear + TITLE + LETTER * widest * abs(outward[0])) * self.unit
+            place = ends.mean(axis=0) + away * outward
+            self._text(axes, place, axis.title, 7.2, theme.INK, rotation=90.0 if k == 2 else angle)
+
+    def _text(
+        self, on: Axes | Figure, place: Any, text: str, size: float, colour: str, **more: Any
+    ) -> None:
+        style = {"ha": "center", "va": "center", "color": colour, "family": FONT} | more
+        made = on.text(float(place[0]), float(place[1]), text, fontsize=size * self.unit, **style)
+        made.set_parse_math(False)  # names come from files
+
+    def _sensors(self, axes: Axes, shot: SurfaceView) -> None:
+        """Mark the sensors, hollow if hidden, each on a stem."""
+        for path in shot.paths:
+            some = path[np.linspace(0, len(path) - 1, min(len(path), PATH_PIECES)).astype(int)]
+            pixels, _ = shot.camera.project(some)
+            axes.plot(
+                *pixels.T, color=theme.SENSOR, lw=0.9 * self.unit, alpha=0.35, zorder=4,
+                solid_capstyle="round",
+            )  # fmt: skip
+            self.lines(axes, shot, np.stack([some[:-1], some[1:]], axis=1), 1.8, 0.9)
+        poses, many = shot.sensors, len(shot.sensors) > MANY_POSES
+        pixels, seen = shot.visible(poses)
+        if not many:
+            feet = np.column_stack([poses[:, :2], np.full(len(poses), shot.stage.level)])
+            self.lines(axes, shot, np.stack([poses, feet], axis=1), 0.8, 0.7)
+        size, edge_width = (5, 0.2) if many else (20, 0.7)
+        for which, face, edge in ((seen, theme.SENSOR, theme.PAGE), (~seen, "none", theme.SENSOR)):
+            axes.scatter(
+                pixels[which, 0], pixels[which, 1], s=size * self.unit**2, facecolors=face,
+                edgecolors=edge, linewidths=edge_width * self.unit, zorder=5,
+            )  # fmt: skip
+
+    def _actors(self, axes: Axes, shot: SurfaceView) -> None:
+        """Name the actors, if they are few, each above its position; paler if hidden.
+
+        Of a robot, whose links are called ROBOT/LINK, the first has its name.
+        """
+        boxes, taken = shot.scene.object_bounds, np.empty((0, 2))
+        some = np.arange(len(boxes) - shot.actors, len(boxes))
+        # Absent ones are one point.
+        there = np.isfinite(boxes).all(axis=(1, 2)) & (np.ptp(boxes, axis=1) > 0).any(axis=1)
+        some = some[there[some]]
+        names = [whole_of(shot.scene.names[k]) for k in some]
+        some = some[np.sort(np.unique(names, return_index=True)[1])]
+        names = list(dict.fromkeys(names))
+        if len(some) > MOST_NAMES:
+            return
+        tops = np.column_stack([boxes[some, :, :2].mean(axis=1), boxes[some, 1, 2]])
+        halo = [withStroke(linewidth=1.6 * self.unit, foreground=theme.PAGE)]
+        places, seen = shot.visible(tops)
+        for k in np.argsort(-places[:, 1]).tolist():  # those in front first
+            pixel, name, colour = places[k], names[k], theme.INK if seen[k] else theme.LINE
+            place = pixel - (0, NAME_ABOVE * self.unit)
+            while (np.abs(taken - place) < np.array(NAME_ROOM) * self.unit).all(axis=1).any():
+                place = place - (0, NAME_ROOM[1] * self.unit)
+            taken = np.vstack([taken, place])
+            axes.plot(
+                *np.stack([pixel, place]).T, color=colour, lw=0.7 * self.unit, zorder=6,
+                path_effects=halo,
+            )  # fmt: skip
+            ink = theme.INK if seen[k] else theme.MUTED
+            style = {"va": "bottom", "path_effects": halo, "zorder": 7}
+            self._text(axes, place, shortened(name), 6.6, ink, **style)
+
+    def numbers(self, axes: Axes, shot: SurfaceView) -> None:
+        """Write numbers from 1 on the sensors' markers; on white for those that are hidden."""
+        pixels, seen = shot.visible(shot.sensors)
+        for rank, k in enumerate(np.argsort(pixels[:, 1]).tolist()):  # those in front last
+            x, y, above = float(pixels[k, 0]), float(pixels[k, 1]), 8 + rank / len(pixels)
+            face, ink = (theme.SENSOR, theme.PAGE) if seen[k] else (theme.PAGE, theme.SENSOR)
+            axes.scatter(
+                [x], [y], s=62 * self.unit**2, facecolors=face, edgecolors=ink,
+                linewidths=0.7 * self.unit, zorder=above,
+            )  # fmt: skip
+            style = {"va": "center_baseline", "weight": "bold", "zorder": above}
+            self._text(axes, (x, y), str(k + 1), 5.6 if k < 99 else 4.4, ink, **style)
+
+    def lines(
+        self, axes: Axes, shot: SurfaceView, segments: Floats, width: float, alpha: float
+    ) -> None:
+        """Draw the visible parts of segments (n, 2, 3), in the sensors' colour."""
+        runs = shot.runs(segments, shot.visible)
+        axes.add_collection(
+            LineCollection(
+                runs, colors=theme.SENSOR, linewidths=width * self.unit, alpha=alpha, zorder=4
+            )
+        )
+
+    def chart(self, frame: tuple[float, float, float, float], **given: Any) -> Axes:
+        """Axes with a grid in a frame: left, bottom, width and height as fractions of the page."""
+        axes, small = self.figure.add_axes(frame), 0.6 * self.unit
+        axes.set(facecolor=theme.GROUND, axisbelow=True, **given)
+        axes.grid(color=theme.LINE, lw=0.5 * self.unit)
+        axes.spines[:].set(color=theme.LINE, linewidth=small)
+        for side in (axes.xaxis, axes.yaxis):
+            side.label.set(fontsize=7.6 * self.unit, color=theme.INK, family=FONT)
+        axes.tick_params(
+            labelsize=6.8 * self.unit, labelcolor=theme.MUTED, color=theme.LINE,
+            length=2.5 * self.unit, width=small, labelfontfamily=FONT,
+        )  # fmt: skip
+        return axes
+
+    def title(self, text: str, *details: str) -> None:
+        """Write a title at the top left, and lines of detail under it."""
+        line = 0.05 * self.size[0] / self.size[1] / 1.6
+        place = 0.03, 1 - line
+        self._text(self.figure, place, text, 11, theme.INK, ha="left", weight="bold")
+        for number, detail in enumerate(details):
+            place = 0.03, 1 - (1.84 + 0.62 * number) * line
+            self._text(self.figure, place, detail, 7.2, theme.MUTED, ha="left")
+
+    def heading(self, axes: Axes, text: str, **given: Any) -> None:
+        """Name a chart, above its left end."""
+        style: dict[str, Any] = {
+            "fontsize": 7.6 * self.unit,
+            "color": theme.INK,
+            "family": FONT,
+        } | given
+        axes.set_title(text, loc="left", parse_math=False, **style)
+
+    def legend(self, entries: Sequence[tuple[str, Any]], sensor: str = "Sensor") -> None:
+        """Name colours, as (name, colour), in the right margin; many are counted in a last line."""
+        rows = [("s", name, colour) for name, colour in entries[:LEGEND_ROWS]]
+        rows.append(("o", sensor, theme.SENSOR))
+        if len(entries) > LEGEND_ROWS:
+            rows.append(("", f"and {len(entries) - LEGEND_ROWS:,} more", theme.MUTED))
+        size = min(7.4, 175 / len(rows))
+        self.key(
+            [
+                Line2D([], [], ls="", marker=marker, color=colour, ms=0.85 * size * self.unit,
+                       mec="none", label=shortened(name))
+                for marker, name, colour in rows
+            ],
+            size,
+        )  # fmt: skip
+
+    def key(
+        self, handles: Sequence[Artist], size: float, on: Axes | Figure | None = None, **given: Any
+    ) -> None:
+        """Put a legend of handles into the right margin, or elsewhere; `size` in points."""
+        style = {"loc": "center left", "bbox_to_anchor": (0.842, 0.5), "borderpad": 0} | given
+        style = {"handletextpad": 0.5, "handlelength": 1.4} | style
+        legend = (on or self.figure).legend(
+            handles, ["x"] * len(handles), frameon=False, labelcolor=theme.INK, labelspacing=0.55,
+            prop={"family": FONT, "size": size * self.unit}, **style,
+        )  # fmt: skip
+        # Names come from files: matplotlib leaves out those that begin with an underscore,
+        # and fails on texts that only look like a formula ("$\\frac{x$").
+        for text, handle in zip(legend.get_texts(), handles, strict=True):
+            text.set_parse_math(False)
+            text.set_text(str(handle.get_label()))
+
+    def colour_bar(
+        self,
+        colours: Floats,
+        norm: Normalize,
+        title: str,
+        frame: tuple[float, float, float, float] = (0.862, 0.27, 0.014, 0.46),
+    ) -> None:
+        """Draw a colour bar of colours (n, 3) in the right margin, its title beside it."""
+        axes = self.figure.add_axes(frame)
+        bar = self.figure.colorbar(ScalarMappable(norm, ListedColormap(colours)), cax=axes)
+        bar.outline.set_visible(False)
+        bar.set_label(
+            title, fontsize=7.6 * self.unit, color=theme.INK, family=FONT, parse_math=False
+        )
+        axes.tick_params(
+            which="both", labelsize=6.6 * self.unit, color=theme.MUTED, width=0.6 * self.unit,
+            labelcolor=theme.MUTED, labelfontfamily=FONT, length=2.5 * self.unit,
+        )  # fmt: skip
+        if isinstance(norm, LogNorm):
+            few = norm.vmax < 1000 * norm.vmin  # type: ignore[operator]  # both are given
+            axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5) if few else (1,)))
+            axes.yaxis.set_major_formatter(lambda value, _: f"{value:,.12g}")
+            axes.yaxis.set_minor_formatter(lambda value, _: "")
+
+    def save(self, path: Path) -> None:
+        """Write the page as a PNG, in its light colours; a link in its place goes.
+
+        Raises
+        ------
+        LidarpoolError
+            If the folder does not exist or is not writable.
+        """
+        advice = "choose a folder that exists, can be written to and has room"
+        with explained(f"The picture {path} could not be written", advice):
+            Storage.at(path.parent, durable=False).write(path.name, self.png())
+
+    def png(self) -> bytes:
+        """Return the page as a PNG, in its light colours."""
+        image = io.BytesIO()
+        self.figure.savefig(image, dpi=DPI, format="png")
+        return image.getvalue()
+
+    def svg(self) -> str:
+        """Return the page as an element of HTML, whose ink may follow the style around it.
+
+        The colours of `theme.STYLED` are variables of CSS, such as --picture-ink.
+        """
+        text = io.StringIO()
+        with matplotlib.rc_context({"svg.hashsalt": "lidarpool"}):
+            self.figure.savefig(text, format="svg", dpi=DPI, metadata={"Date": None})
+        # Without what all elements of the document would share, and nobody reads.
+        svg = re.sub(r"<!--.*?-->|<style.*?</style>", "", text.getvalue(), flags=re.DOTALL)
+        svg = re.sub(r'^.*?<svg[^>]*(viewBox="[^"]*")[^>]*>', r"<svg \1>", svg, flags=re.DOTALL)
+        svg = re.sub(r' id="[a-zA-Z]+_\d+"|<metadata>.*?</metadata>', "", svg, flags=re.DOTALL)
+        for colour, name in theme.STYLED.items():
+            svg = svg.replace(colour, f"var(--picture-{name}, {colour})")
+        return svg
+
+
+def _grid(shot: SurfaceView) -> Floats:
+    """Lines (n, 2, 3) of the ground: its border, and one at each tick."""
+    (x0, y0), (x1, y1) = shot.stage.ground.tolist()
+    level = shot.stage.level
+    across, along = (axis.ticks.tolist() for axis in shot.stage.axes[:2])
+    return np.array(
+        [((x, y0, level), (x, y1, level)) for x in (x0, *across, x1)]
+        + [((x0, y, level), (x1, y, level)) for y in (y0, *along, y1)]
+    )
+
+
+def _axis_edges(shot: SurfaceView) -> list[tuple[Floats, Floats, Floats]]:
+    """For x, y and z: two ends (3,) in the scene, and the outward direction (2,) in the picture."""
+    corners = shot.stage.corners
+    flat, _ = shot.camera.project(corners)
+    middle, _ = shot.camera.project(corners.mean(axis=0)[None])
+    out = []
+    for sides in (((0, 1), (3, 2)), ((0, 3), (1, 2))):  # corners along x and along y
+        a, b = max(sides, key=lambda side: float(flat[list(side), 1].mean()))  # the nearer one
+        along = flat[b] - flat[a]
+        outward = np.array([along[1], -along[0]]) / np.linalg.norm(along)
+        outward *= np.sign(outward @ ((flat[a] + flat[b]) / 2 - middle[0]))
+        out.append((corners[a], corners[b], outward))
+    foot = corners[np.argmin(flat[:, 0])]
+    top = np.array([*foot[:2], shot.stage.bounds[1, 2]])
+    return [*out, (foot, top, np.array([-1.0, 0.0]))]
+
+
+def shortened(name: str, most: int = LEGEND_LETTERS) -> str:
+    """Shorten a name with more letters than `most` in its middle; show control characters."""
+    name = "".join(letter if letter.isprintable() else "\ufffd" for letter in name)
+    tail = (most - 1) // 2
+    return name if len(name) <= most else f"{name[: most - 1 - tail]}…{name[-tail:]}"
+
+
+def whole_of(name: str) -> str:
+    """Name of the robot of a link, ROBOT/LINK; of another actor its own."""
+    # Traffic has names of its files in brackets, with any letters.
+    return name if "(" in name else name.partition("/")[0]
+
+
+def without_common_prefix(names: Sequence[str]) -> list[str]:
+    """Remove the common first words of at least three names.
+
+    Examples
+    --------
+    >>> without_common_prefix(["site_a_Wall", "site_a_Floor", "site_a_Lamp_1"])
+    ['Wall', 'Floor', 'Lamp_1']
+    """
+    if len(names) < 3:
+        return list(names)
+    prefix = os.path.commonprefix(list(names))  # noqa: RUF071 - of letters, as is wanted
+    end = max(prefix.rfind(mark) for mark in "_./: -") + 1
+    shorter = [name[end:] for name in names]
+    return shorter if all(shorter) else list(names)

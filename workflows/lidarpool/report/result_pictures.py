@@ -1,0 +1,307 @@
+"""The pictures of a result, each by name."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Collection, Iterator, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection, PatchCollection
+from matplotlib.lines import Line2D
+from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
+
+from ..base.arrays import Bools, Floats, Ints
+from ..base.errors import LidarpoolError, explained
+from ..base.sampling import even_indices
+from ..base.vocabulary import PICTURES
+from ..base.words import did_you_mean, plural
+from ..columns.cloud import Cloud
+from ..columns.cloud_file import CloudFile
+from ..columns.table import TABLE, Z
+from ..plan import Plan, Planning
+from ..plan.stations import Sight, StationPlan
+from ..render import theme
+from ..render.colouring import with_rgb
+from ..render.picture_page import FONT, Page
+from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
+from ..render.shot import SIZE, Samples, SurfaceView, take_shot
+from ..render.stage import make_axis, nice_step
+from ..run.picture_file import PictureContent, ways_of
+from ..scene.scene import Scene
+
+SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
+_LIGHT = ("reflectivity", "intensity")  # columns for the picture of intensity, the better first
+SIDES_RATIO = 2  # longer side to shorter, at most, or legends do not fit
+FRAME = (0.085, 0.115, 0.70, 0.755)  # left, bottom, width, height of the plot on the page
+MOST_TRIALS = 1000
+PATH_COLOUR, TRIAL_COLOUR = "#d6336c", "#5b8fd0"
+COVERED, UNCOVERED, HIDDEN = range(3)  # hidden from all candidates
+COLOURS = np.stack([theme.rgb(c) for c in ("#5b9bd5", "#ee7733", theme.CLAY)])
+_BLOCK = 4  # pixels a side
+
+
+def draw_pictures(
+    shown: PictureContent,
+    cloud: Path,
+    folder: str | Path,
+    only: Sequence[str] = (),
+    size: tuple[int, int] = SIZE,
+    colour: str = Z.name,
+) -> Iterator[Path]:
+    """Draw pictures, those in `only`, into a folder, which is made; see `picture_makers`."""
+    least, most = min(size), max(size)
+    if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
+        raise LidarpoolError(
+            f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
+            f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
+        )
+    columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
+    makers = picture_makers(shown, cloud, columns, size, colour)
+    for name in only:
+        if name not in PICTURES:
+            there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
+            raise LidarpoolError(f"There is no picture {name!r}.{there}")
+        if name not in makers:
+            why = f"the cloud has no column {' or '.join(_LIGHT)}"
+            if name == "path":
+                why = "its run planned no path"
+            elif shown.coordinates == "sensor":
+                why = "points are in the axes of their sensors"
+            raise LidarpoolError(f"There is no picture {name!r}: {why}.")
+    with explained(f"The folder {folder} cannot be made", "give another"):
+        Path(folder).mkdir(parents=True, exist_ok=True)
+    for name in only or makers:
+        path = Path(folder) / f"{name}.png"
+        makers[name]().save(path)
+        yield path
+
+
+def picture_makers(
+    shown: PictureContent,
+    cloud: Path,
+    columns: Collection[str],
+    size: tuple[int, int] = SIZE,
+    colour: str = Z.name,
+) -> dict[str, Callable[[], Page]]:
+    """Return functions that draw pictures, all from the same viewpoint.
+
+    Without planning there is no picture of the path; and none of points in the axes of their
+    sensors, which do not fit the scene. The file `cloud` is read when it is drawn, and coloured by
+    the column `colour`; its `columns` tell whether there is a picture of intensity.
+    """
+    alone = shown.coordinates == "sensor"
+    middle = shown.duration_ns / 2
+
+    @cache
+    def shot() -> SurfaceView:
+        # A moving sensor has a marker at half time, and a line for its trajectory.
+        places = [w.at(middle)[None] if w.moves else w.positions for w in shown.sensors]
+        scene = shown.scene
+        return take_shot(
+            scene.solid(middle),
+            np.concatenate([np.empty((0, 3)), *places]) + scene.origin,
+            paths=[way.positions for way in shown.sensors if way.moves],
+            around=ways_of(shown.sensors, scene.actors, shown.duration_ns),
+            actors=len(scene.actors),
+            when=shown.when,
+            models=shown.models,
+            size=size,
+        )
+
+    @cache
+    def points() -> Cloud:
+        return CloudFile(cloud, shown.own).choose(MOST_POINTS)
+
+    def draw_counts() -> Page:
+        places = np.empty((0, 3)) if alone else points().positions - shown.scene.origin
+        return draw_hits(shot(), shown.hit_counts, places, shown.sample_rays)
+
+    def draw_points() -> Page:
+        file = CloudFile(cloud, shown.own)
+        known = with_rgb({name: c for c in (Z, *file.table) for name in (c.name, c.in_files)})
+        if colour not in known:
+            there = list(dict.fromkeys(c.name for c in known.values()))
+            raise LidarpoolError(
+                f"{cloud} has no column {colour!r}."
+                + (did_you_mean(colour, known) or f" There are {', '.join(there)}.")
+            )
+        column = known[colour]
+        return draw_cloud(shot(), points(), len(file), column, shown.names_of(column))
+
+    makers: dict[str, Callable[[], Page]] = {
+        "scene": lambda: draw_scene(shot(), shown.triangles),
+        "hits": draw_counts,
+    }
+    if not alone:
+        light = next((TABLE[name] for name in _LIGHT if name in columns), None)
+        if light is not None:
+            makers["intensity"] = lambda: draw_cloud(
+                shot(), points(), len(CloudFile(cloud)), light, solid=True
+            )
+        makers["cloud"] = draw_points
+    planning, plan = shown.planning, shown.plan
+    if planning is not None and plan is not None:
+        makers["path"] = lambda: draw_path(
+            planning, plan, shown.trials, shown.scene.origin[:2], size
+        )
+    return makers
+
+
+def draw_path(
+    planning: Planning, plan: Plan, trials: Sequence[Floats], origin: Floats, size: tuple[int, int]
+) -> Page:
+    """Draw a plan from above: obstacles, ends, the trials' paths faint and the best one bold.
+
+    `trials` are the corners (w, 2) of their paths; of more than 1000 an evenly spaced sample is
+    drawn. `origin` is x and y of the local origin: the axes have world coordinates.
+    """
+    page = Page(size)
+    unit = page.unit
+    best = plan.path
+    every = [np.concatenate([best[:1], trial, best[-1:]]) for trial in trials]
+    others = [every[k] for k in even_indices(len(every), MOST_TRIALS)]
+    (x0, y0), (x1, y1) = _limits(best, others, planning, size).tolist()
+    axes = page.chart(FRAME, xlim=(x0, x1), ylim=(y0, y1), aspect="equal")
+    step = nice_step((x1 - x0) / 8)
+    for side, name, low, high, start in (
+        (axes.xaxis, "x", x0, x1, origin[0]),
+        (axes.yaxis, "y", y0, y1, origin[1]),
+    ):
+        ticks = make_axis(name, low, high, step, float(start))
+        side.set_ticks(ticks.ticks, ticks.labels)
+        side.set_label_text(ticks.title)
+    circles = zip(planning.centres, planning.radii, strict=True)
+    discs = PatchCollection(
+        [Circle((x, y), radius) for (x, y), radius in circles],
+        facecolor=theme.UNSEEN, edgecolor=theme.MUTED, linewidth=0.6 * unit,
+    )  # fmt: skip
+    axes.add_collection(discs)
+    alpha = float(np.clip(6 / max(len(others), 1), 0.08, 0.6))
+    axes.add_collection(
+        LineCollection(others, colors=TRIAL_COLOUR, linewidths=0.8 * unit, alpha=alpha)
+    )
+    axes.plot(*best.T, color=PATH_COLOUR, lw=2.0 * unit, solid_joinstyle="round", zorder=4)
+    axes.plot(*best[1:-1].T, "o", color=PATH_COLOUR, ms=2.6 * unit, zorder=5)
+    _ends(axes, page, planning)
+    key = [Line2D([], [], color=PATH_COLOUR, lw=2 * unit, label="Best path")]
+    if others:
+        label = plural(len(others), "trial")
+        key.append(Line2D([], [], color=TRIAL_COLOUR, lw=0.8 * unit, alpha=0.6, label=label))
+    if len(planning.radii):
+        key.append(
+            Line2D([], [], ls="", marker="o", color=theme.UNSEEN, mec=theme.MUTED,
+                   mew=0.6 * unit, ms=7 * unit, label="Obstacle")
+        )  # fmt: skip
+    page.key(key, 7.4)
+    page.title("Planned path", _verdict(plan, every))
+    return page
+
+
+def _verdict(plan: Plan, trials: Sequence[Floats]) -> str:
+    """Caption: length, shortest possible, collisions, and the other trials."""
+    shortest = "discs cut the target off"
+    if math.isfinite(plan.shortest_possible) and plan.shortest_possible > 0:
+        shortest = f"shortest possible {plan.shortest_possible:.2f} m ({plan.excess:+.2%})"
+    length = f"length {plan.length:.2f} m · {shortest}"
+    state = "collision-free" if plan.collision_free else "enters a disc"
+    best_of = f"best of {plural(plan.trials, 'trial')}"
+    if len(trials) > 1:  # equal paths are hidden by the best one
+        longest = max(float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum()) for path in trials)
+        best_of += f", the longest {longest:.2f} m"
+    return f"{length.replace('-', '−')} · {state} · {best_of}"
+
+
+def _limits(
+    best: Floats, others: Sequence[Floats], planning: Planning, size: tuple[int, int]
+) -> Floats:
+    """Lowest and highest corner (2, 2) of the plot, in the page's proportions."""
+    reach = planning.radii[:, None]
+    shown = np.concatenate([best, *others, planning.centres - reach, planning.centres + reach])
+    low, high = shown.min(axis=0), shown.max(axis=0)
+    width = np.maximum(high - low, 1e-3) * 1.1
+    room = np.array([FRAME[2] * size[0], FRAME[3] * size[1]])
+    half = room * (width / room).max() / 2
+    middle = (low + high) / 2
+    return np.stack([middle - half, middle + half])
+
+
+def _ends(axes: Axes, page: Page, planning: Planning) -> None:
+    """Mark and name start and target."""
+    halo = [withStroke(linewidth=2.2 * page.unit, foreground=theme.GROUND)]
+    middle = sum(axes.get_xlim()) / 2
+    for name, place, marker, size in (
+        ("start", planning.start, "o", 6),
+        ("target", planning.target, "*", 10),
+    ):
+        axes.plot(
+            *place, marker, color=theme.INK, ms=size * page.unit, mec=theme.GROUND,
+            mew=0.8 * page.unit, zorder=6,
+        )  # fmt: skip
+        left = place[0] > middle  # names are towards the middle, inside the plot
+        axes.annotate(
+            name, place, xytext=(-8 * page.unit if left else 8 * page.unit, 0),
+            textcoords="offset points", ha="right" if left else "left", va="center",
+            fontsize=7.6 * page.unit, color=theme.INK, family=FONT, path_effects=halo, zorder=7,
+        )  # fmt: skip
+
+
+def draw_stations(scene: Scene, plan: StationPlan) -> Page:
+    """Draw the scene of a plan by what its stations see: exactly, in each pixel, with shadows.
+
+    Actors are left out.
+    """
+    shot = take_shot(replace(scene, actors=()), plan.stations)
+    page = Page(SIZE)
+    axes = page.show(shot, _by_coverage(shot, plan).paint(COLOURS, 0.6))
+    page.numbers(axes, shot)
+    names = ("covered", "not covered", "out of sight")
+    page.legend([*zip(names, COLOURS, strict=True)], "station")
+    places = plural(len(plan.candidates), "place")
+    page.title(
+        plural(len(plan.stations), "station").capitalize(),
+        f"{plan.coverage[-1]:.1%} covered of what can be seen from {places}",
+        plan.sight.sensor.model,
+    )
+    return page
+
+
+def _by_coverage(shot: SurfaceView, plan: StationPlan) -> SurfaceView:
+    """Return the shot with COVERED, UNCOVERED or HIDDEN in place of triangles."""
+    sight = Sight(shot.uncut, plan.sight.sensor, plan.sight.slant_deg)  # it has been moved a little
+    stations, places = (p - shot.scene.origin for p in (plan.stations, plan.candidates))
+    width = shot.camera.size[0]
+    kinds = np.full(shot.whole.triangle.size, HIDDEN)
+    surface = np.flatnonzero(shot.whole.triangle >= 0)
+    covered = _seen(sight, stations, shot.whole, surface)
+    kinds[surface[covered]] = COVERED
+    # Of each triangle one pixel in a block is asked: to ask all would take minutes.
+    left = surface[~covered]
+    block = left // width // _BLOCK * width + left % width // _BLOCK
+    key = block * np.int64(len(shot.scene.faces)) + shot.whole.triangle[left]
+    _, asked, alike = np.unique(key, return_index=True, return_inverse=True)
+    visible = _seen(sight, places, shot.whole, left[asked])
+    kinds[left[visible[alike]]] = UNCOVERED
+    edges = shot.finer.triangle.size // max(len(shot.edges), 1)
+    finer = np.repeat(np.where(kinds[shot.edges] == COVERED, HIDDEN, kinds[shot.edges]), edges)
+    some = np.flatnonzero(shot.finer.triangle >= 0)
+    finer[some[_seen(sight, stations, shot.finer, some)]] = COVERED
+    return replace(shot, whole=_painted(shot.whole, kinds), finer=_painted(shot.finer, finer))
+
+
+def _painted(samples: Samples, kinds: Ints) -> Samples:
+    return replace(samples, triangle=np.where(samples.triangle >= 0, kinds, samples.triangle))
+
+
+def _seen(sight: Sight, places: Floats, samples: Samples, which: Ints) -> Bools:
+    """Whether any of places (p, 3) sees the side of the samples that the camera sees: (k,)."""
+    points = samples.position[which].astype(np.float64)
+    normals = samples.normal[which].astype(np.float64)
+    hidden = np.arange(len(which))
+    for place in places:
+        hidden = hidden[sight.sides(place, points[hidden], normals[hidden]) <= 0]
+    return ~np.isin(np.arange(len(which)), hidden)

@@ -1,0 +1,66 @@
+"""What a run tells a live page, see `lidarpool.live.live_page`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from poolpart import Partition
+
+from ..datasets.job_table import JobRow, Value
+from ..pipeline.messages import Receipt, ScanFrame
+from .job_points import JobPoints
+from .progress import Progress
+from .run_result import RunResult
+
+
+@dataclass(frozen=True)
+class JobNow:
+    """A job that is being cast or written, at one moment.
+
+    `stored` of its `scans` are in storage, with `points`; `seconds` is the casting time so far.
+    """
+
+    name: str
+    values: Mapping[str, Value]
+    stored: int
+    scans: int
+    points: int
+    seconds: float
+    writing: bool
+
+
+class RunPage:
+    """What a run of one job or many tells its live page; this one shows nothing.
+
+    Methods are called in the run's thread and must return at once, `look` in a thread that removes
+    what is left of ended jobs.
+    """
+
+    def begun(self, points: JobPoints) -> None:
+        """Show a job from now on, the only one of its run, and what an earlier run has left."""
+
+    def follow(self, partitions: Mapping[str, Partition]) -> None:
+        """Show what goes on from now on, on these partitions."""
+
+    def on_parts(self, receipts: Sequence[Receipt]) -> None:
+        """Show parts of the only job that were committed."""
+
+    def on_frame(self, frame: ScanFrame) -> None:
+        """Show a frame of the only job."""
+
+    def on_progress(self, progress: Progress, under_way: Callable[[], Sequence[JobNow]]) -> None:
+        """Show the progress; KeyboardInterrupt if a user of the page has stopped the run."""
+
+    def ended(self, row: JobRow) -> None:
+        """Show a job that has ended, in this run or an earlier one."""
+
+    def look(self, row: JobRow, points: JobPoints) -> None:
+        """Read points of a job that is done, before its parts are removed, if they are shown."""
+
+    def finish(self, seconds: float, result: RunResult | None = None) -> None:
+        """Show that all is done, after so long, and the result of a survey; parts may then go."""
+
+    def stay(self, cloud: Path | None = None) -> None:
+        """Keep the page until its user ends it; points are read from the written `cloud`."""

@@ -1,0 +1,140 @@
+"""What a run gives: the result of a survey, before anything is made of it, or the sums of many."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any
+
+from poolpart import TaskRecord
+
+from ..base.arrays import Floats32, Ints
+from ..columns.cloud import Cloud
+from ..columns.parts import StoredCloud
+from ..datasets.job_table import JobRow
+from ..pipeline.task_book import StageTotals
+from ..plan import Plan, Planning, Trial
+from ..scene.scene import Scene
+from ..sensor import Survey
+
+
+@dataclass(frozen=True, eq=False)
+class RunResult:
+    """What a run gives, before anything is made of it; `lidarpool.api.result` adds to that.
+
+    Parameters
+    ----------
+    points
+        The points, in parts: read in order a piece at a time, or written with their `save`.
+    plan, trials
+        The best path and all trials; None and empty without planning.
+    backend
+        Name of the ray-casting backend that was used.
+    rays, hits
+        Rays fired, and those that hit something.
+    stages
+        All tasks of each stage together.
+    resumed
+        Scans from an earlier run. `records` and seconds are of this run only.
+    notes
+        Remarks for the user, such as that the GPU partition had no GPU.
+    identity
+        Fingerprints of scene, survey and planning, and versions of the software.
+    sample_rays
+        float32 (k, 2, 3): first and last point of some rays, metres, local coordinates.
+    seconds, survey_seconds, planning_seconds
+        Wall time of all, of the survey and of the planning.
+    replayed
+        Batches that were offered again.
+    """
+
+    scene: Scene
+    survey: Survey
+    planning: Planning | None
+    points: StoredCloud
+    plan: Plan | None
+    trials: tuple[Trial, ...]
+    backend: str
+    rays: int
+    hits: int
+    stages: tuple[StageTotals, ...]
+    resumed: int
+    notes: tuple[str, ...]
+    identity: Mapping[str, str]
+    _hit_counts: Callable[[], Ints] = field(repr=False)
+    sample_rays: Floats32 = field(repr=False)
+    seconds: float = 0.0
+    survey_seconds: float = 0.0
+    planning_seconds: float = 0.0
+    replayed: int = 0
+
+    @property
+    def thinned(self) -> str:
+        """Why there are fewer points than hits, for behind their number; empty if all are kept."""
+        every = self.survey.keep_every
+        return f", one of every {every:,} hits of a scan (keep_every)" if every > 1 else ""
+
+    @property
+    def records(self) -> tuple[TaskRecord, ...]:
+        """Tasks of the run, with worker and time; every n-th of a stage with thousands."""
+        return tuple(record for totals in self.stages for record in totals.records)
+
+    @cached_property
+    def cloud(self) -> Cloud:
+        """The points in memory, read on first use."""
+        return self.points.load()
+
+    @cached_property
+    def hit_counts(self) -> Ints:
+        """Hits by `counters` of the scene, read when first asked for."""
+        return self._hit_counts()
+
+
+@dataclass(frozen=True)
+class CampaignRun:
+    """What `Campaign.run` returns.
+
+    Parameters
+    ----------
+    failed
+        Jobs that have failed, with `number`, `name`, `values` and `error`; see `jobs.csv`.
+    done, points, rays
+        Jobs in the data set, their points, and the rays that were cast for them.
+    casting_seconds
+        Of all casting tasks together.
+    resumed
+        Jobs of an earlier run.
+    seconds
+        Wall time of this run.
+    stages
+        Tasks of each stage.
+    notes, sensors
+        Remarks for the user, and the sensors of the jobs that are done, {name: models and rates}.
+    """
+
+    failed: tuple[JobRow, ...]
+    done: int
+    points: int
+    rays: int
+    casting_seconds: float
+    resumed: int
+    seconds: float
+    stages: tuple[StageTotals, ...] = ()
+    notes: tuple[str, ...] = ()
+    sensors: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(
+        cls, rows: Iterable[JobRow], seconds: float, resumed: int | None = None, **more: Any
+    ) -> CampaignRun:
+        """Sum up the rows of a campaign, all of which are of an earlier run by default."""
+        failed, done, points, rays, casting = [], 0, 0, 0, 0.0
+        for row in rows:
+            if row.error:
+                failed.append(row)
+            else:
+                done, points, rays = done + 1, points + row.points, rays + row.rays
+                casting += row.seconds
+        known = done if resumed is None else resumed
+        return cls(tuple(failed), done, points, rays, casting, known, seconds, **more)

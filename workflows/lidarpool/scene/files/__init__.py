@@ -1,0 +1,1 @@
+"""Readers of mesh files: bytes in, meshes and scene graphs out."""

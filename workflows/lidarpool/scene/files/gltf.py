@@ -1,0 +1,620 @@
+"""glTF 2.0 files, .glb and .gltf, after the specification by the Khronos Group (2021).
+
+This is not trimesh 5.2, which puts a node of several parents into one place, loses what hangs on a
+camera, ignores sparse and normalised positions, skins and required extensions, and reads neither
+fans nor files without scenes; nor assimp, which skips what it cannot read. Only triangles are read,
+and of materials where they are transparent, and their base colours.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import re
+import struct
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import Any, TypeVar
+from urllib.parse import unquote_to_bytes
+
+import numpy as np
+
+from ...base.allowance import Allowance
+from ...base.arrays import AnyArray, Bytes, Floats, Ints
+from ...base.words import plural
+from ...sensor.trajectory import matrices
+from ..colours import LINEAR, Colours, as_srgb
+from ..masks import (
+    FACE_BYTES,
+    MaskError,
+    MaskNotes,
+    Texture,
+    Wrap,
+    read_colours,
+    read_opacity,
+)
+from ..scene_mesh import SceneMesh
+from .companions import image_file, named_file
+from .polygons import check_corners, fanned, unrolled
+from .scene_graph import (
+    MOST_NODES,
+    SMALLER,
+    Content,
+    MeshFileError,
+    Node,
+    Piece,
+    Wanted,
+    instances,
+    joined,
+    settled,
+)
+
+# Extensions that do not change shapes, or that are supported here.
+_READ = re.compile(
+    r"KHR_materials_|KHR_techni|\w+_texture_|KHR_texture|KHR_lights|KHR_mesh_quantization"
+)
+_DRACO = "KHR_draco_mesh_compression"
+_INSTANCING = "EXT_mesh_gpu_instancing"
+_TRANSMISSION = "KHR_materials_transmission"
+_GLOSSY = "KHR_materials_pbrSpecularGlossiness"  # materials of older files
+
+_TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+V = TypeVar("V")
+_WRAPS: dict[Any, Wrap] = {33071: "clamp", 33648: "mirror"}
+
+
+def read_gltf(data: bytes, path: Path, wanted: Wanted) -> Content:
+    """Read the default scene of a file, or all nodes if it has no scenes.
+
+    Without masks, triangles are solid; without these and colours, no image is read.
+    """
+    header, body = _chunks(data)
+    _check(header)
+    reader = _Reader(header, body, path, len(data), wanted)
+    content = settled(instances(_roots(header), reader.node, path.stem))
+    content.unit_m, content.up_axis, content.turned = 1.0, "y", "as glTF asks"
+    content.notes = [*reader.notes.lines(), *reader.still()]
+    content.generator = str(header.get("asset", {}).get("generator", ""))
+    return content
+
+
+_OLD = "is glTF 1.0, which is not supported: convert it to glTF 2.0"
+
+
+def _chunks(data: bytes) -> tuple[dict[str, Any], bytes]:
+    """JSON object, and the binary buffer of a .glb."""
+    body = b""
+    if data[:4] == b"glTF" and len(data) >= 20:
+        version, total, size = struct.unpack_from("<III", data, 4)
+        if version == 1:
+            raise MeshFileError(_OLD)
+        if len(data) < total:
+            raise MeshFileError(f"is cut short: {total} bytes announced, {len(data)} there")
+        body = data[28 + size : total]
+        data = data[20 : 20 + size]
+    elif data[:1] not in b"{[ \t\r\n":
+        raise MeshFileError("is not glTF")
+    try:
+        header = json.loads(data)
+    except (ValueError, RecursionError) as error:
+        raise MeshFileError(f"holds no valid JSON ({error})") from error
+    if not isinstance(header, dict):
+        raise MeshFileError("holds no glTF object")
+    return header, body
+
+
+def _check(header: dict[str, Any]) -> None:
+    """Refuse other versions, and extensions that cannot be read."""
+    # Version 1.0 names parts, instead of numbering them.
+    if str(header.get("asset", {}).get("version", "2")).startswith("1") or isinstance(
+        header.get("nodes"), dict
+    ):
+        raise MeshFileError(_OLD)
+    for name in map(str, header.get("extensionsRequired", ())):
+        if not _READ.match(name) and name not in (_DRACO, _INSTANCING):
+            raise MeshFileError(f"needs {name}, which cannot be read: export without it")
+
+
+def _roots(header: dict[str, Any]) -> list[int]:
+    """Find the outermost nodes."""
+    nodes = header.get("nodes", ())
+    if scenes := header.get("scenes"):
+        return list(scenes[header.get("scene", 0)].get("nodes", ()))
+    inner = {child for node in nodes for child in node.get("children", ())}
+    return [index for index in range(len(nodes)) if index not in inner]
+
+
+class _Reader:
+    """Nodes, meshes, accessors and buffers by their numbers, each read once."""
+
+    def __init__(
+        self,
+        header: dict[str, Any],
+        body: bytes,
+        path: Path,
+        size: int,
+        wanted: Wanted,
+    ) -> None:
+        self._header, self._body, self._path = header, body, path
+        self._wanted = wanted
+        self._allowance = Allowance(size, SMALLER)
+        self._same: dict[str, int] = {}  # {primitives of a mesh: the first with these}
+        nodes = header.get("nodes", ())
+        self._parents = {
+            child: index for index, node in enumerate(nodes) for child in node.get("children", ())
+        }
+        self._bent = cache(self._read_bent)  # keys are (mesh, weights of its targets, skin)
+        self._mesh = cache(partial(self._read_bent, weights=(), skin=None))
+        self._accessor = cache(self._read_accessor)
+        self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
+        self._texture, self._opacity = cache(self._read_texture), cache(self._read_opacity)
+        self._mask = cache(self._read_mask)
+        self._base, self._shades = cache(self._read_base), cache(self._read_shades)
+        self.notes = MaskNotes()
+
+    def _part(self, kind: str, index: Any) -> dict[str, Any]:
+        """Part of the file by its number; a negative one would count from the end."""
+        part: dict[str, Any] = self._header[kind][_natural(index)]
+        return part
+
+    def node(self, index: int) -> Node:
+        """Node `index`; without a name it gets that of its mesh."""
+        found = self._part("nodes", index)
+        name, meshes, copies = str(found.get("name") or ""), [], None
+        if "mesh" in found:
+            name = name or str(self._part("meshes", found["mesh"]).get("name") or "")
+            # Some programs write a mesh for each node, all of the same accessors.
+            content = json.dumps(self._part("meshes", found["mesh"])["primitives"], sort_keys=True)
+            skin, weights = found.get("skin"), self._weights(found)
+            if skin is None and not any(weights):
+                meshes = self._mesh(self._same.setdefault(content, found["mesh"]))
+            else:
+                meshes = self._bent(found["mesh"], weights, skin)
+            if skin is not None:  # its joints place it, not the node
+                copies = np.linalg.inv(self._world(index)).astype(np.float64)[None]
+            if instancing := found.get("extensions", {}).get(_INSTANCING):
+                copies = self._copies(instancing.get("attributes", {}))
+        return Node(name, _matrix(found), meshes, found.get("children", ()), copies)
+
+    def _copies(self, attributes: dict[str, Any]) -> Floats | None:
+        """Matrices (k, 4, 4) of the copies of a node's mesh; None if it has one place."""
+        named = ("TRANSLATION", "ROTATION", "SCALE")
+        indices = {name: attributes[name] for name in named if name in attributes}
+        if not indices:
+            return None
+        counts = [_natural(self._part("accessors", at)["count"]) for at in indices.values()]
+        if len({*counts}) > 1:
+            raise ValueError(f"the attributes of {_INSTANCING} have {counts} rows")
+        if counts[0] > MOST_NODES:
+            raise MeshFileError(
+                f"places a mesh {counts[0]:,} times by {_INSTANCING}, of at most {MOST_NODES:,}: "
+                "export it in parts"
+            )
+        self._allowance.take(2 * 128 * counts[0])
+        rows = {name: self._accessor(at).astype(np.float64) for name, at in indices.items()}
+        return _matrices(*(rows.get(name) for name in named))
+
+    def still(self) -> list[str]:
+        """Return a note on what moves in the file, and stands still here."""
+        bent, found = self._bent.cache_info().currsize, len(self._header.get("animations", ()))
+        meshes = f", of {plural(bent, 'bent mesh', 'bent meshes')}" * bool(bent)
+        return [f"has {plural(found, 'animation')}{meshes}: all stands still"] * bool(found)
+
+    def _weights(self, node: dict[str, Any]) -> tuple[float, ...]:
+        """Weights of the morph targets of a node's mesh."""
+        mesh = self._part("meshes", node["mesh"])
+        if not any("targets" in primitive for primitive in mesh["primitives"]):
+            return ()
+        return tuple(map(float, node.get("weights", mesh.get("weights", ()))))
+
+    def _world(self, index: int) -> Floats:
+        """Matrix (4, 4) from a node's coordinates to those of the scene."""
+        matrix, seen = np.eye(4), set()
+        at: int | None = index
+        while at is not None:
+            if at in seen:
+                raise ValueError("nodes contain each other")
+            seen.add(at)
+            matrix, at = _matrix(self._part("nodes", at)) @ matrix, self._parents.get(at)
+        return matrix
+
+    def _read_bent(
+        self, index: int, weights: tuple[float, ...], skin: int | None
+    ) -> list[SceneMesh]:
+        """Return a mesh with its morph targets; of a skin, in the coordinates of the scene.
+
+        Its primitives, which differ by material only, are one.
+        """
+        mesh = self._part("meshes", index)
+        surfaces = [p for p in mesh["primitives"] if p.get("mode", 4) >= 4]
+        name = str(mesh.get("name") or self._path.stem)
+        joints = None if skin is None else self._joints(skin)
+
+        def piece(primitive: dict[str, Any]) -> Piece:
+            made = self._primitive(primitive)
+            if not len(made.faces) or (joints is None and not any(weights)):
+                return made
+            if _DRACO in primitive.get("extensions", {}):
+                raise MeshFileError(f"bends what is packed with {_DRACO}: export it without")
+            self._allowance.take(600 * len(made.vertices))  # of matrices and points, for a time
+            vertices = made.vertices.astype(np.float64)
+            for weight, target in zip(weights, primitive.get("targets", ()), strict=False):
+                if weight and "POSITION" in target:
+                    vertices += weight * self._accessor(target["POSITION"])
+            if joints is not None:
+                vertices = self._skinned(vertices, primitive["attributes"], joints)
+            return made._replace(vertices=vertices)
+
+        return joined(name, map(piece, surfaces), self._allowance)
+
+    def _joints(self, skin: int) -> Floats:
+        """Matrices (j, 4, 4) of a skin's joints, from its mesh to the scene; glTF 2.0, 3.7.3."""
+        found = self._part("skins", skin)
+        worlds = np.array([self._world(joint) for joint in found["joints"]])
+        if (bound := found.get("inverseBindMatrices")) is not None:
+            columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
+            worlds = worlds @ columns.reshape(-1, 4, 4).transpose(0, 2, 1)
+        return worlds
+
+    def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:
+        """Blend places of vertices (v, 3) by the joints that hold them."""
+        blend, total = np.zeros((len(vertices), 4, 4)), np.zeros(len(vertices))
+        sets = (name.removeprefix("JOINTS") for name in sorted(at) if name.startswith("JOINTS_"))
+        for number in sets:
+            rows = self._accessor(at[f"JOINTS{number}"]).astype(np.int64)
+            weights = self._accessor(at[f"WEIGHTS{number}"]).astype(np.float64)
+            for joint, weight in zip(rows.T, weights.T, strict=True):
+                if joint.max(initial=0) >= len(joints):
+                    raise ValueError(f"a vertex has joint {joint.max()} of {len(joints)}")
+                blend += weight[:, None, None] * joints[joint]
+                total += weight
+        loose = np.flatnonzero(total <= 0)  # other readers give these to their first joint
+        blend[loose] = joints[self._accessor(at["JOINTS_0"])[loose, 0].astype(np.int64)]
+        total[loose] = 1.0
+        blend /= total[:, None, None]
+        moved = np.einsum("vij,vj->vi", blend[:, :3, :3], vertices) + blend[:, :3, 3]
+        return np.asarray(moved)
+
+    def _primitive(self, primitive: dict[str, Any]) -> Piece:
+        position, index = primitive["attributes"].get("POSITION"), primitive.get("indices")
+        packed = primitive.get("extensions", {}).get(_DRACO)
+        if position is None:
+            return Piece(np.empty((0, 3)), np.empty((0, 3), np.int64))
+        if packed and "bufferView" not in self._part("accessors", position):
+            mesh = _unpacked(bytes(self._view(packed["bufferView"])), self._allowance)
+            vertices = np.asarray(mesh.points).reshape(-1, 3)
+            faces = np.asarray(mesh.faces, np.int64).reshape(-1, 3)
+            return self._dressed(Piece(vertices, faces), primitive, mesh)
+        vertices = self._accessor(position)
+        mode = primitive.get("mode", 4)
+        # The corners, and the triangles of strips and fans, before they are checked.
+        count = len(vertices if index is None else self._accessor(index))
+        self._allowance.take((8 if mode == 4 else 24) * count)
+        corners = np.arange(count)
+        if index is not None:
+            corners = self._accessor(index)[:, 0].astype(np.int64)
+        if mode == 4:
+            faces = corners[: len(corners) // 3 * 3].reshape(-1, 3)
+        else:
+            faces = unrolled(corners) if mode == 5 else fanned(corners)
+        return self._dressed(Piece(vertices, faces), primitive)
+
+    def _dressed(self, piece: Piece, primitive: dict[str, Any], mesh: Any = None) -> Piece:
+        """Return a piece with mask and colours; `mesh` is unpacked by Draco."""
+        if self._wanted.colours and len(piece.faces):
+            with self.notes.without_colour(self._material_name(primitive.get("material"))):
+                piece = piece._replace(colours=self._coloured(primitive, piece.faces, mesh))
+        return self._cut(piece, primitive, mesh)
+
+    def _coloured(self, primitive: dict[str, Any], faces: Ints, mesh: Any) -> Colours | None:
+        """Colours of triangles; None if they have none."""
+        number, corners, colours = primitive.get("material"), None, None
+        if not self._allowance.fits(FACE_BYTES * len(faces)):
+            raise MaskError("there are too many triangles")
+        if "COLOR_0" in primitive["attributes"]:
+            light = self._normalised(self._attribute("COLOR_0", primitive, mesh))
+            check_corners(faces, len(light))
+            if light.shape[1] < 3:
+                raise MaskError("its COLOR_0 is not red, green and blue")
+            corners = as_srgb(np.clip(light[:, :3], 0, 1))[faces]
+            colours = Colours.of_corners(corners)
+        if number is not None:
+            base, info = self._base(_natural(number))
+            if isinstance(base, Texture):
+                colours = base.colours(self._coordinates(info, primitive, mesh), faces)
+            else:
+                colours = Colours.plain(base, len(faces))
+        return colours and replace(colours, corners=corners)
+
+    def _read_base(self, number: int) -> tuple[Texture | Bytes, dict[str, Any]]:
+        """Return the texture of a material's base colour, and its use, or one colour (1, 1, 3)."""
+        material = self._part("materials", number)
+        info, factor = _base_of(material)
+        light = tuple(float(np.clip(one, 0, 1)) for one in factor[:3])
+        if len(light) < 3:
+            raise MaskError("its factor is not red, green and blue")
+        if info is None:
+            return as_srgb(light).reshape(1, 1, 3), {}
+        texture = self._part("textures", info["index"])
+        return self._shades((_image_of(texture), light, *self._wraps(texture))), info
+
+    def _read_shades(self, key: tuple[int, tuple[float, ...], Wrap, Wrap]) -> Texture:
+        """Texture of an image, by which a colour is multiplied, and how it goes on."""
+        image, light, along, across = key
+        found = self._image(image, partial(read_colours, notes=self.notes))
+        if light != (1.0, 1.0, 1.0):
+            scaled = [as_srgb(LINEAR * share) for share in light]
+            found = np.stack([by[found[..., k]] for k, by in enumerate(scaled)], axis=-1)
+        return Texture(found, (along, across), self._allowance)
+
+    def _wraps(self, texture: dict[str, Any]) -> tuple[Wrap, Wrap]:
+        sampler = self._part("samplers", texture["sampler"]) if "sampler" in texture else {}
+        along, across = (_WRAPS.get(sampler.get(name), "repeat") for name in ("wrapS", "wrapT"))
+        return along, across
+
+    def _cut(self, piece: Piece, primitive: dict[str, Any], mesh: Any) -> Piece:
+        """Return a piece with the mask of its material."""
+        number = primitive.get("material")
+        if number is not None and self._wanted.masks and len(piece.faces):
+            with self.notes.instead(self._material_name(number)):
+                if found := self._texture(number):
+                    texture, info = found
+                    uv = self._coordinates(info, primitive, mesh)
+                    piece = piece._replace(cutout=texture.cutout(uv, piece.faces))
+        return piece
+
+    def _material_name(self, number: Any) -> str:
+        try:
+            name = str(self._part("materials", number).get("name") or "")
+        except (ValueError, KeyError, IndexError, TypeError, AttributeError):
+            name = ""
+        return name[:80] or f"material {str(number)[:20]}"
+
+    def _read_texture(self, number: int) -> tuple[Texture, dict[str, Any]] | None:
+        """Texture of a material, and its use of it; None if the material is solid."""
+        material = self._part("materials", number)
+        mode = material.get("alphaMode", "OPAQUE")
+        if mode not in ("MASK", "BLEND"):
+            if _extension(material, _TRANSMISSION).get("transmissionFactor", 0) > 0:
+                self.notes.glass[self._material_name(number)] = None
+            return None
+        info, factor = _base_of(material)
+        cutoff = material.get("alphaCutoff", 0.5) if mode == "MASK" else 0.5
+        passing = np.flatnonzero(np.arange(256) / 255 * factor[3] >= cutoff)
+        least = int(passing[0]) if len(passing) else 256
+        texture = {} if info is None else self._part("textures", info["index"])
+        image = -1 if info is None else _image_of(texture)
+        opacity = None if info is None else self._opacity(image)
+        if info is None or opacity is None or (mode == "BLEND" and opacity.max() < least):
+            if least > 255 or opacity is not None:
+                self.notes.glass[self._material_name(number)] = None
+            return None
+        if opacity.min() >= least:
+            return None
+        return self._mask((image, least, *self._wraps(texture))), info
+
+    def _read_mask(self, key: tuple[int, int, Wrap, Wrap]) -> Texture:
+        """Texture of an image, its least alpha that stops light, and how it goes on."""
+        image, least, along, across = key
+        opacity = self._opacity(image)
+        assert opacity is not None
+        return Texture(opacity >= least, (along, across), self._allowance)
+
+    def _read_opacity(self, index: int) -> Bytes | None:
+        """Opacity of an image; None if it is opaque everywhere."""
+        return self._image(index, read_opacity)
+
+    def _image(self, index: int, read: Callable[[Path | bytes, Allowance], V]) -> V:
+        """Decode an image."""
+        image = self._part("images", index)
+        if "bufferView" in image:
+            return read(bytes(self._view(image["bufferView"])), self._allowance)
+        uri = image["uri"]
+        if uri.startswith("data:"):
+            return read(_inline(uri), self._allowance)
+        return read(image_file(self._path, uri, self._wanted, self._allowance), self._allowance)
+
+    def _coordinates(self, info: dict[str, Any], primitive: dict[str, Any], mesh: Any) -> Any:
+        """Texture coordinates (v, 2) of a primitive."""
+        moved = _extension(info, "KHR_texture_transform")
+        name = f"TEXCOORD_{moved.get('texCoord', info.get('texCoord', 0))}"
+        if name not in primitive["attributes"]:
+            raise MaskError("texture coordinates are missing")
+        uv = self._attribute(name, primitive, mesh)
+        if uv.shape[1] != 2:
+            raise MaskError("its texture coordinates are not pairs")
+        if moved:
+            # Of KHR_texture_transform: scaled, rotated anticlockwise as v grows down, moved.
+            turn = float(moved.get("rotation", 0))
+            c, s = np.cos(turn), np.sin(turn)
+            self._allowance.take(32 * len(uv))
+            uv = uv * np.array(moved.get("scale", (1, 1)), np.float64)
+            uv = uv @ np.array([[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
+        return uv
+
+    def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
+        """Numbers (v, width) of the vertices of a primitive."""
+        accessor = primitive["attributes"][name]
+        if mesh is None:
+            return self._accessor(accessor)
+        packed = primitive["extensions"][_DRACO]["attributes"][name]
+        rows = np.asarray(mesh.get_attribute_by_unique_id(packed)["data"])
+        normal = self._part("accessors", accessor).get("normalized")
+        return self._normalised(rows) if normal else rows
+
+    def _read_accessor(self, index: int) -> AnyArray:
+        """Numbers (count, width) of an accessor; those of a buffer are not copied."""
+        accessor = self._part("accessors", index)
+        count, width = _natural(accessor["count"]), _WIDTHS[accessor["type"]]
+        kind = np.dtype(_TYPES[accessor["componentType"]])
+        sparse = accessor.get("sparse")
+        if sparse:
+            self._allowance.take(count * width * kind.itemsize)
+        if "bufferView" in accessor:
+            numbers = self._array(accessor, kind, count, width)
+        elif sparse:
+            numbers = np.zeros((count, width), kind)
+        else:
+            raise ValueError(f"accessor {index} has no content")
+        if sparse:
+            changed, values = sparse["indices"], sparse["values"]
+            where = np.dtype(_TYPES[changed["componentType"]])
+            rows = self._array(changed, where, sparse["count"], 1)[:, 0]
+            numbers = numbers.copy()
+            numbers[rows] = self._array(values, kind, sparse["count"], width)
+        return self._normalised(numbers) if accessor.get("normalized") else numbers
+
+    def _normalised(self, numbers: AnyArray) -> AnyArray:
+        """Fractions that integers stand for; glTF 2.0, 3.6.2.2."""
+        if numbers.dtype.kind not in "iu":
+            return numbers
+        self._allowance.take(8 * numbers.size)
+        return np.maximum(numbers / np.iinfo(numbers.dtype).max, -1.0)
+
+    def _array(self, at: dict[str, Any], kind: np.dtype[Any], count: int, width: int) -> Any:
+        """Numbers (count, width) of a buffer view, from `at['byteOffset']` on."""
+        row = kind.itemsize * width
+        stride = self._part("bufferViews", at["bufferView"]).get("byteStride", row)
+        view = self._view(at["bufferView"])[at.get("byteOffset", 0) :]
+        if not count:
+            return np.empty((0, width), kind)
+        if stride * (count - 1) + row > len(view):
+            raise ValueError(f"{count:,} elements announced, {len(view):,} bytes there")
+        return np.ndarray((count, width), kind, view, strides=(stride, kind.itemsize))
+
+    def _view(self, index: int) -> memoryview:
+        view = self._part("bufferViews", index)
+        begin = view.get("byteOffset", 0)
+        return memoryview(self._buffer(view["buffer"]))[begin : begin + view["byteLength"]]
+
+    def _read_buffer(self, index: int) -> bytes:
+        buffer = self._part("buffers", index)
+        uri = buffer.get("uri")
+        if uri is None:
+            if index:
+                raise MeshFileError("has a buffer without content, as packed files have: unpack it")
+            content = self._body
+        elif uri.startswith("data:"):
+            content = _inline(uri)
+        else:
+            content = self._beside(uri)
+        if len(content) < buffer["byteLength"]:
+            raise MeshFileError(
+                f"takes {buffer['byteLength']:,} bytes from {uri[:80] if uri else 'itself'!r}, "
+                f"which is cut short: it has {len(content):,}"
+            )
+        return content
+
+    def _read_beside(self, uri: str) -> bytes:
+        """Read a buffer file."""
+        target = named_file(self._path, uri, self._wanted)
+        if target is None:
+            raise MeshFileError(
+                f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "
+                "as .glb"
+            )
+        content = target.read_bytes()
+        self._allowance.grow(len(content))
+        return content
+
+
+def _inline(uri: str) -> bytes:
+    """Content of a data URI."""
+    kind, _, text = uri.partition(",")
+    content = unquote_to_bytes(text)
+    return base64.b64decode(content) if kind.endswith(";base64") else content
+
+
+def _extension(part: dict[str, Any], name: str) -> dict[str, Any]:
+    found: dict[str, Any] = part.get("extensions", {}).get(name, {})
+    return found
+
+
+def _base_of(material: dict[str, Any]) -> tuple[dict[str, Any] | None, Sequence[float]]:
+    """Use of the texture of a material's base colour, if it has one, and its factors."""
+    usual, glossy = material.get("pbrMetallicRoughness", {}), _extension(material, _GLOSSY)
+    info = usual.get("baseColorTexture") or glossy.get("diffuseTexture")
+    return info, usual.get("baseColorFactor") or glossy.get("diffuseFactor") or (1, 1, 1, 1)
+
+
+def _image_of(texture: dict[str, Any]) -> int:
+    """Return the number of a texture's image, of those in formats that can be read."""
+    index = texture.get("source", _extension(texture, "EXT_texture_webp").get("source"))
+    if index is None:
+        raise MaskError("its image is in a format that cannot be read")
+    return _natural(index)
+
+
+def _natural(number: Any) -> int:
+    """Check a count or an index; a negative index would count from the end."""
+    if type(number) is not int or number < 0:
+        raise ValueError(f"{number!r} is given as an index or a count")
+    return number
+
+
+def _matrix(node: dict[str, Any]) -> Floats:
+    """Matrix (4, 4) of a node, from its columns or from translation, rotation and scale."""
+    if "matrix" in node:
+        return np.array(node["matrix"], np.float64).reshape(4, 4).T
+    rows = (
+        np.array([node[name]], np.float64) if name in node else None
+        for name in ("translation", "rotation", "scale")
+    )
+    made = _matrices(*rows)
+    return np.eye(4) if made is None else made[0]
+
+
+def _matrices(
+    translation: Floats | None,
+    rotation: Floats | None,
+    scale: Floats | None,
+) -> Floats | None:
+    """Matrices (k, 4, 4) of translations (k, 3), quaternions (k, 4) and scales (k, 3)."""
+    rows = next((one for one in (translation, rotation, scale) if one is not None), None)
+    if rows is None:
+        return None
+    out = np.tile(np.eye(4), (len(rows), 1, 1))
+    if rotation is not None:
+        unit = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
+        out[:, :3, :3] = matrices(unit)
+    if scale is not None:
+        out[:, :3, :3] *= scale[:, None]
+    if translation is not None:
+        out[:, :3, 3] = translation
+    return out
+
+
+def _unpacked(data: bytes, allowance: Allowance) -> Any:
+    """Mesh that is packed with Draco."""
+    try:
+        import DracoPy
+    except ImportError as error:
+        raise MeshFileError(
+            f"is packed with {_DRACO}: install DracoPy to read it, or export without it"
+        ) from error
+    allowance.take(24 * sum(_draco_counts(data)))
+    return DracoPy.decode(data)
+
+
+def _draco_counts(data: bytes) -> tuple[int, int]:
+    """Two counts of faces and vertices that a Draco mesh announces, as its format 2.2 stores them.
+
+    The decoder makes them all, though a few bytes can stand for any number.
+    """
+    magic, version, kind, method, flags = struct.unpack_from("<5sHBBH", data)
+    if magic != b"DRACO" or kind != 1 or method > 1:
+        raise ValueError("its Draco data are not a mesh")
+    if version != 0x0202 or flags & 0x8000:
+        raise MeshFileError(
+            "has Draco data of another version than 2.2, or with metadata: export it again"
+        )
+    # Numbers of seven bits a byte, the least first; the second method has a byte more before them.
+    first, second = re.findall(rb"(?s)[\x80-\xff]*[\0-\x7f]", data[11 + method : 31])[:2]
+    return _varint(first), _varint(second)
+
+
+def _varint(data: bytes) -> int:
+    return sum((byte & 0x7F) << 7 * at for at, byte in enumerate(data))

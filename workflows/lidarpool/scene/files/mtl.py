@@ -1,0 +1,215 @@
+"""Materials of Wavefront files: colours, and images that make them transparent in places."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, field
+from functools import cache
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ...base.allowance import Allowance
+from ...base.arrays import Bytes, Floats, Ints
+from ...base.words import as_text
+from ..colours import Colours, as_bytes
+from ..masks import (
+    HALF,
+    MaskNotes,
+    Texture,
+    Wrap,
+    read_colours,
+    read_opacity,
+)
+from ..scene_mesh import Cutout
+from .companions import image_file, named_file
+from .scene_graph import SMALLER, MeshFileError, Wanted
+
+# Options of images, and the words that follow each; -o, -s and -t have one to three numbers.
+_OPTION = re.compile(
+    rb"\s*(-[ost])((?:\s+[-+.\de]+(?=\s)){0,3})|\s*(-mm)((?:\s+\S+){2})"
+    rb"|\s*(-(?:blendu|blendv|boost|texres|clamp|bm|imfchan|type|cc))(\s+\S+)",
+    re.IGNORECASE,
+)
+_WITHOUT_ALPHA = (".jpg", ".jpeg")
+_MOST_BYTES = 1 << 26  # of a file of materials
+
+
+@dataclass
+class _Image:
+    """An image of a material, as a line names it."""
+
+    name: str
+    options: dict[bytes, list[bytes]] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, words: bytes) -> _Image:
+        """Read the line after its first word."""
+        options: dict[bytes, list[bytes]] = {}
+        at = 0
+        while found := _OPTION.match(words, at):
+            key, given = (part for part in found.groups() if part is not None)
+            options[key.lower()] = given.split()
+            at = found.end()
+        return cls(as_text(words[at:].strip()), options)
+
+    @property
+    def wrap(self) -> Wrap:
+        """How it goes on beyond its edges."""
+        clamped = [word.lower() for word in self.options.get(b"-clamp", [])] == [b"on"]
+        return "clamp" if clamped else "repeat"
+
+    def coordinates(self, vt: Floats) -> Floats:
+        """Texture coordinates (c, 2) on it, of which v grows downwards, from those of the file."""
+        (su, sv), (ou, ov) = self._numbers(b"-s", 1), self._numbers(b"-o", 0)
+        return np.column_stack([vt[:, 0] * su + ou, 1 - (vt[:, 1] * sv + ov)])
+
+    def _numbers(self, option: bytes, usual: float) -> list[float]:
+        """Two numbers of an option."""
+        given = [float(word) for word in self.options.get(option, [])]
+        return (given + [usual] * 2)[:2]
+
+
+@dataclass
+class _Entry:
+    """What a file says of a material."""
+
+    images: dict[bytes, _Image] = field(default_factory=dict)  # {b"map_d": image}
+    colour: Bytes | None = None  # uint8 (1, 1, 3)
+
+
+class MtlMaterials:
+    """Masks and colours of the materials of a .obj file, each read once.
+
+    They are in files named by the lines `libraries`. Masks are the images `map_d`, or else the
+    alpha channels of `map_Kd`. Constant opacities, `d` and `Tr`, count for nothing: some programs
+    write one for the other. Colours are the images `map_Kd`, or else `Kd`; with an image, `Kd`
+    counts for nothing, since some programs write black there.
+    """
+
+    def __init__(self, mesh: Path, size: int, libraries: Sequence[bytes], wanted: Wanted) -> None:
+        self.notes = MaskNotes()
+        self._mesh, self._wanted = mesh, wanted
+        self._allowance = Allowance(size, SMALLER)
+        self._opacity, self._mask = cache(self._read_opacity), cache(self._read_mask)
+        self._image = cache(self._read_image)
+        self._entries: dict[bytes, _Entry] = {}
+        for data in self._files(libraries):
+            self._entries |= _read_mtl(data)
+
+    @property
+    def images(self) -> bool:
+        """Whether a material has an image, so that texture coordinates are needed."""
+        return any(entry.images for entry in self._entries.values())
+
+    def cutout(self, name: bytes, vt: Floats, corners: Ints) -> Cutout | None:
+        """Cut the mask of a material out of triangles, whose corners (k, 3) have some of `vt`."""
+        if not self._wanted.masks or name not in self._entries:
+            return None
+        with self.notes.instead(as_text(name)):
+            images = self._entries[name].images
+            if texture := self._texture(as_text(name), images):
+                image = images.get(b"map_d") or images[b"map_kd"]
+                return texture.cutout(image.coordinates(vt), corners)
+        return None
+
+    def colours(
+        self, name: bytes, vt: Floats, corners: Ints, tints: Bytes | None
+    ) -> Colours | None:
+        """Colours of triangles: of an image, or of their corners (k, 3, 3), or a plain one."""
+        entry = self._entries.get(name, _Entry())
+        if not self._wanted.colours:
+            return None
+        found = None
+        if (image := entry.images.get(b"map_kd")) is not None:
+            with self.notes.without_colour(as_text(name)):
+                texture = self._image((image.name, image.wrap))
+                found = texture.colours(image.coordinates(vt), corners)
+        elif tints is not None:
+            found = Colours.of_corners(tints)
+        elif entry.colour is not None:
+            found = Colours.plain(entry.colour, len(corners))
+        return found
+
+    def _files(self, libraries: Sequence[bytes]) -> Iterator[bytes]:
+        """Content of the files that lines name: each one, or several between spaces."""
+        read: set[Path | None] = set()
+        for names in map(as_text, libraries):
+            for name in [names] if self._file(names) else names.split():
+                path = self._file(name)
+                if path not in read:
+                    read.add(path)
+                    try:
+                        yield self._content(path)
+                    except OSError:
+                        self.notes.gone.append(name)
+
+    def _content(self, path: Path | None) -> bytes:
+        if path is None or path.stat().st_size > _MOST_BYTES:
+            raise FileNotFoundError
+        return path.read_bytes()
+
+    def _file(self, name: str) -> Path | None:
+        """File of materials."""
+        with suppress(MeshFileError):
+            return named_file(self._mesh, name, self._wanted)
+        return None
+
+    def _texture(self, name: str, images: dict[bytes, _Image]) -> Texture | None:
+        colour = images.get(b"map_kd")
+        image = images.get(b"map_d", colour)
+        if image is None:
+            return None
+        if image is colour and image.name.lower().endswith(_WITHOUT_ALPHA):
+            return None
+        # Some programs name the same image twice: then its brightness is its colour's.
+        grey = image is not colour and not (colour and colour.name == image.name)
+        base, gain = map(float, image.options.get(b"-mm", (0, 1)))
+        texture = self._mask((image.name, grey, base, gain, image.wrap))
+        if texture == "glass":
+            self.notes.glass[name] = None
+        return texture if isinstance(texture, Texture) else None
+
+    def _read_mask(
+        self, key: tuple[str, bool, float, float, Wrap]
+    ) -> Texture | Literal["solid", "glass"]:
+        """Mask of an image, or what it makes of a material."""
+        name, grey, base, gain, wrap = key
+        opacity = self._opacity((name, grey))
+        if opacity is None:
+            return "solid"
+        mask = np.float32(255 * base) + np.float32(gain) * opacity >= HALF
+        if mask.all() or not mask.any():
+            return "solid" if mask.all() else "glass"
+        return Texture(mask, (wrap, wrap), self._allowance)
+
+    def _read_opacity(self, key: tuple[str, bool]) -> Bytes | None:
+        name, grey = key
+        file = image_file(self._mesh, name, self._wanted, self._allowance)
+        return read_opacity(file, self._allowance, grey=grey)
+
+    def _read_image(self, key: tuple[str, Wrap]) -> Texture:
+        name, wrap = key
+        file = image_file(self._mesh, name, self._wanted, self._allowance)
+        image = read_colours(file, self._allowance, self.notes)
+        return Texture(image, (wrap, wrap), self._allowance)
+
+
+def _read_mtl(data: bytes) -> dict[bytes, _Entry]:
+    """Find what a file says of materials."""
+    entries: dict[bytes, _Entry] = {}
+    entry = _Entry()
+    text = data.removeprefix(b"\xef\xbb\xbf")  # the mark of some editors on Windows
+    for line in text.replace(b"\r", b"\n").replace(b"\t", b" ").split(b"\n"):
+        key, _, rest = line.strip().partition(b" ")
+        if key == b"newmtl":
+            entry = entries.setdefault(rest.strip(), _Entry())
+        elif key.lower() in (b"map_d", b"map_kd") and rest.strip():
+            entry.images[key.lower()] = _Image.of(rest)
+        elif key == b"Kd":
+            with suppress(ValueError):  # of spectra, which nobody writes
+                entry.colour = as_bytes([*map(float, rest.split()[:3])]).reshape(1, 1, 3)
+    return entries

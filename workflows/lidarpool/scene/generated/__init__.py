@@ -1,0 +1,1 @@
+"""Generated scenes: cities, terrain with forests, cars."""
