@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import re
+import shutil
 import subprocess
 import sys
 
@@ -131,6 +133,27 @@ def test_a_faulty_write_leaves_the_earlier_result(tmp_path, monkeypatch, fault):
     with pytest.raises(kind, match=message):
         save_cloud(sample(1000), path)
     assert path.read_bytes() == before and list(tmp_path.iterdir()) == [path]
+
+
+@pytest.mark.parametrize("count", [0, 70, 1000])
+def test_a_disk_without_room_is_told_the_size_of_the_file(tmp_path, monkeypatch, count):
+    """Written in pieces of 300 points, the file needs room for itself and one of them."""
+    monkeypatch.setattr(ply, "CHUNK_POINTS", 300)
+    path, free = tmp_path / "c.ply", 0
+    usage = shutil.disk_usage(tmp_path)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: usage._replace(free=free))
+    with pytest.raises(LidarpoolError, match="could not be written: it takes") as caught:
+        save_cloud(sample(count), path)
+    numbers = re.search(r"takes ([\d,]+) bytes, and ([\d,]+) beside it", str(caught.value))
+    size, piece = (int(number.replace(",", "")) for number in numbers.groups())
+    assert piece == min(count, 300) * (3 * 4 + 4 + 2 + 4)
+    free = size + piece - 1
+    with pytest.raises(LidarpoolError, match=f"the disk has {free:,} bytes free"):
+        save_cloud(sample(count), path)
+    assert not any(tmp_path.iterdir())
+    free += 1
+    save_cloud(sample(count), path)
+    assert path.stat().st_size == size
 
 
 def test_permissions_follow_the_umask(tmp_path):

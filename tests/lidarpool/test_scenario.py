@@ -344,6 +344,8 @@ def test_a_mesh_alone_is_scanned_below_its_ceiling_and_whole(tmp_path, height, e
     ("size", "generator", "entry", "says"),
     [
         ((8, 3, 6), "Blender", "hall.glb", "hall.glb was turned from Y-up to Z-up, as glTF asks"),
+        ((8, 6, 2), "Blender", "hall.glb", "8 m wide, 6 m high and 2 m thick now"),
+        ((8, 3, 6), "https://github.com/mikedh/trimesh", "hall.glb", "trimesh wrote it"),
         ((8, 6, 2), "lidarpool", "hall.glb", ""),
         ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "y"}, ""),
         ((8, 6, 2), "trimesh", {"file": "hall.glb", "up_axis": "z"}, ""),

@@ -185,7 +185,7 @@ def test_a_lost_worker_is_replaced_while_there_is_work(queue, wait_until):
     with soon, cluster_of({"GPU": adaptive(0, 2)}) as client:
         gpu = Partition("GPU", client)
         tasks = [gpu.submit(wait_for, "go") for _ in range(2)]
-        wait_until(lambda: len(gpu) == 2)
+        wait_until(lambda: len(queue.workers) == len(gpu) == 2)  # known to both
         [worker] = queue.workers.pop("0")
         client.sync(worker.close, timeout=1)
         wait_until(lambda: len(gpu) == 2)

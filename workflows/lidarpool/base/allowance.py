@@ -35,6 +35,7 @@ class Allowance:
     def __init__(self, size: int, advice: str) -> None:
         self.taken = 0
         self._size, self._advice = size, advice
+        self._files: set[Path] = set()
 
     @property
     def limit(self) -> int:
@@ -42,8 +43,14 @@ class Allowance:
         return min(max(TIMES * self._size, LEAST), memory_share())
 
     def grow(self, size: int) -> None:
-        """Count another file with it, which it names."""
+        """Count data of another file with it."""
         self._size += size
+
+    def add_file(self, file: Path) -> None:
+        """Count another file with it, which it names, once however often it names it."""
+        if file not in self._files:
+            self._files.add(file)
+            self.grow(file.stat().st_size)
 
     def fits(self, count: int) -> bool:
         """Whether so many bytes more may be taken."""

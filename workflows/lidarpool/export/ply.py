@@ -12,7 +12,7 @@ from ..base.arrays import AnyFloats, Records
 from ..base.errors import LidarpoolError
 from ..base.open3d_module import load_open3d
 from ..base.validation import checked
-from ..columns.cloud import Cloud, CloudLike
+from ..columns.cloud import CHUNK_POINTS, Cloud, CloudLike
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES, as_held, header, layout, mapped_rows, row_type
 from ..columns.table import AXES as POSITION
@@ -36,6 +36,7 @@ def write_ply(path: Path, cloud: CloudLike, sweeps: Sweeps) -> None:
     check_names((*POSITION, *cloud.table))
     real = real_type(cloud.bounds, sweeps.precision_m)
     row = row_type(real, cloud.table)
+    _check_room(path, header(row, len(cloud)), len(cloud), row.itemsize)
     with path.open("xb") as file:
         for chunk in cloud.chunks():
             if file.tell():
@@ -103,6 +104,17 @@ def real_type(bounds: AnyFloats, precision_m: float) -> np.dtype[np.floating]:
     farthest = np.float32(np.abs(bounds).max(initial=0.0))
     enough = np.isfinite(farthest) and np.spacing(farthest) / 2 < _ROUNDING_SHARE * precision_m
     return np.dtype(np.float32 if enough else np.float64)
+
+
+def _check_room(path: Path, head: bytes, count: int, row_bytes: int) -> None:
+    """Check that the disk has room for a file of so many points, and for a piece beside it."""
+    size, piece = len(head) + count * row_bytes, min(count, CHUNK_POINTS) * row_bytes
+    free = shutil.disk_usage(path.parent).free
+    if free < size + piece:
+        raise LidarpoolError(
+            f"{path} could not be written: it takes {size:,} bytes, and {piece:,} beside it "
+            f"meanwhile; the disk has {free:,} bytes free. Make room, or write to another folder."
+        )
 
 
 def _write_open3d(path: Path, cloud: Cloud, real: np.dtype[np.floating]) -> None:

@@ -5,11 +5,12 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..base.arrays import Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
 from ..base.errors import LidarpoolError
 from ..base.words import plural
 
@@ -157,19 +158,22 @@ class Lookup:
         self._height, self._width = sizes.T
         counts = sizes.prod(axis=1)
         self._first = np.cumsum([0, *counts[:-1]])
-        # Texture coordinates and colours at the corners are planes of the position.
-        textures: list[Floats] = []
-        lights: list[Floats] = []
-        at = 0
+        # Faces with images have texture coordinates, and those with colours at their corners
+        # have these, as planes of the position.
+        own = (counts > 1)[self._image]
+        tinted = np.zeros(0, np.bool_) if tints is None else (tints != 255).any(axis=(1, 2))
+        textures, lights, at = [np.zeros((0, 8))], [np.zeros((0, 12))], 0
         for block in corners:
             rows = slice(at, at + len(block))
             if colours.uv is not None:
-                textures.append(_planes(block, colours.uv[rows].astype(np.float64)))
+                uv = colours.uv[rows][own[rows]]
+                textures.append(_planes(block[own[rows]], uv.astype(np.float64)))
             if tints is not None:
-                lights.append(_planes(block, LINEAR[tints[rows]]))
+                light = LINEAR[tints[rows][tinted[rows]]]
+                lights.append(_planes(block[tinted[rows]], light))
             at += len(block)
-        self._texture = np.concatenate(textures) if textures else None
-        self._light = np.concatenate(lights) if lights else None
+        self._texture = _Planes.of(own, textures)
+        self._light = _Planes.of(tinted, lights)
 
     def at(self, rows: Integers, points: Floats) -> UInts32:
         """Colours of points (n, 3) on faces (n,), packed; of images the nearest element."""
@@ -177,33 +181,55 @@ class Lookup:
         at = self._first.take(image)
         place = np.ascontiguousarray(points.T)
         if self._texture is not None:
-            u, v = _on_planes(self._texture, rows, place)
+            on, (u, v) = self._texture.at(rows, place)
+            image = image[on]
             width = self._width.take(image)
-            at += _element(v, self._height.take(image)) * width + _element(u, width)
+            row = _element(v, self._height.take(image))
+            at[on] += row * width + _element(u, width)
         found = self._texels.take(at)
         if self._light is not None:
-            light = _on_planes(self._light, rows, place)
-            found = packed(as_srgb(LINEAR[unpacked(found)] * np.clip(light.T, 0, 1)))
+            on, light = self._light.at(rows, place)
+            tinted = LINEAR[unpacked(found[on])] * np.clip(light.T, 0, 1)
+            found[on] = packed(as_srgb(tinted))
         return found
 
 
-def _on_planes(slopes: Floats, rows: Integers, points: Floats) -> Floats:
-    """Values (w, n) at points (3, n) of faces (n,), by the slopes (f, 4 w) of all faces."""
-    x, y, z = points
-    out = np.empty((slopes.shape[1] // 4, len(x)))
-    found = slopes.take(rows, axis=0).T.reshape(len(out), 4, len(x))
-    for value, (a, b, c, d) in zip(out, found, strict=True):
-        np.multiply(a, x, out=value)
-        value += b * y
-        value += c * z
-        value += d
-    return out
+class _Planes(NamedTuple):
+    """Values on faces that are linear in the position."""
+
+    place: Ints32  # (f,): row of `slopes` that each face has; -1 for none
+    slopes: Floats  # (k, 4 w): of each of w values, along x, y and z, and at zero
+    everywhere: bool
+
+    @classmethod
+    def of(cls, there: Bools, blocks: list[Floats]) -> _Planes | None:
+        """Join blocks (k, 4 w), of the faces (f,) that have some; None if there are none."""
+        if not there.any():
+            return None
+        place = np.where(there, np.cumsum(there) - 1, -1).astype(np.int32)
+        return cls(place, np.concatenate(blocks), bool(there.all()))
+
+    def at(self, rows: Integers, points: Floats) -> tuple[Any, Floats]:
+        """Which of the faces (n,) have values, and the values at points (3, n): (w, m)."""
+        on: Any = slice(None)
+        place = self.place.take(rows)
+        if not self.everywhere:
+            on = np.flatnonzero(place >= 0)
+            place, points = place[on], points[:, on]
+        x, y, z = points
+        out = np.empty((self.slopes.shape[1] // 4, len(x)))
+        slopes = self.slopes.take(place, axis=0).T.reshape(len(out), 4, len(x))
+        for value, (a, b, c, d) in zip(out, slopes, strict=True):
+            np.multiply(a, x, out=value)
+            value += b * y
+            value += c * z
+            value += d
+        return on, out
 
 
 def _planes(corners: Floats, values: Floats) -> Floats:
-    """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w).
+    """Slopes of values (k, 3, w) between corners (k, 3, 3): (k, 4 w), see `_Planes`.
 
-    Of each value they are those along x, y and z, and the value at zero.
     Flat triangles, which are not hit, have the value of their first corner.
     """
     a, b, c = corners.transpose(1, 0, 2)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Hashable, Iterator
 from contextlib import AbstractContextManager, contextmanager
+from functools import cache
 from io import BytesIO
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 from PIL import Image
@@ -26,6 +27,8 @@ NAMED = 3  # materials that a note names
 SIDE_MOST = 4096  # pixels of an image of colours; larger ones are made smaller
 
 Wrap = Literal["repeat", "mirror", "clamp", "black"]  # or transparent, in a mask
+K = TypeVar("K", bound=Hashable)
+V = TypeVar("V")
 
 
 class MaskError(Exception):
@@ -103,6 +106,25 @@ def _opened(image: Path | bytes) -> Iterator[Image.Image]:
 
 class _TooLargeError(Exception):
     pass
+
+
+def remembered(read: Callable[[K], V]) -> Callable[[K], V]:
+    """Cache a function, and its MaskErrors."""
+
+    @cache
+    def tried(key: K) -> V | MaskError:
+        try:
+            return read(key)
+        except MaskError as error:
+            return error
+
+    def once(key: K) -> V:
+        found = tried(key)
+        if isinstance(found, MaskError):
+            raise MaskError(str(found))
+        return found
+
+    return once
 
 
 def _of_bytes(image: Image.Image) -> Image.Image:

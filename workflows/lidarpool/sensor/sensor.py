@@ -23,7 +23,6 @@ Layers = Annotated[int, about("for a grid: elevations (rings)", ge=1, le=CHANNEL
 Fov = Annotated[float, about("for a grid: degrees, half of it below the horizon", gt=0, le=180)]
 MinRange = Annotated[float, Field(ge=0, le=1e8)]
 MaxRange = Annotated[float, Field(gt=0, allow_inf_nan=True)]
-_STEPS_MOST = 1 << 32  # among which turns are looked for: months of time steps
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,12 +175,26 @@ class Sensor:
         >>> Sensor.grid(step_deg=10).steps_of_turn(2)
         range(72, 108)
         """
+        first, stop = (self._first_step(n, self._steps_in_turn) for n in (number, number + 1))
+        return range(first, stop)
+
+    @cached_property
+    def _steps_in_turn(self) -> int:
+        return self._first_step(1, 1)
+
+    def _first_step(self, number: int, each: int) -> int:
+        """Find the first time step of a turn, if `each` turn has about so many."""
 
         def turn(step: int) -> int:
             return int(self.turns([step])[0])
 
-        first, stop = (bisect_left(range(_STEPS_MOST), n, key=turn) for n in (number, number + 1))
-        return range(first, stop)
+        low = high = number * each
+        back = ahead = 1
+        while low and turn(low) >= number:
+            low, back = max(0, low - back), 2 * back
+        while turn(high) < number:
+            high, ahead = high + ahead, 2 * ahead
+        return bisect_left(range(high + 1), number, lo=low, key=turn)
 
     def directions(self, firings: Ints) -> Floats:
         """Make the unit directions of firings (k,), in the sensor's axes: (k, channels, 3)."""

@@ -53,7 +53,7 @@ def image_file(mesh: Path, name: str, wanted: Wanted, allowance: Allowance) -> P
         raise MaskError(str(error)) from error
     if file is None:
         raise MaskError(f"its image {name[-80:]!r} is not there")
-    allowance.grow(file.stat().st_size)
+    allowance.add_file(file)
     return file
 
 

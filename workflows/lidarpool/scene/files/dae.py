@@ -22,7 +22,7 @@ from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats, Ints
 from ...base.xmlfile import xml_root
 from ..colours import Colours, as_bytes
-from ..masks import MaskError, MaskNotes, Texture, Wrap, read_colours
+from ..masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
 from ..scene_mesh import SceneMesh
 from ..transform import rotation_about
 from .companions import image_file
@@ -231,7 +231,7 @@ class _Effects:
     def __init__(self, path: Path, wanted: Wanted, allowance: Allowance) -> None:
         self.notes = MaskNotes()
         self._path, self._wanted, self._allowance = path, wanted, allowance
-        self._texture = cache(self._read_texture)
+        self._texture = remembered(self._read_texture)
 
     def shade(self, effect: Element, ids: dict[tuple[str, str], Element]) -> Texture | Bytes | None:
         """Image or colour, (1, 1, 3), of an effect; None if it has none."""

@@ -34,6 +34,7 @@ from ..masks import (
     Wrap,
     read_colours,
     read_opacity,
+    remembered,
 )
 from ..scene_mesh import SceneMesh
 from .companions import image_file, named_file
@@ -150,9 +151,9 @@ class _Reader:
         self._mesh = cache(partial(self._read_bent, weights=(), skin=None))
         self._accessor = cache(self._read_accessor)
         self._beside, self._buffer = cache(self._read_beside), cache(self._read_buffer)
-        self._texture, self._opacity = cache(self._read_texture), cache(self._read_opacity)
-        self._mask = cache(self._read_mask)
-        self._base, self._shades = cache(self._read_base), cache(self._read_shades)
+        self._texture, self._opacity = cache(self._read_texture), remembered(self._read_opacity)
+        self._mask = remembered(self._read_mask)
+        self._base, self._shades = remembered(self._read_base), remembered(self._read_shades)
         self.notes = MaskNotes()
 
     def _part(self, kind: str, index: Any) -> dict[str, Any]:
@@ -516,9 +517,8 @@ class _Reader:
                 f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "
                 "as .glb"
             )
-        content = target.read_bytes()
-        self._allowance.grow(len(content))
-        return content
+        self._allowance.add_file(target)
+        return target.read_bytes()
 
 
 def _inline(uri: str) -> bytes:

@@ -99,7 +99,7 @@ def load_objects(
     epsg: int | None = None,
     assets: str | Path | None = None,
     tell: Callable[[str], None] = _log.warning,
-    axes: Callable[[str], None] = _log.info,
+    axes: Callable[[str], None] | None = None,
 ) -> Objects:
     """Read all objects of a mesh file.
 
@@ -125,7 +125,7 @@ def load_objects(
         may be glass, or on a reference system; by default this module's logger warns.
     axes
         Called with a line on axes that a file did not state, or that were turned; by default this
-        module's logger has it.
+        module's logger has it, as a warning if the scene seems to lie on its side.
 
     Returns
     -------
@@ -173,12 +173,13 @@ def load_objects(
         tell(f"{path} scales {names} to zero: left out")
     for note in (*content.notes, *(() if unit else filter(None, [content.unit_note]))):
         tell(f"{path} {note}")
+    all_of_it = objects.still(lambda _: None)
     if content.raster is not None:
         summary = content.raster.told
     else:
-        summary = _summary(objects.still(lambda _: None), unit_m, up, colours)
+        summary = _summary(all_of_it, unit_m, up, colours)
     if up_axis is None and content.generator != GENERATOR and OWN.encode() not in data[:_HEAD]:
-        _tell_axes(path, content, axes)
+        _tell_axes(path, content, all_of_it, axes)
     return objects._replace(summary=summary, raster=content.raster)
 
 
@@ -222,17 +223,34 @@ def wrote_it(path: Path) -> bool:
         return OWN.encode() in file.read(_HEAD)
 
 
-def _tell_axes(path: Path, content: Content, axes: Callable[[str], None]) -> None:
+def _tell_axes(
+    path: Path,
+    content: Content,
+    meshes: Sequence[SceneMesh | SceneInstance],
+    axes: Callable[[str], None] | None,
+) -> None:
     if content.turned and content.up_axis == "y":
-        done, other = f"was turned from Y-up to Z-up, {content.turned}", "z"
+        why, other = _lies(content, meshes), "z"
+        done = f"was turned from Y-up to Z-up, {content.turned}{why}"
     elif path.suffix.lower() == ".obj":  # the one without axes that is Y-up as often as not
-        done, other = "states no axes and is taken as Z-up", "y"
+        done, why, other = "states no axes and is taken as Z-up", "", "y"
     else:
         return
-    axes(
+    (axes or (_log.warning if why else _log.info))(
         f"{path.name} {done}; if it lies on its side, set up_axis: {other} in scene.files "
         f"(lidarpool init --mesh FILE --up-axis {other}); any up_axis ends this note"
     )
+
+
+def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
+    """Say why a file rotated from Y-up seems to have been Z-up; empty if it does not."""
+    if "trimesh" in content.generator:
+        return ", and trimesh wrote it, which keeps the axes that it is given"
+    low = np.min([_corners(mesh).min(axis=0) for mesh in meshes], axis=0)
+    x, y, z = np.max([_corners(mesh).max(axis=0) for mesh in meshes], axis=0) - low
+    if 2 * y < min(x, z):
+        return f", and is {x:,.3g} m wide, {z:,.3g} m high and {y:,.3g} m thick now"
+    return ""
 
 
 def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any]) -> Content:

@@ -6,7 +6,6 @@ import re
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
-from functools import cache
 from pathlib import Path
 from typing import Literal
 
@@ -23,6 +22,7 @@ from ..masks import (
     Wrap,
     read_colours,
     read_opacity,
+    remembered,
 )
 from ..scene_mesh import Cutout
 from .companions import image_file, named_file
@@ -94,8 +94,8 @@ class MtlMaterials:
         self.notes = MaskNotes()
         self._mesh, self._wanted = mesh, wanted
         self._allowance = Allowance(size, SMALLER)
-        self._opacity, self._mask = cache(self._read_opacity), cache(self._read_mask)
-        self._image = cache(self._read_image)
+        self._opacity, self._mask = remembered(self._read_opacity), remembered(self._read_mask)
+        self._image = remembered(self._read_image)
         self._entries: dict[bytes, _Entry] = {}
         for data in self._files(libraries):
             self._entries |= _read_mtl(data)

@@ -369,17 +369,28 @@ def _coarser(grid: _RasterGrid, step_m: float, window: Window | None) -> Iterato
 
 
 def _check_size(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> None:
-    """Refuse more pixels than the memory has room for."""
+    """Refuse more pixels than the memory has room for, with a window and a step that fit."""
     sides = np.array([columns[1] - columns[0], rows[1] - rows[0]])
     count = int(np.prod(sides.astype(object)))
     most = min(memory_share() // _PIXEL_BYTES, MOST_TRIANGLES // 2)
     if count <= most:
         return
-    step = grid.pixel_m * math.sqrt(1.2 * count / most)  # some more, for what is askew
+    low, high = grid.reach
+    x, y = grid.at(np.array([sum(columns) / 2]), np.array([sum(rows) / 2]))
+    # Less by a tenth, for what is askew.
+    half = np.minimum(0.9 * math.sqrt(most), sides) * grid.pixel_m / 2
+    window = [round(float(side), 1) for side in (x[0] - half[0], y[0] - half[1])]
+    window += [round(float(side), 1) for side in (x[0] + half[0], y[0] + half[1])]
+    step = grid.pixel_m
+    while np.prod(np.ceil((high - low) / step) + 1) > 0.9 * most:
+        step *= 1.1
+    digits = 2 - math.floor(math.log10(step))
+    step = math.ceil(step * 10**digits) / 10**digits
+    coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "
-        f"at most {bytes_of(memory_share())}, a quarter of the memory: give a window of at most "
-        f"{most:,} pixels, or step_m: {step:.4g}, in scene.files"
+        f"at most {bytes_of(memory_share())}, a quarter of the memory: give window: {window}"
+        f"{coarser} in scene.files"
     )
 
 

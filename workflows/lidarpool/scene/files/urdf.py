@@ -341,7 +341,7 @@ class _Looks:
                 colours=self.colours,
                 tell=self.tell,
             )
-            self._allowance.grow(path.stat().st_size)
+            self._allowance.add_file(path)
             self._files[path] = [
                 one.flat() if isinstance(one, SceneInstance) else one for one in found
             ]

@@ -72,7 +72,7 @@ def read_usd(data: bytes, path: Path, wanted: Wanted) -> Content:
                 case "stage":
                     stage = frame
                     for file in frame["files"]:
-                        allowance.grow(Path(file).stat().st_size)
+                        allowance.add_file(Path(file))
                 case "image" | "material":
                     materials.add(frame, arrays)
                 case "mesh":

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import cache
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -19,6 +18,7 @@ from ..masks import (
     Wrap,
     read_colours,
     read_opacity,
+    remembered,
 )
 from ..scene_mesh import Cutout
 from .polygons import check_corners, triangulated
@@ -110,7 +110,7 @@ class UsdMaterials:
         self._allowance, self._colours = allowance, colours
         self._images: dict[int, tuple[str, bytes]] = {}  # {number: (why it is not read, content)}
         self._materials: dict[int | None, dict[str, Any]] = {None: {"name": "displayColor"}}
-        self._shades, self._mask = cache(self._read_shades), cache(self._read_mask)
+        self._shades, self._mask = remembered(self._read_shades), remembered(self._read_mask)
         self.notes = MaskNotes()
 
     def add(self, frame: dict[str, Any], arrays: list[AnyArray]) -> None:
