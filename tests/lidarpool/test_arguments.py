@@ -167,9 +167,9 @@ def test_options_of_a_survey_are_checked_too():
 
 def test_a_scenario_says_how_it_is_run_unless_python_does():
     pool = PoolSection(gpu=3, batch_mb=64, backend="numpy")
-    said = RunOptions.of(pool, gpu_workers=None, backend=None, live=True)
+    said = RunOptions(live=True).with_pool(pool)
     assert (said.gpu_workers, said.batch_mb, said.backend, said.live) == (3, 64, "numpy", True)
-    given = RunOptions.of(pool, gpu_workers=2, backend="embree")
+    given = RunOptions(gpu_workers=2).with_pool(pool, "embree")
     assert (given.gpu_workers, given.batch_mb, given.backend) == (2, 64, "embree")
 
 

@@ -33,7 +33,7 @@ def forked_workers() -> Iterator[None]:
 _starting: set[Nanny] = set()  # those of `OwnNanny` that start a worker just now
 
 
-@cache  # once, for the same reason
+@cache  # once: another library may have wrapped the same since
 def _spare_workers_the_script() -> None:
     prepare = spawn.get_preparation_data
 

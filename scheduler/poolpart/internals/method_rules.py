@@ -14,11 +14,10 @@ from .scheduler import Resources
 
 logger = logging.getLogger(__name__)
 
-#
 # Plugins of the scheduler only observe. An attribute of the instance hides the class's method
 # until it is deleted.
-After = Callable[..., Any]  # gets the method's result and its arguments; returns the result
 
+After = Callable[..., Any]  # gets the method's result and its arguments; returns the result
 Before = Callable[[dict[str, Any]], dict[str, Any]]  # gets the keyword arguments; returns them
 
 

@@ -222,13 +222,11 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             another campaign or version; one or two lines say which and what to do.
         """
         place = output_place(out)
-        options = RunOptions.of(
-            self.pool,
+        options = RunOptions(
             out=place,
             folder=Storage.at(place).below(RUN_FOLDER),
             client=client,
             gpu_workers=gpu_workers,
-            backend=backend,
             parts=parts,
             resume=resume,
             fresh=fresh,
@@ -238,7 +236,7 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
             live=live,
             wait_s=wait_s,
             patience_s=patience_s,
-        )
+        ).with_pool(self.pool, backend)
         with page_of(self, live) as page:
             output = DataSetOutput(place, self)
             return Conductor(self, options, output, Screen(on_progress), page)()

@@ -7,8 +7,9 @@ immediate: the imports of a run take a second.
 from __future__ import annotations
 
 import sys
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable
+from dataclasses import asdict, fields, replace
+from functools import wraps
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -25,21 +26,22 @@ from ..base.interrupts import (
 )
 from ..base.vocabulary import PATIENCE_S, QUEUE_S, WAIT_S
 from ..base.words import plural
-from . import shared_options as options
+from . import shared_options as shared
 from .result_commands import compare, export, plot, view
 from .scenario_commands import check, import_, init, scene, schema, sensors, stations
 from .shared_options import set_logs
 
 if TYPE_CHECKING:
-    from ..base.storage import Storage
     from ..run.connection import TlsFiles
+    from ..run.options import RunOptions
+    from .terminal import Terminal
 
 PROGRAM = "lidarpool"
 
 # What `demo` and `run` have in common; each is a field of RunOptions.
-_shown = options.together(
-    options.flag("--tls", help="Encrypt the traffic of the local cluster."),
-    options.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
+_shown = shared.together(
+    shared.flag("--tls", help="Encrypt the traffic of the local cluster."),
+    shared.flag("--live", help="Show the live page in the browser; it stays until Ctrl-C."),
     click.option(
         "--no-stay",
         "stay",
@@ -52,10 +54,10 @@ _shown = options.together(
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no pictures and no page.",
     ),
-    options.flag("--overwrite", help="Replace the result of another survey, or a data set."),
-    options.flag("--quiet", "-q", help="No progress, only the result."),
-    options.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
-    options.as_json,
+    shared.flag("--overwrite", help="Replace the result of another survey, or a data set."),
+    shared.flag("--quiet", "-q", help="No progress, only the result."),
+    shared.flag("--verbose", "-v", help="Show what Dask and other libraries log, on stderr."),
+    shared.as_json,
 )
 
 
@@ -69,6 +71,43 @@ def _seconds(text: str) -> float:
         raise click.BadParameter(told) from error
 
 
+def _runs(command: Callable[..., None]) -> Callable[..., None]:
+    """Give a command a Terminal and RunOptions, and other options by their names.
+
+    What workers need is imported meanwhile in the background.
+    """
+
+    @wraps(command)
+    def prepared(
+        *, quiet: bool, verbose: bool, as_json: bool, cluster: Path | None = None, **given: Any
+    ) -> None:
+        from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
+
+        keep_freed_memory()
+        if cluster is None and given.get("scheduler") is None:
+            start_fork_server()
+        try:
+            with deferred_interrupts():  # an interrupted import cannot be repeated
+                from ..run.cluster_file import ClusterFile
+                from ..run.options import RunOptions
+                from . import run_command  # noqa: F401
+                from .terminal import Terminal
+            set_logs(verbose)
+            own: dict[str, Any] = {}
+            if cluster is not None:
+                own = {"cluster": ClusterFile.load(cluster), "wait_s": QUEUE_S}
+                own["patience_s"] = QUEUE_S
+            # A scenario may say the backend, too.
+            names = {field.name for field in fields(RunOptions)} - {"backend"}
+            own |= {name: one for name, one in given.items() if name in names and one is not None}
+            others = {name: one for name, one in given.items() if name not in names}
+            command(Terminal(quiet, verbose, as_json), RunOptions(**own), **others)
+        finally:
+            stop_fork_server()
+
+    return prepared
+
+
 @click.group(
     commands=[init, import_, check, schema, scene, sensors, stations, view, plot, export, compare],
     context_settings={"max_content_width": 100, "help_option_names": ["-h", "--help"]},
@@ -79,9 +118,10 @@ def cli() -> None:
 
 
 @cli.command()
-@options.out
+@shared.out
 @_shown
-def demo(**given: Any) -> None:
+@_runs
+def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
     """Run the default survey and plan a path, on this machine.
 
     \b
@@ -89,21 +129,24 @@ def demo(**given: Any) -> None:
       lidarpool demo --live
       lidarpool demo --out /tmp/demo
     """  # noqa: D301 - click wants the character, not its name
-    _run((), resumable=False, **given)
+    from ..scenario.scenario import Scenario
+    from .run_command import run_scenario
+
+    run_scenario(Scenario(), terminal, options, only=only)
 
 
 @cli.command()
 @click.argument("scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path())
-@options.out
-@options.scheduler
-@options.cluster
-@options.backend
-@options.no_plan
-@options.flag("--resume", help="Resume an unfinished run, if there is one.")
-@options.flag("--fresh", help="Delete an unfinished run.")
-@options.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
-@options.flag("--verify", help="Compare every byte of a data set, or of the jobs to resume from.")
-@options.job
+@shared.out
+@shared.scheduler
+@shared.cluster
+@shared.backend
+@shared.no_plan
+@shared.flag("--resume", help="Resume an unfinished run, if there is one.")
+@shared.flag("--fresh", help="Delete an unfinished run.")
+@shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
+@shared.flag("--verify", help="Compare every byte of a data set, or of the jobs to resume from.")
+@shared.job
 @click.option(
     "--parts",
     metavar="PLACE",
@@ -126,7 +169,16 @@ def demo(**given: Any) -> None:
     f"{PATIENCE_S:g}s, with --cluster {QUEUE_S / 3600:g}h.",
 )
 @_shown
-def run(scenarios: tuple[str, ...], **given: Any) -> None:
+@_runs
+def run(
+    terminal: Terminal,
+    options: RunOptions,
+    scenarios: tuple[str, ...],
+    no_plan: bool,
+    only: str | None,
+    number: int | None,
+    backend: str | None,
+) -> None:
     """Run the survey of a scenario or mesh file, or a campaign of many.
 
     A campaign file, or several scenarios, make one data set.
@@ -143,78 +195,47 @@ def run(scenarios: tuple[str, ...], **given: Any) -> None:
       lidarpool run examples/campaign.yaml --out dataset
       lidarpool run --verify dataset
     """  # noqa: D301 - click wants the character, not its name
-    queued = given["cluster"] is not None
-    for name, default in (("wait_s", WAIT_S), ("patience_s", PATIENCE_S)):
-        if given[name] is None:
-            given[name] = QUEUE_S if queued else default
-    if given["tls"] and (queued or given["scheduler"] is not None):
+    from ..base.storage import Storage
+    from ..report.campaign_output import verify
+    from ..run.store import RUN_FOLDER
+    from ..scenario.campaign import CampaignSpec, is_campaign
+    from ..scenario.scenario import Scenario
+    from .run_command import run_campaign, run_job, run_scenario
+
+    if options.tls and not options.own:
         raise click.UsageError(
             "--tls is for a cluster of this machine: that of --cluster is encrypted if its file "
             "says so, that of --scheduler if its address begins with tls://."
         )
-    if (given["resume"] or given["verify"]) and given["fresh"]:
+    if options.fresh and (options.resume or options.verify):
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
-    if given["retry_failed"] and (given["fresh"] or given["number"] is not None):
+    if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
-    if given["verify"] and not Path(scenarios[0]).is_file():
-        from ..base.storage import Storage
-        from ..report.campaign_output import verify
-
+    paths = [*map(Path, scenarios)]
+    if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
         return
-    _run([*map(Path, scenarios)], **given)
-
-
-def _run(
-    paths: Sequence[Path],
-    out: Path | Storage,
-    *,
-    resumable: bool = True,
-    no_plan: bool = False,
-    number: int | None = None,
-    quiet: bool,
-    verbose: bool,
-    as_json: bool,
-    **given: Any,
-) -> None:
-    from ..base.fork_server import keep_freed_memory, start_fork_server, stop_fork_server
-
-    keep_freed_memory()
-    if not given.get("scheduler") and not given.get("cluster"):
-        start_fork_server()  # imports what workers need in the background
-    try:
-        with deferred_interrupts():  # an interrupted import cannot be repeated
-            from ..base.storage import Storage
-            from ..run.cluster_file import ClusterFile
-            from ..run.store import RUN_FOLDER
-            from ..scenario.campaign import CampaignSpec, is_campaign
-            from ..scenario.scenario import Scenario
-            from .run_command import run_campaign, run_job, run_scenario
-            from .terminal import Terminal
-        if given.get("cluster") is not None:
-            given["cluster"] = ClusterFile.load(given["cluster"])
-        terminal = Terminal(quiet, verbose, as_json)
-        set_logs(verbose)
-        given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER) if resumable else None}
-        if len(paths) > 1 or (paths and is_campaign(paths[0])):
-            several = len(paths) > 1
-            campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
-            if number is not None:
-                run_job(campaign, number, terminal, **given)
-            else:
-                run_campaign(campaign, terminal, **given)
-        elif given.get("retry_failed") or given.get("verify") or number is not None:
-            raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
+    assert options.out is not None, "it has a default"
+    options = replace(options, folder=Storage.at(options.out).below(RUN_FOLDER))
+    if len(paths) > 1 or is_campaign(paths[0]):
+        several = len(paths) > 1
+        campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
+        if number is not None:
+            run_job(campaign, number, terminal, options, backend, only)
+        elif only is not None:
+            raise click.UsageError("--only is for one survey: a data set is written as a whole.")
         else:
-            scenario = Scenario.load(paths[0]) if paths else Scenario()
-            run_scenario(scenario, terminal, no_plan=no_plan, **given)
-    finally:
-        stop_fork_server()
+            run_campaign(campaign, terminal, options, backend)
+    elif options.retry_failed or options.verify or number is not None:
+        raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
+    else:
+        scenario = Scenario.load(paths[0])
+        run_scenario(scenario, terminal, options, backend, no_plan=no_plan, only=only)
 
 
 @cli.command()
-@options.scheduler
-@options.as_json
+@shared.scheduler
+@shared.as_json
 def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
     """Show versions, backends, GPUs and workers.
 
@@ -255,7 +276,7 @@ def info(scheduler: str | None, files: TlsFiles, as_json: bool) -> None:
             f"{plural(worker.nthreads, 'thread')}  {worker.memory / 2**30:.1f} GiB  "
             f"{plural(len(worker.gpus), 'GPU')}"
         )
-    options.show(told, lines, as_json)
+    shared.show(told, lines, as_json)
 
 
 def main(arguments: list[str] | None = None) -> NoReturn:
@@ -264,33 +285,38 @@ def main(arguments: list[str] | None = None) -> NoReturn:
     set_logs(shown=False)
     try:
         cli.main(args=arguments, prog_name=PROGRAM, standalone_mode=False)
-    except LidarpoolError as error:
-        _die(str(error), error)
     except click.exceptions.NoArgsIsHelpError as error:
         click.echo(error.format_message())
-    except click.MissingParameter as error:
-        usage = error.ctx.get_usage() if error.ctx else ""
-        told = " ".join(error.format_message().split())  # click gives each choice a line
-        _die(f"{told}\n{usage}")
-    except click.UsageError as error:
-        _die(error.format_message())
     except (KeyboardInterrupt, click.Abort) as error:
         _die(f"{STOPPED}." if _notes(error) else UNTOUCHED, error, INTERRUPTED)
-    except OSError as error:
-        # The name is impossible for a file, or its folder may not be read; anything else is a
-        # defect, and gets a traceback.
-        if error.filename is None:
+    except Exception as error:
+        if (told := _explanation(error)) is None:  # a defect
             raise
-        _die(f"{error.filename}: {error.strerror}: give another name or folder.", error)
-    except MemoryError as error:
-        _die("not enough memory: take a smaller scene, fewer scans or a larger keep_every.", error)
-    except RuntimeError as error:
-        from poolpart import PoolError
-
-        if not isinstance(error, PoolError):
-            raise
-        _die(str(error), error)
+        _die(told, error)
     sys.exit(0)
+
+
+def _explanation(error: Exception) -> str | None:
+    """Say what a user can correct; None if it is a defect."""
+    match error:
+        case click.MissingParameter():
+            usage = error.ctx.get_usage() if error.ctx else ""
+            told = " ".join(error.format_message().split())  # click gives each choice a line
+            return f"{told}\n{usage}"
+        case click.ClickException():
+            return error.format_message()
+        case OSError(filename=str() | Path() as name):
+            # No file can have this name, or its folder may not be read.
+            return f"{name}: {error.strerror}: give another name or folder."
+        case MemoryError():
+            return "not enough memory: take a smaller scene, fewer scans or a larger keep_every."
+        case LidarpoolError():
+            return str(error)
+        case RuntimeError():
+            from poolpart import PoolError
+
+            return str(error) if isinstance(error, PoolError) else None
+    return None
 
 
 def _notes(error: BaseException | None) -> list[str]:

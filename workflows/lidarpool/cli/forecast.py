@@ -79,15 +79,15 @@ def look_at(
     path: Path,
     number: int | None,
     client: Client | None,
+    options: RunOptions,
+    backend: str | None,
     *,
     no_plan: bool,
     quiet: bool,
-    **given: Any,
 ) -> tuple[dict[str, Any], Iterator[str]]:
     """Find out what the run of a scenario, a campaign or one of its jobs would do and need.
 
-    It is a run with the options `given`, see `RunOptions`. Of a campaign, some jobs are looked at,
-    the first and the last among them; they plan no paths.
+    Of a campaign, some jobs are looked at, the first and the last among them; they plan no paths.
 
     Returns
     -------
@@ -106,7 +106,7 @@ def look_at(
             built = build(read, plans=campaign is None and not no_plan)
             job = built.job()
         with terminal.status("casting some rays"):
-            found = forecast(job, RunOptions.of(read.pool, **given), client)
+            found = forecast(job, options.with_pool(read.pool, backend), client)
         found["notes"] += advice(built)
         found["sources"] = dict(built.found.sources)
         if campaign is not None:

@@ -42,13 +42,19 @@ from .terminal import Terminal
 
 
 def run_scenario(
-    scenario: Scenario, terminal: Terminal, *, no_plan: bool, only: str | None, **given: Any
+    scenario: Scenario,
+    terminal: Terminal,
+    options: RunOptions,
+    backend: str | None = None,
+    *,
+    no_plan: bool = False,
+    only: str | None = None,
 ) -> None:
-    """Run a scenario, write the result and print a summary; `given` as of `RunOptions`.
+    """Run a scenario, write the result and print a summary.
 
     LidarpoolError if the run fails; notes of the error say what was kept.
     """
-    options = RunOptions.of(scenario.pool, **given)
+    options = options.with_pool(scenario.pool, backend)
     if options.own:  # before reading the scene, which may take long
         check_backend_here(options.backend)
     with terminal.status("reading the scene", logged=False):
@@ -83,12 +89,10 @@ def _run_survey(
 
 
 def run_campaign(
-    campaign: CampaignSpec, terminal: Terminal, *, only: str | None, **given: Any
+    campaign: CampaignSpec, terminal: Terminal, options: RunOptions, backend: str | None
 ) -> None:
     """Run a campaign, and print a summary; LidarpoolError if it or a job fails."""
-    if only:
-        raise LidarpoolError("--only is for one survey: a data set is written as a whole.")
-    options = RunOptions.of(campaign.pool, **given)
+    options = options.with_pool(campaign.pool, backend)
     assert options.out is not None, "commands write"
     with page_of(campaign, options.live) as page:
         output = DataSetOutput(options.out, campaign)
@@ -114,9 +118,9 @@ def run_job(
     campaign: CampaignSpec,
     number: int,
     terminal: Terminal,
-    *,
+    options: RunOptions,
+    backend: str | None,
     only: str | None,
-    **given: Any,
 ) -> None:
     """Run one job of a campaign again, and write it as the result of a survey.
 
@@ -124,14 +128,15 @@ def run_job(
     must be those of the data set. LidarpoolError if they are not, or cannot be: it was made by
     other software, or its files there are damaged.
     """
-    place, name = Storage.at(given["out"]), campaign.name(number)
+    assert options.out is not None, "commands write"
+    place, name = Storage.at(options.out), campaign.name(number)
     dataset = DataSet(place, campaign.keep.format, campaign.keep.layout)
     of_dataset = CAMPAIGN_FILE in place.entries()
     if of_dataset:
-        given["backend"] = check_same(place, campaign)["backend"]
+        backend = check_same(place, campaign)["backend"]
         verify(place, number)
-        out = output_place(f"{given['out']}/job-{name}")
-        given |= {"out": out, "folder": Storage.at(out).below(RUN_FOLDER)}
+        out = output_place(f"{options.out}/job-{name}")
+        options = replace(options, out=out, folder=Storage.at(out).below(RUN_FOLDER))
     scenario = campaign.scenario(number)
     assert scenario is not None, "of a file"
     built, job = build(scenario, plans=False), campaign.job(number, columns=dataset.columns)
@@ -148,7 +153,7 @@ def run_job(
             )
         return f"the points are those of job {name} in {place}, bit for bit"
 
-    options = RunOptions.of(scenario.pool, **given)
+    options = options.with_pool(scenario.pool, backend)
     _run_survey(built, replace(job, number=0), options, terminal, only, compare)
 
 

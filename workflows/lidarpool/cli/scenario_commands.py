@@ -19,6 +19,7 @@ from . import shared_options as options
 from .shared_options import Command, overwrite, together
 
 if TYPE_CHECKING:
+    from ..base.storage import Storage
     from ..plan.stations import StationPlan
     from ..run.connection import TlsFiles
     from ..scenario.scenario import Scenario
@@ -168,12 +169,14 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.as_json
 def check(
     scenario: Path,
+    out: Path | Storage,
     scheduler: str | None,
     files: TlsFiles,
     cluster: Path | None,
+    backend: str | None,
+    no_plan: bool,
     number: int | None,
     as_json: bool,
-    **given: Any,
 ) -> None:
     """Show what a run would do and need.
 
@@ -191,12 +194,16 @@ def check(
     """  # noqa: D301 - click wants the character, not its name
     from ..run.cluster_file import ClusterFile
     from ..run.connection import connected
+    from ..run.options import RunOptions
     from .forecast import look_at
 
     try:
         file = None if cluster is None else ClusterFile.load(cluster)
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
-            found, lines = look_at(scenario, number, client, quiet=as_json, cluster=file, **given)
+            asked = RunOptions(out=out, cluster=file)
+            found, lines = look_at(
+                scenario, number, client, asked, backend, no_plan=no_plan, quiet=as_json
+            )
     except LidarpoolError as error:
         if as_json:
             options.show({"can_run": False, "reasons": [str(error)], "notes": []}, (), True)
@@ -206,11 +213,12 @@ def check(
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
         words = ["lidarpool", "run", str(scenario)]
-        given |= {"scheduler": scheduler, "cluster": cluster, "job": number}
-        for name in ("out", "scheduler", "cluster", "backend", "job"):
-            wanted = given[name] is not None and str(given[name]) != "lidarpool-out"
-            words += [f"--{name}", str(given[name])] if wanted else []
-        click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * given['no_plan']])}")
+        given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
+        given |= {"backend": backend, "job": number}
+        for name, value in given.items():
+            if value is not None and str(value) != "lidarpool-out":
+                words += [f"--{name}", str(value)]
+        click.echo(f"it can run: {shlex.join([*words, *['--no-plan'] * no_plan])}")
 
 
 @click.command()

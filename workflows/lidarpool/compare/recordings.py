@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from importlib import import_module
+from importlib.util import find_spec
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,6 @@ from ..columns.cloud_file import CloudFile
 from ..columns.parts import StoredCloud
 from ..datasets.dataset import INDEX_FILE
 from ..datasets.loader import sweeps
-from ..export.formats import Format
 from ..export.sweeps import SWEEPS_FILE, Placed, Sweeps
 from ..scene.files.polygon_files import read_ply_columns
 
@@ -250,7 +250,7 @@ def _of_data_set(path: Path, name: str, sensor: str | None, light: str | None) -
 
 def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
     """Open files of a sweep each; VIEWPOINT says where its sensor was."""
-    Format("pcd").check_installed()
+    _need("pypcd4", "pcd", name)
 
     def read(number: int) -> Read:
         from pypcd4.pypcd4 import PointCloud  # an extra
@@ -268,7 +268,7 @@ def _of_pcd(files: list[Path], name: str, light: str | None) -> Recording:
 
 
 def _of_las(path: Path, name: str, light: str | None) -> Recording:
-    Format("las").check_installed()
+    _need("laspy", "las", name)
     laspy: Any = import_module("laspy")
     with _reading(name):
         with path.open("rb") as start:
@@ -293,7 +293,7 @@ def _of_las(path: Path, name: str, light: str | None) -> Recording:
 
 def _of_bag(path: Path, name: str, topic: str | None, light: str | None) -> Recording:
     """Open a topic of PointCloud2, a sweep each, in the axes of their frame."""
-    Format("mcap").check_installed()
+    _need("rosbags", "ros", name)
     from rosbags.rosbag2 import Reader
 
     from ..export.ros import columns_of
@@ -337,6 +337,11 @@ def _places(columns: Columns) -> Floats:
     if missing := [axis for axis in "xyz" if axis not in columns]:
         raise ValueError(f"its points have no {', '.join(missing)}")
     return np.stack([np.asarray(columns[axis], np.float64) for axis in "xyz"], axis=1)
+
+
+def _need(package: str, extra: str, name: str) -> None:
+    if find_spec(package) is None:
+        raise LidarpoolError(f'{name} is read by {package}: pip install "lidarpool[{extra}]".')
 
 
 def _chosen(name: str, what: str, there: Iterable[str], wanted: str | None) -> str:

@@ -20,6 +20,7 @@ from .._version import __version__
 from ..base.archives import packed
 from ..base.errors import LidarpoolError, explained
 from ..base.storage import Storage
+from ..base.validation import checked_fields
 from ..columns.cloud import CloudLike
 from ..export.boxes import Boxes
 from ..export.folder import local_folder
@@ -70,6 +71,7 @@ def job_file(format: str, name: str, file: str) -> str:  # noqa: A002
 
 
 @dataclass(frozen=True)
+@checked_fields
 class DataSet:
     """The files of many jobs in one place: small when pickled, any process writes a job.
 

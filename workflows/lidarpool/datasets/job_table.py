@@ -13,11 +13,14 @@ import csv
 import hashlib
 import json
 import re
+import tempfile
 from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, field
 from importlib.util import find_spec
 from itertools import islice
+from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
@@ -214,29 +217,31 @@ def read_table(place: Storage) -> Iterator[JobRow]:
     LidarpoolError
         If there is no such table, or it is damaged.
     """
-    where = place.path(TABLE_FILE)
-    if place.is_local:
-        place.local(TABLE_FILE)  # refuses a link
-    with explained(f"{where} cannot be read", "give the folder of a data set"):
-        system, folder = place.file_system()
-        how = {"encoding": "utf-8", "newline": ""}
-        with system.open(f"{folder}/{TABLE_FILE}", "r", **how) as file:
-            reader = csv.reader(file, strict=True)
-            try:
-                header = next(reader, [])
-                first, last = len(_HEAD), header.index("error")
-                tail = header[last : last + len(_TAIL)]
-                if header[:first] != [*_HEAD] or tail != [*_TAIL]:
-                    raise ValueError("it is not a table of jobs")
-                names = [name.removeprefix(_VARIED) for name in header[first:last]]
-                for cells in reader:
-                    yield _row(header, names, cells)
-            except (ValueError, csv.Error) as error:
-                raise LidarpoolError(
-                    f"{where} is damaged near line {reader.line_num} ({error}): "
-                    "--resume writes that of an unfinished campaign anew; --overwrite makes a "
-                    "finished one again."
-                ) from error
+    with ExitStack() as stack:
+        with explained(f"{place.path(TABLE_FILE)} cannot be read", "give the folder of a data set"):
+            if place.is_local:
+                path = place.local(TABLE_FILE)
+            else:
+                folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="lidarpool-"))
+                path = Path(folder, TABLE_FILE)
+                place.get(TABLE_FILE, path)
+            file = stack.enter_context(path.open(encoding="utf-8", newline=""))
+        reader = csv.reader(file, strict=True)
+        try:
+            header = next(reader, [])
+            first, last = len(_HEAD), header.index("error")
+            tail = header[last : last + len(_TAIL)]
+            if header[:first] != [*_HEAD] or tail != [*_TAIL]:
+                raise ValueError("it is not a table of jobs")
+            names = [name.removeprefix(_VARIED) for name in header[first:last]]
+            for cells in reader:
+                yield _row(header, names, cells)
+        except (ValueError, csv.Error) as error:
+            raise LidarpoolError(
+                f"{place.path(TABLE_FILE)} is damaged near line {reader.line_num} ({error}): "
+                "--resume writes that of an unfinished campaign anew; --overwrite makes a finished "
+                "one again."
+            ) from error
 
 
 def _column_of(name: str) -> str:

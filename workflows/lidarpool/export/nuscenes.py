@@ -187,7 +187,6 @@ class _Tables:
             log_token=self._token("log", _LOG), first_sample_token=self._token("sample", 0),
             last_sample_token=self._token("sample", count - 1),
         )  # fmt: skip
-        # The devkit sorts scenes by their time, and fails where two have the same.
         # nuscenes-devkit sorts scenes by time, and fails where two have the same.
         day = 0 if self._entry is None else self._entry.number
         times = [day * _DAY_US + round(begin / 1000) for begin in sweeps.begins_ns]

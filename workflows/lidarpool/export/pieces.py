@@ -154,7 +154,7 @@ class RangeWriter:
         with ThreadPoolExecutor(THREADS, "write") as pool:  # ends when all its threads have
             made |= {span: it for span, it in zip(left, pool.map(self, left), strict=True) if it}
         self.stop()
-        pieces.finish(self.place, (made[span] for span in spans))
+        pieces.finish(self.place, (made.get(span, (0, [])) for span in spans))
         self.place.tidy()
 
 

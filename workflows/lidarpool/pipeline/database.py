@@ -442,8 +442,9 @@ def read_place(path: Path) -> tuple[str, str] | None:
         return None
     try:
         # Not read-only: then SQLite could not undo a transaction that was interrupted.
-        address = f"{path.absolute().as_uri()}?mode=rw"
-        with _explained(path), closing(sqlite3.connect(address, uri=True, timeout=1.0)) as sql:
+        with closing(
+            sqlite3.connect(f"{path.absolute().as_uri()}?mode=rw", uri=True, timeout=1.0)
+        ) as sql:
             tables = {name for (name,) in sql.execute("SELECT name FROM sqlite_master")}
             if tables and not tables >= {"meta", "parts", "trials"}:
                 raise LidarpoolError(
@@ -451,5 +452,9 @@ def read_place(path: Path) -> tuple[str, str] | None:
                     "folder."
                 )
             return _checked_place(dict(sql.execute("SELECT name, value FROM meta")))
-    except DamagedError:
+    except sqlite3.Error as error:
+        if "locked" in str(error):
+            raise LidarpoolError(f"Another run is using {path.parent}.") from error
+        return None
+    except (ValueError, TypeError, KeyError):
         return None

@@ -100,7 +100,15 @@ class LongStages:
         self._waited_from: float | None = None  # waited for slots that others held
         self.waiting = False  # whether it waits for such slots
         self._closed_at: float | None = None
-        self.notes: list[str] = []  # what a user should know
+        self._hidden: set[str] = set()  # addresses of workers that do not see the storage
+        self._notes: list[str] = []
+
+    @property
+    def notes(self) -> list[str]:
+        """What a user should know."""
+        workers = f"{', '.join(sorted(self._hidden))} of partition {self.partition.name}"
+        note = f"{workers} cannot see {self._storage.url}: the driver wrote their parts"
+        return [*self._notes, *([note] if self._hidden else [])]
 
     def open(self) -> None:
         """Make the pipes; `look` starts the stages, and `finish` must be called after this."""
@@ -144,12 +152,7 @@ class LongStages:
 
     def store_held(self, receipt: Receipt) -> bool:
         """Store a part of a worker that does not see the storage; False if it is lost."""
-        note = (
-            f"{receipt.held_at} of partition {self.partition.name} cannot see "
-            f"{self._storage.url}: the driver wrote its parts"
-        )
-        if note not in self.notes:
-            self.notes.append(note)
+        self._hidden.add(receipt.held_at)
         data = take_held(self.client, receipt.held_at, receipt.name)
         if data is None:
             return False
@@ -202,7 +205,7 @@ class LongStages:
             return
         self.waiting = False
         if self._waited_from is not None:
-            self.notes.append(
+            self._notes.append(
                 f"the survey waited {now - self._waited_from:.1f} s for partition "
                 f"{self.partition.name}, until other runs had left it {needed} slots"
             )

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import EngFormatter, LogLocator, MaxNLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from ..base.arrays import Bools, Floats
 from ..base.sampling import even_indices
@@ -152,10 +152,18 @@ def _chart(page: Page, left: float, top: float, wide: float, high: float) -> Axe
     width, height = page.size
     axes = page.chart((left / width, 1 - (top + high) / height, wide / width, high / height))
     axes.yaxis.set_major_locator(MaxNLocator(4 if high > COUNTS else 2, integer=True))
-    axes.yaxis.set_major_formatter(EngFormatter(sep=NARROW))
+    axes.yaxis.set_major_formatter(_tick)
     axes.xaxis.grid(visible=False)
     axes.tick_params(which="both", color=theme.LINE)
     return axes
+
+
+def _tick(value: float, _: object = None) -> str:
+    """Write a number at an axis: «1.5 M»."""
+    for size, letter in ((1e9, "G"), (1e6, "M"), (1e3, "k")):
+        if abs(value) >= 10 * size or (abs(value) >= size and letter != "k"):
+            return f"{value / size:.4g}{NARROW}{letter}"
+    return f"{value:,.6g}"
 
 
 def _draw_counts(axes: Axes, scale: Varied, failures: Bools, colours: Iterable[Any]) -> None:
@@ -240,7 +248,7 @@ def _set_labels(page: Page, axes: Axes, scale: Varied, wide: float) -> None:
         whole = bool((scale.edges % 1 == 0.5).all())  # bins of whole numbers
         few = max(2, min(6, int(wide / 90)))
         axis.set_major_locator(MaxNLocator(few, integer=whole, min_n_ticks=1))
-    axis.set_major_formatter("{x:,.6g}")
+    axis.set_major_formatter(_tick)
 
 
 def draw_sweep(sweep: Sweep) -> Page:

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from pathlib import Path
@@ -151,10 +151,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         with (
             explained(f"The result cannot be written to {place}", advice),
             staging(folder, place) as staged,
-            ThreadPoolExecutor(1, "pictures") as thread,
+            nullcontext() if self.only_cloud else _Pictures(result, staged) as pictures,
         ):
-            pictures = None if self.only_cloud else _Pictures(result, staged)
-            others = thread.submit(pictures.draw, of_cloud=False) if pictures else None
             drawn, page = (pictures.files, [PAGE]) if pictures else ([], [])
             further = _further_files(result.survey, formats)
             files = [CLOUD, *further, *drawn, SWEEPS_FILE, *page, REPORT]
@@ -178,10 +176,10 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 result = workers.recorded(result)
             report = make_report(result, files, cloud)
             report["notes"] += [note for one in formats for note in one.notes(points)]
-            if pictures and others:
+            if pictures:
                 from .page.rendering import write_page  # as slow to import as the pictures
 
-                images = others.result() | pictures.draw(of_cloud=True)
+                images = pictures.finish()
                 write_page(staged / PAGE, report, result, cloud, images, self.scenario)
             text = json.dumps(report, indent=1, allow_nan=False) + "\n"
             (staged / REPORT).write_text(text, encoding="utf-8")
@@ -253,24 +251,36 @@ def _clear(target: Storage, files: Collection[str], earlier: Collection[str]) ->
             flush(target.local())
 
 
-class _Pictures:
-    """Pictures of a result, which are drawn from the file of the cloud, as by `lidarpool plot`."""
+class _Pictures(AbstractContextManager["_Pictures"]):
+    """Pictures of a result, drawn in a thread while the cloud is written.
+
+    They are drawn from the file of the cloud, as by `lidarpool plot`, so that both draw the same.
+    """
 
     def __init__(self, result: RunResult, staged: Path) -> None:
         from .result_pictures import picture_makers  # Matplotlib takes as long as all other imports
 
-        pictured, self._staged = PictureContent.of(result), staged
-        pictured.save(staged / PICTURE_FILE)
+        self._staged, self._thread = staged, ThreadPoolExecutor(1, "pictures")
+        self._pictured = PictureContent.of(result)
         columns = [column.name for column in result.survey.stored_columns]
-        self._makers = picture_makers(pictured, staged / CLOUD, columns)
+        self._makers = picture_makers(self._pictured, staged / CLOUD, columns)
         self.files = [*(f"{name}.png" for name in self._makers), PICTURE_FILE]
+        self._drawn: dict[str, Future[str]] = {}
+        self._begin(name for name in self._makers if name not in _OF_CLOUD)
 
-    def draw(self, *, of_cloud: bool) -> dict[str, str]:
-        """Draw those of the cloud's file, or all others; returns them as SVG, by name."""
-        images = {}
-        for name, make in self._makers.items():
-            if (name in _OF_CLOUD) == of_cloud:
-                page = make()
-                page.save(self._staged / f"{name}.png")
-                images[name] = page.svg()
-        return images
+    def __exit__(self, *_: object) -> None:
+        self._thread.shutdown(cancel_futures=True)
+
+    def _begin(self, names: Iterable[str]) -> None:
+        self._drawn |= {name: self._thread.submit(self._draw, name) for name in names}
+
+    def _draw(self, name: str) -> str:
+        page = self._makers[name]()
+        page.save(self._staged / f"{name}.png")
+        return page.svg()
+
+    def finish(self) -> dict[str, str]:
+        """Draw those of the cloud, whose file is there by now; returns all as SVG, by name."""
+        self._begin(name for name in _OF_CLOUD if name in self._makers)
+        self._pictured.save(self._staged / PICTURE_FILE)
+        return {name: self._drawn[name].result() for name in self._makers}

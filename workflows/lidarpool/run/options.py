@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 from distributed import Client
 from pydantic import Field
@@ -48,12 +48,12 @@ class RunOptions(TaskOptions):
     live: bool = False
     stay: bool = True  # of the live page, at the end
 
-    @classmethod
-    def of(cls, pool: PoolSection, **given: Any) -> RunOptions:
-        """Options of a scenario's section `pool`, unless others are given that are not None."""
-        own = declared(pool, TaskOptions)
-        own |= {"gpu_workers": pool.gpu, "other_workers": pool.other}
-        return cls(**own | {name: one for name, one in given.items() if one is not None})
+    def with_pool(self, pool: PoolSection, backend: str | None = None) -> RunOptions:
+        """Fill in a scenario's section `pool`; a `backend`, and workers that are here, stay."""
+        own = declared(pool, TaskOptions) | {"backend": backend or pool.backend}
+        own["gpu_workers"] = self.gpu_workers or pool.gpu
+        own["other_workers"] = self.other_workers or pool.other
+        return replace(self, **own)
 
     @property
     def own(self) -> bool:

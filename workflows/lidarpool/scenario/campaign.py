@@ -5,11 +5,11 @@ from __future__ import annotations
 import hashlib
 import os
 import re
-from collections.abc import Callable, Iterable, Mapping, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from contextlib import suppress
 from dataclasses import replace
 from functools import cache, cached_property, partial
-from itertools import chain, combinations, count
+from itertools import chain, combinations, count, islice
 from pathlib import Path
 from types import MappingProxyType
 from typing import Annotated, Any
@@ -20,7 +20,7 @@ from pydantic import BaseModel, Field
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.validation import checked, fields_of, is_section, sections_in, sentences, shown
+from ..base.validation import checked, dotted, fields_of, is_section, sections_in, sentences, shown
 from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
@@ -519,14 +519,20 @@ class _Base:
     def check(self, source: str, mistakes: Mistakes) -> None:
         """Note values that are not valid, and find out which files jobs may be made of.
 
-        The first values of all paths are tried together, then the second, and so on.
+        The first values of all paths are tried together, then the second, and so on; only if
+        something is wrong, each alone, to find out which.
         """
         trials = {text: self._trials(text) for text in self._vary}
         for turn in range(max([1, *map(len, trials.values())])):
             changes = {text: tried[turn % len(tried)] for text, tried in trials.items()}
-            with mistakes.noted():
-                found = self.changed(changes, f"{source}: {self._where} can choose")
-                self.files.update(found.files)
+            try:
+                found = self.changed(changes, f"{source}: {self._where}")
+            except LidarpoolError as error:
+                wrong = [line for text in self._vary for line in islice(self._tried(text), 1)]
+                mistakes.lines += [f"{source}: {self._where}: {line}" for line in wrong]
+                mistakes.lines += () if wrong else str(error).splitlines()
+                return
+            self.files.update(found.files)
 
     def _trials(self, text: str) -> list[Any]:
         """Return values for a path, valid if all jobs are; of a table, all rows in pieces."""
@@ -537,6 +543,18 @@ class _Base:
         begins = range(0, len(table), max(1, most)) if most else ()
         pieces = [table[begin : begin + most] for begin in begins]
         return [table[:least], *pieces]
+
+    def _tried(self, text: str) -> Iterator[str]:
+        """Yield lines on the values of a path that are not valid in the base."""
+        choice, place = self._vary[text], dotted([key for key, _ in self._steps[text]])
+        for value in () if choice.sample else choice.ends:
+            try:
+                self.changed({text: value}, "")
+            except LidarpoolError as error:
+                told = str(error).partition("\n")[0].removeprefix(": ")
+                own = told.partition("; ")[2] if told.startswith(f"{place} is ") else ""
+                given = f"{text} can be {shown(value)}"
+                yield f"{given}; {own}{choice.hint(own)}" if own else f"{given}: {told}"
 
     def changed(self, changes: Mapping[str, Any], source: str, noise_seed: int = 0) -> Scenario:
         """Return the scenario with other values, and with a seed of its noise if it has none."""

@@ -140,10 +140,10 @@ class Scene:
             The file; its objects keep their names.
         unit
             Length unit of the file: um, mm, cm, dm, m, km, in, ft, yd or mi. None takes what
-            the file states, else metres.
+            the file states (.dae, .3mf, .usd, .glb and .gltf), else metres.
         up_axis
-            Axis of the file that points up: x, y or z. None takes what the file or its format
-            states, else z.
+            Axis of the file that points up: x, y or z. None takes what the file (.dae, .usd) or
+            its format states (y of .glb and .gltf), else z.
         transform
             Placement of the mesh in the world, in metres, after unit and up axis: a
             `lidarpool.scene.transform.Transform`.

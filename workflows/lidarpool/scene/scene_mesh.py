@@ -142,9 +142,9 @@ def _check_voxels(name: str, voxels: Voxels) -> None:
     well = well and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
     if not well or np.linalg.matrix_rank(matrix[:, :3]) < 3:
         raise LidarpoolError(
-            f"The voxels of {name!r} are not as they must be: densities float32 (nx, ny, nz), "
-            f"{VOXELS_MOST:,} at most along each axis, of 0 to {DENSEST:g} m²/m³, and a finite "
-            "matrix (3, 4) that has an inverse."
+            f"The voxels of {name!r} are {density.dtype} {density.shape}, with a matrix "
+            f"{matrix.shape}; they must be float32 (nx, ny, nz), {VOXELS_MOST:,} at most along "
+            f"each axis, of 0 to {DENSEST:g} m²/m³, and the matrix finite (3, 4), invertible."
         )
 
 
@@ -180,6 +180,8 @@ def compacted(vertices: AnyArray, faces: Integers) -> tuple[AnyArray, Ints]:
         return vertices[used], corners.reshape(-1, 3)
     there = np.zeros(len(vertices), np.bool_)
     there[faces] = True
+    if there.all():
+        return vertices, np.asarray(faces, np.int64)
     return vertices[there], (np.cumsum(there) - 1)[faces]
 
 

@@ -137,7 +137,6 @@ def _shares(shared: Instances, most: int, near: Sequence[Floats]) -> Floats:
     distance += 1e-3
     full = distance.max()  # up to this distance they have all
     while True:
-        # In few steps, because each is another mesh.
         # In steps of four: each step is another mesh.
         shares = np.maximum(4.0 ** np.floor(np.log2(np.minimum(full / distance, 1))), even / 2)
         if shares @ shared.sizes <= most:

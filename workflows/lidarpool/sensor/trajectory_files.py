@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import csv
-from array import array
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import replace
-from math import isfinite, nan
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -99,13 +97,13 @@ def load_trajectory(
         raise LidarpoolError(f"{path} is not a usable trajectory: {said(error)}") from error
 
 
-def _numbers(text: str, columns: int) -> Floats:
+def _numbers(text: str, columns: int | None = None, **options: Any) -> Floats:
     """Rows of numbers, by `np.loadtxt`; lines that begin with # are comments."""
     lines = [line for line in text.splitlines() if line.strip() and line.strip()[0] != "#"]
     if not lines:
         raise ValueError("it has no rows of numbers")
-    rows = np.loadtxt(lines, ndmin=2)
-    if rows.shape[1:] != (columns,):
+    rows = np.loadtxt(lines, ndmin=2, **options)
+    if columns is not None and rows.shape[1:] != (columns,):
         raise ValueError(f"its rows have {rows.shape[1]} numbers, not {columns}")
     return rows
 
@@ -174,23 +172,27 @@ def columns_of_table(
     must = {**dict.fromkeys(needed(at)), **names}
     if missing := [names.get(name, name) for name in must if name not in at]:
         raise ValueError(f"it has no column {missing[0]!r}; it has {', '.join(head)}")
-    rows = array("d")
-    reader = csv.reader(lines[first + 1 :], delimiter=mark)
-    for cells in reader:
-        if not "".join(cells).strip() or cells[0].lstrip().startswith("#"):
-            continue
-        for name, index in at.items():  # other columns may hold text
-            cell = cells[index] if index < len(cells) else ""
-            rows.append(_number(cell.partition("#")[0]))
-            if not isfinite(rows[-1]):
-                more = "" if name in must else ", or leave the column out"
-                raise ValueError(
-                    f"its column {head[index]!r} has {cell!r} in line {first + 1 + reader.line_num}"
-                    f": give a number in every line{more}"
-                )
-    if not rows:
-        raise ValueError("it has no rows of numbers")
-    return dict(zip(at, np.frombuffer(rows).reshape(-1, len(at)).T, strict=True))
+    used = list(at.values())  # others may hold text
+    body = lines[first + 1 :]
+    try:
+        rows = _numbers("\n".join(body), delimiter=mark, quotechar='"', usecols=used)
+        if not np.isfinite(rows).all():
+            raise ValueError("it has a nan or inf")
+    except ValueError as error:
+        reader = csv.reader(body, delimiter=mark)
+        for cells in reader:
+            remark = not cells or cells[0].lstrip().startswith("#")
+            for name, index in () if remark else at.items():
+                cell = cells[index] if index < len(cells) else ""
+                if not _is_finite(cell):
+                    line = first + 1 + reader.line_num
+                    more = "" if name in must else ", or leave the column out"
+                    raise ValueError(
+                        f"its column {head[index]!r} has {cell!r} in line {line}: give a number in "
+                        f"every line{more}"
+                    ) from error
+        raise
+    return dict(zip(at, rows.T, strict=True))
 
 
 def head_of_table(lines: Sequence[str]) -> tuple[int, str, list[str]]:
@@ -201,11 +203,11 @@ def head_of_table(lines: Sequence[str]) -> tuple[int, str, list[str]]:
     return first, mark, [name.strip().strip('"') for name in lines[first].split(mark)]
 
 
-def _number(cell: str) -> float:
+def _is_finite(cell: str) -> bool:
     try:
-        return float(cell)
+        return bool(np.isfinite(float(cell)))
     except ValueError:
-        return nan
+        return False
 
 
 def quaternions_from_degrees(angles: Floats) -> Floats:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections import defaultdict
+from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from heapq import nlargest
@@ -36,6 +36,7 @@ ROWS_MOST = 24  # rows of a partition; the busiest are drawn
 _THIN = 1.2  # least width of a bar, in units
 _GAP = 0.6  # bars nearer than this are drawn as one
 TimeSpan = tuple[float, float]
+WorkerTasks = dict[tuple[str, str], list[TaskRecord]]  # {(worker, stage): their tasks}
 MINUS, NARROW = "\N{MINUS SIGN}", "\N{NARROW NO-BREAK SPACE}"
 _SPACES = f"\n\t\N{NO-BREAK SPACE}{NARROW}"  # not printable to Python, and harmless
 
@@ -93,7 +94,7 @@ def rendered(
         finalize=lambda value: escaped(value) if type(value) is str else value,  # not of Markup
     )
     for filter_ in (
-        duration, rate, large, share,
+        duration, rate, large, share, excess,
         numbers, formatted, code, markdown, millimetres,
         ratio, plural,
     ):  # fmt: skip
@@ -159,15 +160,18 @@ def make_timeline(stages: Sequence[StageTotals]) -> dict[str, Any] | None:
     groups: list[dict[str, Any]] = [
         {"title": "Stages", "detail": "while at least one task ran", "rows": overview}
     ]
-    for partition in sorted({stage.partition for stage in stages if stage.records}):
-        own = [stage for stage in stages if stage.partition == partition]
-        tasks: dict[tuple[str, str], list[TaskRecord]] = defaultdict(list)  # {(worker, stage): …}
-        for record in (record for stage in own for record in stage.records):
-            tasks[record.worker, record.stage].append(record)
-        workers = {worker for stage in own for worker in stage.workers}
-        ran, count = sum(stage.tasks for stage in own), sum(map(len, tasks.values()))
-        detail = f"{plural(len(workers), 'worker')}, {plural(ran, 'task')}"
-        if ran > count:  # else gaps would look like idle time
+    ran = sum((stage.resources for stage in stages), Counter())  # {partition: tasks}
+    # {partition: its tasks}
+    drawn: dict[str, WorkerTasks] = defaultdict(lambda: defaultdict(list))
+    for record in (record for stage in stages for record in stage.records):
+        where = record.partition if not record.misplaced else " + ".join(record.resources)
+        drawn[where or "no partition"][record.worker, record.stage].append(record)
+    for partition, tasks in sorted(drawn.items()):
+        workers = {worker for worker, _ in tasks}  # of tasks that have a record
+        workers = workers.union(*(s.workers for s in stages if s.partition == partition))
+        count = sum(map(len, tasks.values()))
+        detail = f"{plural(len(workers), 'worker')}, {plural(max(ran[partition], count), 'task')}"
+        if ran[partition] > count:  # else gaps would look like idle time
             detail += f", of which {count:,} are drawn: gaps are not all idle time"
         if len(tasks) > ROWS_MOST:
             detail += f"; the busiest {ROWS_MOST} of {len(tasks):,} rows"
@@ -238,6 +242,13 @@ def large(number: float) -> str:
 def share(part: float, whole: float) -> str:
     """Return a part in per cent."""
     return f"{100 * part / whole:.1f}%" if whole else "–"
+
+
+def excess(fraction: float) -> str:
+    """Return an excess in per cent: «+0.12%»."""
+    if 0 < fraction < 1e-4:
+        return "< 0.01%"
+    return f"{fraction:+.2%}".replace("-", MINUS)
 
 
 def formatted(value: Any, digits: int = 6) -> str:

@@ -10,12 +10,12 @@ from ..masks import MaskError
 from .scene_graph import MeshFileError, Wanted
 
 
-def named_file(mesh: Path, name: str, wanted: Wanted) -> Path | None:
+def named_file(mesh: Path, name: str, wanted: Wanted, *, moved: bool = True) -> Path | None:
     """Find a file that a mesh file names; None if it is not there.
 
     Names may be escaped, as URIs are by the standard but not by all programs, have backslashes, or
-    be of another machine: then their last part counts. A pipe is no file, because reading it would
-    wait for ever.
+    be of another machine: then their last part counts, if files may be `moved`. A pipe is no file,
+    because reading it would wait for ever.
 
     Raises
     ------
@@ -25,7 +25,8 @@ def named_file(mesh: Path, name: str, wanted: Wanted) -> Path | None:
     name = name.strip().removeprefix("file://")
     windows = PureWindowsPath(unquote(name))
     refused = False
-    for one in filter(None, (name, unquote(name), windows.as_posix(), windows.name)):
+    last = windows.name if moved else ""
+    for one in filter(None, (name, unquote(name), windows.as_posix(), last)):
         target = mesh.parent.resolve() / one
         try:
             if not wanted.allows(target):

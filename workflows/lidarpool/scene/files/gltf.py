@@ -511,7 +511,7 @@ class _Reader:
 
     def _read_beside(self, uri: str) -> bytes:
         """Read a buffer file."""
-        target = named_file(self._path, uri, self._wanted)
+        target = named_file(self._path, uri, self._wanted, moved=False)
         if target is None:
             raise MeshFileError(
                 f"takes data from {uri[:80]!r}, a file that is not there: put it beside, or export "

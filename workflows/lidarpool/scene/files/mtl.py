@@ -30,7 +30,7 @@ from .scene_graph import SMALLER, MeshFileError, Wanted
 
 # Options of images, and the words that follow each; -o, -s and -t have one to three numbers.
 _OPTION = re.compile(
-    rb"\s*(-[ost])((?:\s+[-+.\de]+(?=\s)){0,3})|\s*(-mm)((?:\s+\S+){2})"
+    rb"\s*(-[ost])(?=\s)((?:\s+[-+.\de]+(?=\s)){0,3})|\s*(-mm)((?:\s+\S+){2})"
     rb"|\s*(-(?:blendu|blendv|boost|texres|clamp|bm|imfchan|type|cc))(\s+\S+)",
     re.IGNORECASE,
 )
@@ -101,9 +101,13 @@ class MtlMaterials:
             self._entries |= _read_mtl(data)
 
     @property
-    def images(self) -> bool:
-        """Whether a material has an image, so that texture coordinates are needed."""
-        return any(entry.images for entry in self._entries.values())
+    def has_masks(self) -> bool:
+        """Whether a material may have a mask, for which texture coordinates are needed."""
+        return self._wanted.masks and any(
+            key == b"map_d" or not image.name.lower().endswith(_WITHOUT_ALPHA)
+            for entry in self._entries.values()
+            for key, image in entry.images.items()
+        )
 
     def cutout(self, name: bytes, vt: Floats, corners: Ints) -> Cutout | None:
         """Cut the mask of a material out of triangles, whose corners (k, 3) have some of `vt`."""

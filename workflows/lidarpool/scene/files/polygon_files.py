@@ -49,6 +49,9 @@ class _ObjPolygons:
         """Vertices (t, 3), texture coordinates (t, 3) and materials (t,) of triangles."""
         corners, sizes = _ints(self.corners), _ints(self.sizes)
         check_corners(corners, len(vertices))
+        if not self.kinds:  # as a whole, without materials
+            own = triangulated(vertices, corners, sizes)
+            return own, own, np.zeros(len(own), np.int64)
         own = triangulated(vertices[corners], np.arange(len(corners)), sizes)
         kinds = np.repeat(_ints(self.kinds), sizes)
         return corners[own], _ints(self.places)[own], kinds[own[:, 0]]
@@ -66,7 +69,7 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
     divider = b"o" if re.search(rb"^ *o ", text, re.MULTILINE) else b"g"
     libraries = _obj_names(b"mtllib", text) if masks or colours else []
     materials = MtlMaterials(path, len(data), libraries, wanted)
-    dressed = materials.images or colours
+    dressed = materials.has_masks or colours
     numbers, coordinates, tints = array("d"), array("d"), array("d")
     parts = {path.stem: _ObjPolygons()}
     part, kind, kinds = parts[path.stem], 0, {b"": 0}  # {material: its number}
@@ -82,11 +85,11 @@ def read_obj(data: bytes, path: Path, wanted: Wanted) -> Content:
         elif key == b"f":
             rest = rest.partition(b"#")[0]
             corners = _obj_corners(rest, len(numbers) // 3, line)
-            places = _obj_places(rest, len(coordinates) // 2) if dressed else [-1] * len(corners)
             part.corners.extend(corners)
-            part.places.extend(places)
             part.sizes.append(len(corners))
-            part.kinds.append(kind)
+            if dressed:
+                part.places.extend(_obj_places(rest, len(coordinates) // 2))
+                part.kinds.append(kind)
         elif key == divider:
             part = parts.setdefault(as_text(rest.strip()) or path.stem, _ObjPolygons())
         elif key == b"usemtl":

@@ -18,7 +18,8 @@ _FLAT = 1e-12  # a corner turns back if its sine, of a plane polygon, is below m
 def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     """Cut polygons into triangles with the same corners and orientation.
 
-    Convex polygons become fans, all of one size at once; mapbox_earcut clips the ears of others.
+    Convex polygons and quadrangles become fans, all of one size at once; mapbox_earcut clips the
+    ears of others.
 
     `vertices` are (v, 3), `corners` (sum of sizes,) those of all polygons one after the other, and
     `sizes` (p,) how many each has; polygons with fewer than three are dropped.
@@ -41,16 +42,29 @@ def triangulated(vertices: Floats, corners: Ints, sizes: Ints) -> Ints:
     for size in np.unique(sizes[sizes > 2]).tolist():
         which = np.flatnonzero(sizes == size)
         rows = corners[first[which, None] + np.arange(size)]
+        if size == 4:
+            rows = _begun_well(vertices, rows)
         places = ends[which, None] - (size - 2) + np.arange(size - 2)
         out[places] = fanned(rows)
-        if size > 3:
+        if size > 4:
             for i in np.flatnonzero(_turns(vertices[rows]).any(axis=1)).tolist():
                 clipped = with_holes(vertices, [rows[i]])
-                if not len(clipped) or _lost(vertices[rows[i]], vertices[clipped]):
-                    continue  # the fan has all of it: no area, or that of a warped polygon
-                out[places[i]] = -1
-                out[places[i, : len(clipped)]] = clipped
+                if len(clipped) < size - 2 and _lost(vertices[rows[i]], vertices[clipped]):
+                    clipped = rows[i][_all_triangles(vertices[rows[i]])]
+                if len(clipped):  # else it has no area, nor has the fan
+                    out[places[i]] = -1
+                    out[places[i, : len(clipped)]] = clipped
     return out[out[:, 0] >= 0]
+
+
+def _begun_well(vertices: Floats, rows: Ints) -> Ints:
+    """Rotate quadrangles (p, 4) to begin at their reflex corner, if any, so that a fan fills them.
+
+    The clipper would leave out half of a quadrangle so warped that its projection crosses itself.
+    """
+    back = _turns(vertices[rows])
+    begin = np.where(back.sum(axis=1) == 1, back.argmax(axis=1), 0)
+    return np.take_along_axis(rows, (begin[:, None] + np.arange(4)) % 4, axis=1)
 
 
 def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
@@ -64,7 +78,6 @@ def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
         As `triangulated`.
     """
     corners = np.concatenate(rings)
-    ends = np.cumsum([len(ring) for ring in rings]).astype(np.uint32)
     if len(corners) > MOST_CORNERS:
         raise ValueError(f"a face has {len(corners):,} corners and is not convex: triangulate it")
     check_corners(corners, len(vertices))
@@ -75,9 +88,14 @@ def with_holes(vertices: Floats, rings: list[Ints]) -> Ints:
     across, up = (drop + 1) % 3, (drop + 2) % 3
     if normal[drop] < 0:  # the clipper's triangles run anticlockwise, whatever the polygon does
         across, up = up, across
-    flat = np.ascontiguousarray(points[:, [across, up]])
-    found = mapbox_earcut.triangulate_float64(flat, ends)
-    return corners[np.asarray(found, np.int64).reshape(-1, 3)]
+    return corners[_clipped(points[:, [across, up]], [len(ring) for ring in rings])]
+
+
+def _clipped(flat: Floats, sizes: list[int]) -> Ints:
+    """Triangles (t, 3) of a plane outline (k, 2) and holes in it, of so many corners each."""
+    ends = np.cumsum(sizes).astype(np.uint32)
+    found = mapbox_earcut.triangulate_float64(np.ascontiguousarray(flat), ends)
+    return np.asarray(found, np.int64).reshape(-1, 3)
 
 
 def unrolled(strip: Ints) -> Ints:
@@ -109,6 +127,28 @@ def _lost(points: Floats, triangles: Floats) -> bool:
         off > _WARPED * size * np.linalg.norm(normal)
         and np.linalg.norm(missing) > _WARPED * size**2
     )
+
+
+def _all_triangles(points: Floats) -> Ints:
+    """Triangles (k - 2, 3) of a warped polygon (k, 3): clipped as seen along its normal, or a fan.
+
+    The fan is the one with the least area, which of a polygon with one reflex corner begins there.
+    """
+    count = len(points)
+    points = points - points[0]
+    normal = _newell(points)
+    normal = normal / np.linalg.norm(normal)
+    across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
+    found = _clipped(points @ np.stack([across, np.cross(normal, across)], axis=1), [count])
+    if len(found) == count - 2:
+        return found
+
+    def area(begin: int) -> float:
+        rest = np.roll(points, -begin, axis=0) - points[begin]
+        return float(np.linalg.norm(np.cross(rest[1:-1], rest[2:]), axis=1).sum())
+
+    best = min(range(count), key=area)
+    return fanned((best + np.arange(count)) % count)
 
 
 def _newell(points: Floats) -> Floats:

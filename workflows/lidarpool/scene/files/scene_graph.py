@@ -232,9 +232,11 @@ def _own(piece: Piece, allowance: Allowance | None) -> Piece:
     """Return a piece without unused vertices; many pieces may share all of them."""
     vertices, faces, cutout, painted = piece
     check_corners(faces, len(vertices))
-    vertices, faces = compacted(vertices, faces)
     if allowance is not None:
         extra = 0 if cutout is None else cutout.uv.nbytes
         extra += 0 if painted is None else 40 * len(faces)
-        allowance.take(faces.nbytes + extra + 24 * len(vertices))  # in double precision
+        allowance.take(faces.nbytes + extra)
+    vertices, faces = compacted(vertices, faces)
+    if allowance is not None:
+        allowance.take(24 * len(vertices))  # in double precision
     return Piece(vertices, faces, cutout, painted)

@@ -32,12 +32,14 @@ from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder, revolve
 from ..transform import UP_AXES
 from .companions import outside
+from .polygons import triangulated
 from .scene_graph import (
     MOST_NODES,
     SMALLER,
     Content,
     MeshFileError,
     Node,
+    Piece,
     PlacedNode,
     RigidPart,
     Wanted,
@@ -154,8 +156,12 @@ def _mesh(
     solid[holes[(holes >= 0) & (holes < len(sizes))]] = False
     vertices = points.reshape(-1, 3).astype(np.float64)
     try:
-        allowance.take(15 * 8 * len(corners))
-        pieces = dressed(frame, arrays, vertices, (sizes, corners, solid), materials)
+        if "materials" in frame:
+            allowance.take(15 * 8 * len(corners))
+            pieces = dressed(frame, arrays, vertices, (sizes, corners, solid), materials)
+        else:
+            outlines = corners[np.repeat(solid, sizes)]
+            pieces = iter([Piece(vertices, triangulated(vertices, outlines, sizes[solid]))])
         return joined(name, pieces, allowance)
     except ValueError as error:
         raise ValueError(f"{name!r}: {error}") from error
@@ -166,11 +172,11 @@ def _shape(
 ) -> list[SceneMesh]:
     """Mesh of a cube, sphere, cylinder, cone, capsule or plane; none if it has no size."""
     made = _outline(frame)
-    if made is None:
-        return []
+    if made is None or "materials" not in frame:
+        return [made] if made else []
     rows = np.arange(len(made.faces))
     look = Look(frame, arrays, {"constant": np.zeros((len(rows), 3), np.int64)})
-    number = next((number for number, _ in frame.get("materials", ())), None)
+    number = next((number for number, _ in frame["materials"]), None)
     # Without texture coordinates they have no masks either, and a note says so.
     materials.cutout(number, look, rows)
     return [replace(made, colours=materials.colours(number, look, rows))]
