@@ -403,11 +403,12 @@ WRONG = {
     "no field": ({"weather.visibility": {"uniform": [1, 2]}}, "Did you mean 'visibility_km'?"),
     "no name": ({"sensors.rof.model": {"choice": ["a"]}}, "Did you mean 'roof'?"),
     "no list": ({"poses.0.yaw_deg": {"uniform": [1, 2]}}, "the base has no poses"),
-    "low": ({KM: {"uniform": [0, 2]}}, f"vary can choose: {KM} is 0.0; it must be 0.001 to"),
-    "tail": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "is -5.0; it must be 0 to"),
+    "low": ({KM: {"uniform": [0, 2]}}, f"{KM} can be 0.0; it must be 0.001 to"),
+    "tail": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "can be -5.0; it must be 0 to"),
+    "limits": ({"noise.range_m": {"normal": {"mean": 1, "std": 1}}}, "Give limits."),
     "far": ({KM: {"normal": {"mean": 1, "std": 1, "limits": [9, 10]}}}, "at least 1% of the"),
-    "not whole": ({"steps": {"uniform": [1, 9]}}, "steps is 1.0; it must be a whole"),
-    "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m is 'a'; it must be"),
+    "not whole": ({"steps": {"uniform": [1, 9]}}, "steps can be 1.0; it must be a whole"),
+    "type": ({"noise.range_m": {"choice": [0, "a"]}}, "noise.range_m can be 'a'; it must be"),
     "model": (
         {"sensors.roof.model": {"choice": ["velodyne/vlp15"]}},
         "Did you mean 'velodyne/vlp16",
@@ -509,7 +510,7 @@ def test_of_several_bases_the_wrong_one_is_named(campaign, folder):
     assert "campaign.yaml: vary, of fog.yaml: sensors of the base has no 'roof'" in str(
         raised.value
     )
-    with pytest.raises(LidarpoolError, match=r"vary, of fog\.yaml can choose: steps is 0; it must"):
+    with pytest.raises(LidarpoolError, match=r"vary, of fog\.yaml: steps can be 0; it must"):
         campaign({"steps": {"choice": [0]}}, base=["base.yaml", "fog.yaml"])
 
 

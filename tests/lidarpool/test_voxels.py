@@ -347,7 +347,7 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
         (np.full((1, 1, 1), np.nan, np.float32), np.eye(3, 4)),
         (np.ones((1, 1, 1), np.float32), np.zeros((3, 4))),
     ]:
-        with pytest.raises(LidarpoolError, match="voxels of 'T' are not as they must be"):
+        with pytest.raises(LidarpoolError, match="voxels of 'T' are .*; they must be float32"):
             SceneMesh("T", mesh.vertices, mesh.faces, voxels=Voxels(density, matrix))
 
 
