@@ -202,11 +202,6 @@ def run(
     from ..scenario.scenario import Scenario
     from .run_command import run_campaign, run_job, run_scenario
 
-    if options.tls and not options.own:
-        raise click.UsageError(
-            "--tls is for a cluster of this machine: that of --cluster is encrypted if its file "
-            "says so, that of --scheduler if its address begins with tls://."
-        )
     if options.fresh and (options.resume or options.verify):
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):

@@ -79,6 +79,11 @@ def scheduler(command: Command) -> Command:
             raise click.UsageError(
                 "--cluster starts a cluster, --scheduler is for one that runs: give one of them."
             )
+        if given.get("tls") and (given["cluster"] is not None or given["scheduler"] is not None):
+            raise click.UsageError(
+                "--tls is for a cluster of this machine: that of --cluster is encrypted if its "
+                "file says so, that of --scheduler if its address begins with tls://."
+            )
         files = TlsFiles(*(given.pop(f"tls_{part}") for part in ("ca", "cert", "key")))
         if any(files) and given["scheduler"] is None:
             raise click.UsageError(
