@@ -175,6 +175,7 @@ def test_a_scenario_says_how_it_is_run_unless_python_does():
 
 def test_nothing_public_is_left_out():
     """But for what only runs make, or a reader of files."""
+    assert dir(lidarpool) == sorted(lidarpool.__all__)
     made = {
         "Comparison",
         "CampaignRun",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -131,7 +130,6 @@ assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
     subprocess.run(
         [sys.executable, "-c", script],
         cwd=EXAMPLES,
-        env={**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))},
         check=True,
     )
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import logging
 import pickle
+import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -493,3 +494,21 @@ def test_names_of_materials_are_looked_up_and_contradictions_refused():
     for name, (shares, library, sample) in table.items():
         row = f"| `{name}` | {shares[0]:.2f} | {shares[1]:.2f} | {library}: {sample} |"
         assert row in page
+
+
+def test_colours_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
+    header, body = opaque()
+    attributes = header["meshes"][0]["primitives"][0]["attributes"]
+    attributes["COLOR_0"] = attributes["TEXCOORD_0"]
+    found, _, _ = on_card(tmp_path, header, body)
+    assert "its COLOR_0 is not red" in caplog.text and (found == GREY[0, 0]).all()
+
+
+def test_the_script_of_the_example_makes_its_file(tmp_path):
+    road = runpy.run_path(str(EXAMPLES / "road.py"), run_name="road")["road"]
+    (tmp_path / "road.glb").write_bytes(road().export(file_type="glb"))
+    made, kept = (
+        Scene.load(folder / "road.glb", up_axis="y", colours=True)
+        for folder in (tmp_path, EXAMPLES)
+    )
+    np.testing.assert_array_equal(made.vertices, kept.vertices)

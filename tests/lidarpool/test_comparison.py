@@ -504,3 +504,10 @@ def test_a_page_by_itself_with_all_figures(tmp_path):
     plain = compare(Cloud(cloud().positions, {}), Cloud(cloud().positions, {}))
     assert len(plain.save(tmp_path / "plain")) == 4  # no pictures of ranges and rings
     assert "No range image" in (tmp_path / "plain/compare.html").read_text()
+
+
+def test_a_ring_that_only_one_sees_is_noted():
+    there = np.ones((RINGS, COLUMNS), bool)
+    there[3] = False
+    notes = compare(cloud(there=there), cloud()).figures["notes"]
+    assert "only one of the two has returns of 1 ring" in str(notes)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import sqlite3
 import subprocess
 import sys
@@ -289,7 +288,6 @@ def test_one_run_at_a_time(db, tmp_path):
     )
     done = subprocess.run(
         [sys.executable, "-c", code, db.path],
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
         capture_output=True,
         text=True,
         check=True,

@@ -126,6 +126,8 @@ def test_nuscenes_has_a_scene_for_each_job(written, job, sweeps):
     points = cloud.part(np.flatnonzero(cloud.scan // SCANS == TURNS + 2))
     inside = sweeps.in_sensor(TURNS + 2, points.positions)
     np.testing.assert_allclose(rows[:, :3], inside, atol=1e-5)
+    np.testing.assert_allclose(rows[:, 3], points.intensity * 255, rtol=1e-6)
+    np.testing.assert_array_equal(rows[:, 4], points.channel)
     total = sum(row["num_lidar_pts"] for row in tables["sample_annotation"])
     objects = len(sweeps.objects)
     assert total == sum((job(number).object >= objects).sum() for number in (0, 1, 7))

@@ -166,31 +166,6 @@ def test_a_mirror_that_moves_counts_twice():
     np.testing.assert_allclose(returns.radial_velocity[seen], -6 * cosine, rtol=1e-9)
 
 
-SENSORS = {
-    "one return each": {},
-    "angles": {"noise": Noise(angle_deg=0.2, velocity_m_s=0.05, seed=3)},
-    "sub-rays": {
-        "returns": Returns("all", subrays=7, divergence_mrad=5),
-        "noise": Noise(range_m=0.1, velocity_m_s=0.05),
-    },
-}
-
-
-@pytest.mark.parametrize("backend", ["embree", "numpy"])
-@pytest.mark.parametrize("options", SENSORS.values(), ids=SENSORS)
-def test_batches_do_not_matter(options, backend):
-    sensor = Sensor.grid(90, 8, 40.0, step_deg=90)
-    cart = Cart(stations=1)
-    carrier = Mounted(sensor, Pose((0.3, 0.1, 1.0), 20))
-    survey = Survey(
-        sensors=[carrier], trajectory=cart, steps=8, columns=["radial_velocity"], **options
-    )
-    scene = Scene.seed().with_actors([Actor(box("Car", (4.0, 2.0, 2.0)), circle(8.0, 1.5, 40))])
-    rig = Rig(scene, survey, backend)
-    whole = cast_between(rig, survey, [0, 8])
-    assert whole == cast_between(rig, survey, range(9)) == cast_between(rig, survey, [0, 3, 5, 8])
-
-
 def test_sub_rays_of_a_plain_beam_see_what_one_ray_sees():
     sensor = Sensor.grid(90, 8, 40.0, step_deg=90)
     cart = Cart(stations=1)

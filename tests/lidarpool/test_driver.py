@@ -750,3 +750,11 @@ def test_stage_1_always_has_jobs_before_it_and_few_of_them(empty):
     assert begun >= ANNOUNCED
     empty.until(begin)
     assert 32 <= most <= 2 * most_under_way(2, 2, 32)
+
+
+def test_slots_are_wanted_as_long_as_there_is_work(run):
+    run.stages.seconds = 100.0
+    run.end()
+    wanted = run.workers.wanted
+    assert wanted[1] == SCANS and wanted[-1] == 0
+    assert wanted[1:] == sorted(wanted[1:], reverse=True)

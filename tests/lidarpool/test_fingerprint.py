@@ -26,6 +26,7 @@ from lidarpool import Beams, LidarpoolError, Sensor, Spin
 from lidarpool.base.fingerprint import fingerprint
 from lidarpool.base.software import PACKAGES, difference, software, sources
 from lidarpool.sensor import Head
+from raybeam import available_backends
 
 Pair = namedtuple("Pair", "a b")
 Other = namedtuple("Other", "a c")
@@ -165,6 +166,7 @@ SCRIPT = """
 import numpy as np
 from lidarpool import Beams, Column, Pose, Sensor, Spin, Survey
 from lidarpool.base.fingerprint import fingerprint
+from raybeam import available_backends
 
 GAIN = {"low": 0.5, "high": 2.0, "none": None}
 NAMES = {"a", "b", "c", "d"}
@@ -189,7 +191,7 @@ print(fingerprint(survey.sensor, survey.path, survey.columns, GAIN, NAMES))
 def test_another_process_finds_the_same():
     found = set()
     for seed in ("1", "2", "3"):
-        environment = os.environ | {"PYTHONHASHSEED": seed, "PYTHONPATH": os.pathsep.join(sys.path)}
+        environment = os.environ | {"PYTHONHASHSEED": seed}
         command = [sys.executable, "-c", SCRIPT]
         done = subprocess.run(command, env=environment, capture_output=True, text=True, check=True)
         found.add(done.stdout)
@@ -254,3 +256,6 @@ def test_the_first_difference_is_named():
     there = here | {"numpy": "1.0 with nothing"}
     assert difference(there, here) == f"numpy 1.0 with nothing, the run numpy {here['numpy']}"
     assert difference({}, here).startswith("lidarpool not installed, the run lidarpool 0.")
+    assert " with " in here["numpy"]  # the instruction sets
+    if not available_backends()["embree"]:
+        assert "vectors of" in software("embree")["backend"]

@@ -685,3 +685,19 @@ def test_a_cloud_becomes_a_dataframe_of_a_library(cloud, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)  # as where it is not installed
     with pytest.raises(LidarpoolError, match="Dataframes need pandas: pip install pandas"):
         cloud.to_dataframe()
+
+
+def test_formats_hold_radial_velocities(cloud, sweeps, tmp_path):
+    velocity = np.random.default_rng(6).normal(0, 9, len(cloud)).astype(np.float32)
+    velocity[5] = np.nan  # of a false alarm
+    columns = {**cloud.columns, "radial_velocity": velocity}
+    moving = Cloud(cloud.positions, columns, sweeps=lambda: sweeps)
+    for name in ("c.mcap", "c.las", "c.ply"):
+        assert "radial_velocity" not in save_cloud(moving, tmp_path / name)
+    for found in (laspy.read(tmp_path / "c.las"), read_cloud(tmp_path / "c.ply")):
+        np.testing.assert_array_equal(found["radial_velocity"], velocity)
+    types = get_typestore(Stores.ROS2_HUMBLE)
+    with AnyReader([tmp_path / "c.mcap"], default_typestore=types) as bag:
+        to, _, data = next(m for m in bag.messages() if m[0].topic == "/front/points")
+        fields = bag.deserialize(data, to.msgtype).fields
+        assert "radial_velocity" in [field.name for field in fields]

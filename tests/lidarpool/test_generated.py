@@ -32,14 +32,6 @@ def test_as_many_triangles_as_asked(triangles):
         assert len(scene.faces) >= 0.999 * triangles
 
 
-def test_same_seed_same_city():
-    one, other, third = city(20_000, 3), city(20_000, 3), city(20_000, 4)
-    assert one.vertices.tobytes() == other.vertices.tobytes()
-    assert one.faces.tobytes() == other.faces.tobytes()
-    assert one.names == other.names
-    assert third.vertices.tobytes() != one.vertices.tobytes()
-
-
 def test_everything_stands_on_the_ground():
     scene = city(100_000)
     bounds = scene.object_bounds

@@ -438,3 +438,15 @@ def test_mistakes_are_told_in_a_line_and_nothing_is_written(survey, tmp_path, ch
         import_survey(path, tmp_path / "out")
     assert str(told.value).startswith(str(path)) and "\n" not in str(told.value)
     assert [entry.name for entry in tmp_path.iterdir()] == ["helios"]
+
+
+def test_angular_resolutions_set_the_rates(imported):
+    wide = {"scanAngleMax_deg": 90, "scanAngleEffectiveMax_deg": 50}
+    device = scanner("rotating", "", headRotatePerSecMax_deg=99, **wide)
+    fine = 'pulseFreq_hz="9000" verticalResolution_deg="2" horizontalResolution_deg="0.5" '
+    ends = 'headRotateStart_deg="0" headRotateStop_deg="50"'
+    made, _, of = imported(device, legs(fine + ends, (0, 0)), platform="tripod")
+    head = of.carried[0].sensor.head
+    assert head.firings_per_turn == pytest.approx(720) and head.rate_hz == pytest.approx(50 / 360)
+    assert of.ray_count == 100 * 50  # lines half a degree apart, of -48 to 50 degrees by 2
+    assert made.scenario.sensors["leg0"].steps == 5

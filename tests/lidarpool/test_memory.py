@@ -84,7 +84,6 @@ SURVEYS = {
     "sub-rays": Survey(MANY, **STILL, **ALL, returns=Returns("strongest", 7, 3.0)),
     "rain": Survey(MANY, **STILL, **SEEN, rain_mm_h=20),
     "snow": Survey(MANY, **STILL, **ALL, **SEEN, snow_mm_h=2),
-    "fog": Survey(MANY, **STILL, **SEEN, visibility_km=0.05, fog_lidar_ratio_sr=65),
 }
 
 

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tests.shapes import cast_between, level, made, quad
+from tests.shapes import level, made, quad
 
 from lidarpool import (
     LidarpoolError,
@@ -192,14 +192,6 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)
     for column, values in every.items():
         assert np.array_equal(found[column], values), column
-
-
-def test_however_scans_are_batched_actors_have_the_same_bits(street):
-    survey = Survey(load_sensor("velodyne/vlp16"), trajectory=DRIVE, columns=COLUMNS)
-    rig = Rig(replace(street, actors=(CAR,)), survey, "numpy")
-    count = survey.scan_count
-    whole = cast_between(rig, survey, [0, count])
-    assert cast_between(rig, survey, [0, 1, 7, 30, count - 3, count]) == whole
 
 
 def test_an_actor_must_be_there_as_long_as_the_survey_lasts(street):

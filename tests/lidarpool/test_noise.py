@@ -6,7 +6,6 @@ import sys
 from dataclasses import replace
 
 import numpy as np
-import pytest
 from tests.shapes import block, level
 
 from lidarpool import (
@@ -91,12 +90,6 @@ def test_no_random_number_is_used_twice(monkeypatch):
         assert len(np.unique(bits)) == len(bits), purpose
     bits = np.concatenate([*each.values()])
     assert len(np.unique(bits)) == len(bits)
-
-
-def test_a_purpose_is_one_of_the_register():
-    with pytest.raises(AttributeError):
-        raw(0, 1, 0, 0)
-    assert len(Purpose.__members__) == len(Purpose), "no two have one number"
 
 
 def test_seeds_of_names_are_the_same_on_every_machine():

@@ -568,3 +568,10 @@ def test_a_search_that_nobody_waits_for_is_given_up(file):
     with pytest.raises(Abandoned):
         finder.find(5000, Filter((("intensity", 7, 7),)), abandoned=lambda: next(asked))
     assert len(read.blocks) == 5
+
+
+def test_points_that_are_nowhere_are_not_found(tmp_path):
+    local = np.ones((1000, 3))
+    local[::2, 0] = np.nan
+    finder = PointFinder(CloudFile(write(tmp_path / "a.ply", local)), np.zeros(3))
+    assert finder.find(1000)[0].tolist() == list(range(1, 1000, 2))

@@ -227,3 +227,16 @@ def test_a_picture_takes_the_place_of_a_link(tmp_path):
     link.symlink_to(theirs)
     Page((300, 200)).save(link)
     assert theirs.read_bytes() == b"of another" and not link.is_symlink()
+
+
+def test_intensity_and_true_colour_are_drawn(unplanned, tmp_path):
+    result, at = make(tmp_path / "result", unplanned), unplanned.scene.vertices
+    zeros, byte = np.zeros(len(at), np.int32), np.full(len(at), 200, np.uint8)
+    columns = dict.fromkeys(("scan", "channel", "object"), zeros)
+    columns |= {"intensity": zeros + 1.0, "red": byte, "green": byte}
+    save_cloud(Cloud(at, columns), result / "cloud.ply")
+    with pytest.raises(LidarpoolError, match="no column 'rgb'"):
+        plot(result, "--only", "cloud", "--colour", "rgb", *SMALL)
+    save_cloud(Cloud(at, columns | {"blue": byte}), result / "cloud.ply")
+    plot(result, "--only", "intensity", "--only", "cloud", "--colour", "rgb", *SMALL)
+    assert {"intensity.png", "cloud.png"} <= names(result)

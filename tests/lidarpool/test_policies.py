@@ -13,9 +13,11 @@ from lidarpool.pipeline.names import INTERSECT
 from lidarpool.pipeline.policies import (
     AHEAD,
     COLLECTING,
+    LATE_FACTOR,
     LATE_S,
     SUSPECT_DEATHS,
     handovers,
+    late_after_s,
     loss,
     offers,
     scans_per_batch,
@@ -203,3 +205,8 @@ def test_tasks_elsewhere_are_counted_and_the_first_are_kept():
         record(n, ("OTHER",) if n % 2 else ()) for n in range(MISPLACED_MOST)
     ]
     assert totals.resources == {"OTHER": 30, "none": 30}
+
+
+def test_batches_are_late_by_what_others_took():
+    assert late_after_s([]) == float("inf") and late_after_s([0.1, 0.2, 99.0]) == LATE_S
+    assert late_after_s([10.0, 20.0, 30.0]) == LATE_FACTOR * 20

@@ -321,8 +321,7 @@ def test_the_scene_has_one_coordinate_system(tmp_path):
     assert epsg_of(tmp_path, "west.tif", "east.tif", epsg=25832) == 25832
 
 
-def test_a_raster_alone_is_a_survey(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_a_raster_alone_is_a_survey(tmp_path):
     _, columns = np.mgrid[:60, :60]
     heights = 100 + columns / 10.0
     write(tmp_path / "hill.tif", heights, count=2, crs="EPSG:2056")

@@ -431,19 +431,6 @@ def test_batches_do_not_matter(subrays):
     assert set(causes.tolist()) == {SURFACE, FALSE_ALARM, CROSSTALK, BLOOMING}
 
 
-def test_backends_agree():
-    found = {}
-    for backend, why in available_backends().items():
-        if not why:
-            rig, survey = drive(1, backend, crosstalk=True)
-            found[backend] = cast_between(rig, survey, [0, 24])[0]
-    causes = {name: columns["cause"] for name, columns in found.items()}
-    assert len({*causes.values()}) == 1
-    first, *others = (np.frombuffer(one["range"], np.float32) for one in found.values())
-    for other in others:
-        assert np.abs(other - first).max() < 1e-3
-
-
 def test_what_a_receiver_adds_leaves_surfaces_as_they_are():
     rig, survey = drive(range_at_threshold_m=0.0, walk_m=0.0, false_alarm_hz=0.0, stray_light=0.0)
     on, same = drive(crosstalk=True)

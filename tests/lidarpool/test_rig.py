@@ -16,8 +16,6 @@ from lidarpool.pipeline import rigs
 from lidarpool.pipeline.failures import naming_scans
 from lidarpool.scene.actors import box
 from lidarpool.scene.shapes import seed_objects
-from lidarpool.sensor.models import load_sensor
-from lidarpool.sensor.optics import Returns
 from lidarpool.simulator import world
 from lidarpool.simulator.batch import columns_of
 from lidarpool.simulator.rig import Rig
@@ -66,20 +64,6 @@ SURVEYS |= {
     for name, survey in SURVEYS.items()
     if name in ("beams without offsets", "on the move")
 }
-
-MODELS = {
-    name: Survey(load_sensor(name, step_deg=step), poses=TURNED, steps=14, columns=COLUMNS)
-    for name, step in (
-        ("velodyne/vlp16", 10),
-        ("ouster/os0-32", 10),
-        ("livox/mid40", 30),
-        ("airborne/riegl-vq780i", 90),
-    )
-}
-VLP16 = load_sensor("velodyne/vlp16")
-MODELS["on the move, beams of several rays"] = Survey(
-    VLP16, trajectory=CART, steps=14, columns=COLUMNS, returns=Returns("all", 7, 3.0)
-)
 
 
 @pytest.fixture(scope="module")
@@ -158,9 +142,9 @@ def test_what_is_cast_is_what_each_ray_by_itself_meets(name, scene):
     assert scans == survey.scan_count
 
 
-@pytest.mark.parametrize("name", SURVEYS | MODELS)
+@pytest.mark.parametrize("name", SURVEYS)
 def test_however_scans_are_batched_their_columns_have_the_same_bits(name, scene):
-    survey = (SURVEYS | MODELS)[name]
+    survey = SURVEYS[name]
     rig = Rig(scene, survey, "numpy")
     whole = cast_between(rig, survey, [0, 28])
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole

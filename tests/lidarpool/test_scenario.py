@@ -367,3 +367,30 @@ def test_a_start_is_a_time_of_yaml_or_text(scenario):
         assert (survey.epsg, survey.start) == (25832, datetime(2026, 11, 21, 10, tzinfo=UTC))
     with pytest.raises(LidarpoolError, match=r"cloud\.start"):
         scenario("cloud: {start: 2026-11-21T10:00:00}")
+
+
+WAY = "[" + ", ".join(f"{{time_s: {t}, position: [0, {t}, {t * t}]}}" for t in range(3)) + "]"
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("cloud: {columns: [red]}", "needs colours"),
+        (
+            f"navigation: {{imu: {{}}}}\ntrajectory: {{interpolation: linear, points: {WAY}}}",
+            "interpolation: smooth",
+        ),
+    ],
+)
+def test_what_would_disappoint_is_in_the_advice(scenario, text, words):
+    assert words in " ".join(advice(build(scenario(text))))
+    calm = text.replace("red", "range").replace("linear", "smooth")
+    assert words not in " ".join(advice(build(scenario(calm))))
+
+
+def test_an_obstacle_whose_name_has_brackets(tmp_path, scenario):
+    walls = "v 0 0 0\nv 1 0 0\nv 0 1 2\no Wall[1]\nf 1 2 3\no Wall1\nf 1 2 3\n"
+    (tmp_path / "m.obj").write_text(walls)
+    ends = "scene: m.obj\nplanning: {start: [-9, 0], target: [9, 0], obstacles: "
+    for names, count in (('["Wall[1]"]', 1), ('["Wall[12]"]', 1), ('["Wall*"]', 2)):  # 1 or 2
+        assert len(build(scenario(ends + names + "}")).planning.radii) == count

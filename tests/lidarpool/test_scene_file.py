@@ -133,16 +133,14 @@ def test_a_failed_write_leaves_what_was_there(tmp_path, monkeypatch):
         ),
     ],
 )
-def test_commands(tmp_path, monkeypatch, arguments, words):
-    monkeypatch.chdir(tmp_path)
+def test_commands(arguments, words):
     done = CliRunner().invoke(command, arguments, catch_exceptions=False)
     assert done.exit_code == 0
     assert re.fullmatch(words, done.output)
     assert len(Scene.load(arguments[1]).faces) > 700
 
 
-def test_files_that_cannot_share_meshes_do_not_hold_a_forest(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
+def test_files_that_cannot_share_meshes_do_not_hold_a_forest(tmp_path):
     arguments = ["terrain", "out.obj", "--triangles", "800", "--side", "1000", "--trees", "5000"]
     with pytest.raises(LidarpoolError, match=r"out.obj would hold 4\d,\d+,\d+ triangles, because"):
         CliRunner().invoke(command, arguments, catch_exceptions=False)

@@ -7,7 +7,7 @@ import tracemalloc
 
 import numpy as np
 import pytest
-from tests.lidarpool.test_vegetation import ALL_ON, GROUND, MANY, cast, rays
+from tests.lidarpool.test_vegetation import ALL_ON, AT, GROUND, MANY, cast, rays
 from tests.shapes import CPU, Cart, ball, box, cast_between
 
 from lidarpool import (
@@ -186,9 +186,12 @@ def test_an_even_grid_is_the_box_with_that_density(tmp_path, nadir_deg):
     whole = box("T", (3, -6, -6), (5.5, 6, 6))
     sensor = rays(nadir_deg=nadir_deg)
     kind = {"leaf_angle": "planophile"}
-    one = cast([grid, wall], sensor, materials=[GROUND, Material("T", **kind)])
+    one = cast([grid, wall], sensor, AT, materials=[GROUND, Material("T", **kind)])
     other = cast(
-        [whole, wall], sensor, materials=[GROUND, Material("T", leaf_area_density=0.3, **kind)]
+        [whole, wall],
+        sensor,
+        AT,
+        materials=[GROUND, Material("T", leaf_area_density=0.3, **kind)],
     )
     assert np.array_equal(one["object"], other["object"])
     assert one["range"] == pytest.approx(other["range"], abs=1e-4)
@@ -204,7 +207,7 @@ def test_gaps_and_depths_of_layers_follow_beer_and_lambert(tmp_path, backend):
     floor = box("Floor", (-99, -99, -2), (99, 99, -1))
     materials = [GROUND, Material("T", leaf_angle="erectophile")]
     sensor, slant = rays(nadir_deg=40.0), 1 / math.cos(math.radians(40))
-    found = cast([mesh, floor], sensor, (-5, 0, 10), backend=backend, materials=materials)
+    found = cast([mesh, floor], sensor, (-5, 0.02, 10), backend=backend, materials=materials)
     crossing = projection("erectophile", np.array([1 / slant]))[0] * slant
     assert (found["object"] == 1).mean() == pytest.approx(
         math.exp(-crossing * profile.sum()), rel=0.01
@@ -272,7 +275,7 @@ def test_crowns_and_grids_that_overlap_add_up(tmp_path):
     ivy = box("Ivy", (7, -4, -4), (9, 4, 4))
     wall = box("Wall", (20, -9, -9), (21, 9, 9))
     materials = [GROUND, Material("Ivy", leaf_area_density=0.4)]
-    found = cast([one, two, ivy, wall], rays(), materials=materials)
+    found = cast([one, two, ivy, wall], rays(), AT, materials=materials)
     before, among, behind = 0.1 * 2, 0.6 * 2, 0.3 * 2
     stop = math.exp(-before) * (1 - math.exp(-among))
     shares = (found["object"][:, None] == np.arange(4)).mean(axis=0)
@@ -347,7 +350,7 @@ def test_what_voxels_cannot_do_is_refused(tmp_path):
         (np.full((1, 1, 1), np.nan, np.float32), np.eye(3, 4)),
         (np.ones((1, 1, 1), np.float32), np.zeros((3, 4))),
     ]:
-        with pytest.raises(LidarpoolError, match="voxels of 'T' are .*; they must be float32"):
+        with pytest.raises(LidarpoolError, match=r"voxels of 'T' are .*; they must be float32"):
             SceneMesh("T", mesh.vertices, mesh.faces, voxels=Voxels(density, matrix))
 
 

@@ -98,3 +98,11 @@ def test_the_device_is_measured(tmp_path):
     code, found = results_of(tmp_path)
     assert code == 0
     assert found["leaks"]["edges and corners"]["escaped"] == 0
+
+
+def test_a_section_that_dies_is_named(tmp_path, monkeypatch):
+    script = tmp_path / "python"
+    script.write_text("#!/bin/sh\nkill -9 $$\n")
+    script.chmod(0o755)
+    monkeypatch.setattr(gpu.sys, "executable", str(script))
+    assert gpu.apart("moving", ["--quick"], 30) == {"error": "its process ended with -9"}

@@ -233,3 +233,10 @@ def test_corners_of_an_open_sheet_and_of_a_ball_are_hit(backend, shapes, axis, s
         assert hits.hit.all()
         for column in ("distance", "triangle"):
             np.testing.assert_array_equal(getattr(hits, column), getattr(want, column))
+
+
+def test_vertices_of_no_triangle_do_not_count(caster, shapes):
+    (points, faces), ways = shapes["sphere"](), np.random.default_rng(6).normal(size=(500, 3))
+    want = caster(points, faces).cast([0, 0, 0], ways)
+    got = caster(np.concatenate([points, [[1e9, 0, 0]]]), faces).cast([0, 0, 0], ways)
+    np.testing.assert_array_equal(got.distance, want.distance)

@@ -75,3 +75,8 @@ def test_nvrtc_compiles_as_cupy_does(card, kind):
             pytest.skip(f"this NVRTC does not know sm_{card}")
         pytest.fail(log)
     assert nvrtc.getCUBIN(program)
+
+
+def test_no_headers():
+    """NVRTC has none, and g++ and nvcc would not mind."""
+    assert "#include" not in source() and "INFINITY" not in source()

@@ -153,7 +153,7 @@ class OutsideCluster:
             [Path(sys.executable).with_name("dask"), command, *arguments],
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
-            env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path), **environment},
+            env={**os.environ, **environment},
         )
 
     def add(self, *workers: tuple[str, int], preload: str = "", **environment: str) -> str:

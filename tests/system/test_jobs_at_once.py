@@ -1,7 +1,5 @@
 """Jobs of a campaign that are cast at once: each gives what it gives alone, whatever others do."""
 
-import os
-import signal
 import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -17,7 +15,6 @@ from tests.daemons import wait_until
 import lidarpool.simulator.world
 from lidarpool import Campaign, Column, Job, Scene, Sensor, Survey, save_cloud, simulate
 from lidarpool.pipeline import rigs
-from lidarpool.run.connection import local_client
 from lidarpool.scene.actors import box
 
 SEED, ROOM = Scene.seed(), Scene.from_meshes([box("Room", (8, 6, 3))])
@@ -34,13 +31,6 @@ def faulty(returns: Any) -> Any:
     """A column that cannot be made of some scans."""
     if any(spec.scan == 12 for spec in returns.specs):
         raise FloatingPointError("the mirror is loose")
-    return returns.range
-
-
-def deadly(returns: Any) -> Any:
-    """A column that ends its worker."""
-    if any(spec.scan == 12 for spec in returns.specs):
-        os.kill(os.getpid(), signal.SIGKILL)
     return returns.range
 
 
@@ -108,18 +98,6 @@ def test_jobs_of_a_scene_share_its_trees_and_others_that_fail_do_no_harm(
     assert left_over(client) == ([], [], [])
     wait_until(lambda: rigs._kept.keys() <= before)  # workers are told, and not waited for
     check(tmp_path, range(4), JOBS, client)
-
-
-@pytest.mark.slow
-def test_a_scan_that_kills_its_workers_is_found_and_the_other_jobs_go_on(tmp_path, left_over):
-    jobs = [*JOBS, (SEED, survey(deadly, steps=30))]
-    with local_client({"LIDAR": 5}, gpu_workers=2) as client:
-        made = run(client, tmp_path, jobs)
-        (failed,) = made.failed
-        assert failed.number == 4 and made.done == 4
-        assert "scan 12 kills the worker that runs stage intersect" in failed.error
-        assert left_over(client) == ([], [], [])
-        check(tmp_path, range(4), JOBS, client)
 
 
 def test_tiny_jobs_share_casting_tasks_and_give_the_points_of_each_alone(

@@ -78,13 +78,6 @@ def test_points_lie_where_the_sensors_own_geometry_says(result):
     assert np.abs(cloud.positions - expected).max() <= 0.006
 
 
-def test_a_column_of_ones_own_is_what_its_function_makes(result):
-    cloud = result.cloud
-    assert cloud["brightness"].dtype == np.float32
-    expected = cloud["intensity"] / np.maximum(cloud["range"], 1.0) ** 2
-    assert np.allclose(cloud["brightness"], expected, rtol=1e-5)
-
-
 def test_a_result_tells_of_itself_and_its_points_become_frames_and_clouds(result):
     told = repr(result)
     assert told.startswith("survey: 60 scans, 28,800 rays")

@@ -6,7 +6,6 @@ from lidarpool import (
     Actor,
     Material,
     Noise,
-    Pose,
     Returns,
     Scanner,
     Scene,
@@ -16,8 +15,6 @@ from lidarpool import (
     simulate,
 )
 from lidarpool.columns.table import OPTIONAL
-from lidarpool.scenario.build import build
-from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 
 OPTIONS = {
@@ -40,27 +37,3 @@ def test_sweeps_of_a_moving_sensor_are_those_of_a_run(cluster_client, same_cloud
     for number in range(2):
         rows = np.flatnonzero(cloud["scan"] // 36 == number)
         assert len(rows) > 500 and same_cloud(scanner.sweep(track, number=number), cloud.part(rows))
-
-
-def test_copies_of_a_scenario_are_those_of_a_run(cluster_client, same_cloud):
-    """Made once by the driver, and moved in a scanner to where another scenario has one."""
-    crate = {"name": "Crate", "box": [1, 1, 1], "scatter": {"count": 200, "scale": [0.5, 2]}}
-    bin_ = {"name": "Bin", "box": [1, 2, 1], "at": [{"position": [3, 4, 0], "yaw_deg": 30}]}
-    data = {
-        "scene": {"ground": {}, "copies": [crate | {"class": 4}, bin_]},
-        "sensor": {"model": "velodyne/vlp16"},
-        "poses": [[0, 0, 2.5]],
-        "steps": 36,
-        "cloud": {"columns": ["range", "class", "intensity", "triangle"], "keep_every": 1},
-    }
-    data["scene"]["copies"][0]["scatter"] |= {"within": [-20, -20, 20, 20]}
-    built = build(Scenario.from_data(data))
-    scene, survey = built.scene, built.survey
-    cloud = simulate(scene, survey, client=cluster_client).cloud
-    assert len({*cloud["object"].tolist()}) > 50 and {*cloud["class"].tolist()} == {0, 4}
-    bin_["at"][0]["position"] = [9, 9, 0]
-    options = {"columns": survey.columns, "materials": survey.materials}
-    scanner = Scanner(build(Scenario.from_data(data)).scene, survey.sensor, **options)
-    assert not same_cloud(scanner.sweep((0, 0, 2.5)), cloud)
-    scanner.move("Bin", Pose((3, 4, 0), 30))
-    assert same_cloud(scanner.sweep((0, 0, 2.5)), cloud)

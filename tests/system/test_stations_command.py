@@ -36,7 +36,8 @@ def hall(tmp_path):
 
 def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
     arguments = ("stations", "hall.yaml", "--sensor", "vlp16", "--coverage", "90%")
-    outcome = lidarpool(*arguments, "--slant", "85")
+    arguments += ("--slant", "85", "--spacing", "1")
+    outcome = lidarpool(*arguments)
     assert outcome.code == 0, outcome.err
     assert outcome.out.endswith(
         "stations in hall-stations: stations.yaml, stations.png\n"
@@ -58,9 +59,9 @@ def test_stations_become_a_scenario_and_a_picture(hall, lidarpool):
         assert (alike.max(axis=2) < 0.05)[:, :1200].sum() > 500  # beside the legend
 
     # The same again, as JSON, and in place of the first.
-    again = lidarpool(*arguments, "--slant", "85", "--json")
+    again = lidarpool(*arguments, "--json")
     assert again.code == 2 and "stations.yaml exists: give another folder" in again.err
-    told = json.loads(lidarpool(*arguments, "--slant", "85", "--json", "--overwrite").out)
+    told = json.loads(lidarpool(*arguments, "--json", "--overwrite").out)
     stations = [tuple(one["position"]) for one in told["stations"]]
     assert [pose.position for pose in Scenario.load(folder / "stations.yaml").poses] == stations
     assert len(stations) >= 2 and {round(z, 3) for _, _, z in stations} == {1.7}
@@ -102,7 +103,7 @@ def test_files_of_copies_are_found_from_the_new_folder(hall, lidarpool):
         "scene:\n  files: [{file: hall.glb, up_axis: z}]\n"
         "  copies: [{name: Crate, file: crate.stl, table: crates.csv, class: 4}]\n"
     )
-    outcome = lidarpool("stations", "hall.yaml", "--sensor", "vlp16", "--count", "1")
+    outcome = lidarpool("stations", "hall.yaml", "--sensor", "vlp16", "--count", "1", "--spacing", "2")
     assert outcome.code == 0, outcome.err
     written = Scenario.load(hall / "hall-stations" / "stations.yaml")
     assert build(written).scene.names[-2:] == ("Crate", "Crate.2")

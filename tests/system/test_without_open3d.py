@@ -19,7 +19,7 @@ def command(*arguments):
 if __name__ == "__main__":
     command("check", "s.yaml")
     command("export", "out", "-f", "pcd", "-f", "laz")
-    command("plot", "out", "--colour", "object")
+    command("plot", "out", "--only", "cloud", "--colour", "object", "--size", "480x480")
     with result_page(open_result(Path("out")), port=0, browser=False):
         print("shown")
     points = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)], keep_every=5)).points
