@@ -15,7 +15,7 @@ import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
 from tests.lidarpool.test_memory import MANY
 from tests.lidarpool.test_memory import SCENE as SPHERE
-from tests.lidarpool.test_rig import CART, MODELS, SURVEYS, TURNED
+from tests.lidarpool.test_rig import CART, COLUMNS, SURVEYS, TURNED
 from tests.shapes import cast_between
 
 from lidarpool import (
@@ -59,6 +59,20 @@ MATERIALS = (
 WAYS = [[6, -3, 0.5], [6, 7, 0.5]], [[6, 7, 0.8], [7, -3, 0.8]]
 ACTORS = tuple(
     Actor(box(f"Car {k}", (4.5, 1.8, 1.5)), Track([0, 2], way)) for k, way in enumerate(WAYS)
+)
+
+MODELS = {
+    name: Survey(load_sensor(name, step_deg=step), poses=TURNED, steps=14, columns=COLUMNS)
+    for name, step in (
+        ("velodyne/vlp16", 10),
+        ("ouster/os0-32", 10),
+        ("livox/mid40", 30),
+        ("airborne/riegl-vq780i", 90),
+    )
+}
+VLP16 = load_sensor("velodyne/vlp16")
+MODELS["on the move, beams of several rays"] = Survey(
+    VLP16, trajectory=CART, steps=14, columns=COLUMNS, returns=Returns("all", 7, 3.0)
 )
 
 

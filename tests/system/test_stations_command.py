@@ -103,7 +103,9 @@ def test_files_of_copies_are_found_from_the_new_folder(hall, lidarpool):
         "scene:\n  files: [{file: hall.glb, up_axis: z}]\n"
         "  copies: [{name: Crate, file: crate.stl, table: crates.csv, class: 4}]\n"
     )
-    outcome = lidarpool("stations", "hall.yaml", "--sensor", "vlp16", "--count", "1", "--spacing", "2")
+    outcome = lidarpool(
+        "stations", "hall.yaml", "--sensor", "vlp16", "--count", "1", "--spacing", "2"
+    )
     assert outcome.code == 0, outcome.err
     written = Scenario.load(hall / "hall-stations" / "stations.yaml")
     assert build(written).scene.names[-2:] == ("Crate", "Crate.2")
