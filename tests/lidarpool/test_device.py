@@ -15,7 +15,8 @@ import pytest
 from tests.cuda_on_host import HOST, source_backend  # noqa: F401 - a fixture
 from tests.lidarpool.test_memory import MANY
 from tests.lidarpool.test_memory import SCENE as SPHERE
-from tests.lidarpool.test_rig import CART, COLUMNS, SURVEYS, TURNED
+from tests.lidarpool.test_rig import CART, SURVEYS, TURNED
+from tests.lidarpool.test_rig import COLUMNS as RIG_COLUMNS
 from tests.shapes import cast_between
 
 from lidarpool import (
@@ -62,7 +63,7 @@ ACTORS = tuple(
 )
 
 MODELS = {
-    name: Survey(load_sensor(name, step_deg=step), poses=TURNED, steps=14, columns=COLUMNS)
+    name: Survey(load_sensor(name, step_deg=step), poses=TURNED, steps=14, columns=RIG_COLUMNS)
     for name, step in (
         ("velodyne/vlp16", 10),
         ("ouster/os0-32", 10),
@@ -72,7 +73,7 @@ MODELS = {
 }
 VLP16 = load_sensor("velodyne/vlp16")
 MODELS["on the move, beams of several rays"] = Survey(
-    VLP16, trajectory=CART, steps=14, columns=COLUMNS, returns=Returns("all", 7, 3.0)
+    VLP16, trajectory=CART, steps=14, columns=RIG_COLUMNS, returns=Returns("all", 7, 3.0)
 )
 
 
