@@ -50,6 +50,7 @@ def test_trees_are_about_as_good_as_the_best_there_are(tmp_path):
         assert len({row[name]["hit_share"] for name in trees.TREES}) == 1
 
 
+@pytest.mark.slow
 def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
     out = tmp_path / "out.json"
     assert scanner.main(["--quick", "--backend", "embree", "--json", str(out)]) == 0

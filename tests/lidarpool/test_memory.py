@@ -10,6 +10,7 @@ import pytest
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
+from tests.rows import quick
 
 from lidarpool import (
     Beams,
@@ -56,6 +57,14 @@ FAINT = {"detection_range_m": 500.0}
 EVERY = {"returns": Returns("all")}
 SIGN = {"materials": [Material("*", 0.5), Material("Sign", 1.0, retro=True)]}
 
+QUICK = (
+    "positions",
+    "one beam, on the move",
+    "lost returns",
+    "noise and colours",
+    "rain",
+    "crosstalk",
+)
 SURVEYS = {
     "positions": Survey(MANY, **STILL),
     "all columns, on the move": Survey(MANY, **WAY, **ALL),
@@ -87,7 +96,7 @@ SURVEYS = {
 }
 
 
-@pytest.mark.parametrize("name", SURVEYS)
+@pytest.mark.parametrize("name", quick(QUICK, SURVEYS))
 def test_the_estimate_is_safe_and_near(name):
     survey = SURVEYS[name]
     rig = Rig(SCENE, survey, "embree", threads=1)

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
+from tests.rows import quick
 
 import lidarpool
 from lidarpool import LidarpoolError, Scene, Sweep
@@ -221,7 +222,7 @@ def _read(data: Any, queue: Any) -> None:
     queue.put([(identity(sweep), float(sweep.points.sum())) for sweep in data])
 
 
-@pytest.mark.parametrize("name", DATA_SETS)
+@pytest.mark.parametrize("name", quick(("kitti", "mcap"), DATA_SETS))
 def test_threads_and_forks_read_beside_each_other(written, name):
     data = lidarpool.sweeps(written(name), shuffle=2)
     alone = [(identity(sweep), float(sweep.points.sum())) for sweep in data]

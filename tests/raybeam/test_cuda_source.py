@@ -6,11 +6,12 @@ import subprocess
 from itertools import product
 
 import pytest
+from tests.rows import quick
 
 from raybeam.cuda_backend import flags, source
 
 # The oldest and the newest in the fast tests.
-CARDS = [75, 120, *(pytest.param(card, marks=pytest.mark.slow) for card in (80, 86, 89, 90, 100))]
+CARDS = quick((120,), (75, 80, 86, 89, 90, 100, 120))
 AS_CUPY = "-ftz=true"  # what it adds of itself
 # {(whether there are instances, whether there are masks): options}
 FLAGS = {kind: (*flags(64, *kind), AS_CUPY) for kind in product((False, True), repeat=2)}

@@ -19,6 +19,7 @@ from distributed import Client
 from tests.clusters import thread_cluster
 from tests.daemons import wait_until
 from tests.killed_drivers import drive
+from tests.rows import quick
 
 import lidarpool.run.cluster
 import lidarpool.run.writer
@@ -27,6 +28,7 @@ from lidarpool.base.errors import explained
 from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
 from lidarpool.datasets.job_table import JobRow
+from lidarpool.export.format_table import DATA_SETS
 from lidarpool.run.progress import Progress
 
 BASE = """
@@ -312,7 +314,7 @@ HARM = {
 }
 
 
-@pytest.mark.parametrize("harm", HARM)
+@pytest.mark.parametrize("harm", quick(("cut", "manifest flipped"), HARM))
 def test_a_damaged_job_is_named_and_made_again(
     files, finished, whole, lidarpool, slots, no_pictures, harm
 ):
@@ -588,7 +590,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     assert [*(here / "mine").iterdir()] == []
 
 
-@pytest.mark.parametrize("kept", ["folder", "kitti", "nuscenes", "mcap", "parquet", "images"])
+@pytest.mark.parametrize("kept", quick(("folder", "kitti"), DATA_SETS))
 def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept):
     ds = tmp_path / "ds"
     Campaign(make, 2, keep=kept, splits={"a": 0.5, "b": 0.5}).run(ds, client=client)

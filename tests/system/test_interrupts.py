@@ -261,6 +261,7 @@ def test_ctrl_c_while_the_result_is_written(start, untouched, cluster):
     assert untouched(kept=True)
 
 
+@pytest.mark.slow
 def test_the_scheduler_of_an_outside_cluster_is_killed(start, untouched, outside):
     cluster = outside()
     cluster.add(("GPU", 1), ("LIDAR", 4), ("OTHER", 1))

@@ -13,6 +13,7 @@ from fsspec.registry import _registry
 from tests.clusters import thread_cluster
 from tests.drives import the_scene, the_sweeps, write_set
 from tests.killed_drivers import drive
+from tests.rows import quick
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of
 from tests.system.test_resume import SCANS
@@ -160,10 +161,7 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
 
 @pytest.mark.parametrize(
     "format",
-    [
-        pytest.param(name, marks=[] if name in ("kitti", "mcap") else pytest.mark.slow)
-        for name in DATA_SETS
-    ],
+    quick(("kitti",), DATA_SETS),
 )
 def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, format):  # noqa: A002
     scene, url, here = the_scene(), f"{BUCKET}/sets/{format}", tmp_path / "here"

@@ -64,7 +64,8 @@ def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_c
     assert {r.worker for r in result.records if r.stage == "intersect"} <= {*ours}
 
 
-@pytest.mark.parametrize("partition", ["LIDAR", pytest.param("OTHER", marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("partition", ["LIDAR", "OTHER"])
 def test_other_workers_with_other_sources_end_the_run_before_they_change_a_byte(outside, partition):
     """Those that are there when it begins are refused; this one joins late."""
     planning = Planning((25, 25), (-30, -20), trials=200, particles=60, iterations=60)

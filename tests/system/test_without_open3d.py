@@ -5,7 +5,9 @@ import sys
 
 SCENARIO = "poses: [[0, 0, 1]]\nplanning: {enabled: false}\ncloud: {keep_every: 5}\n"
 EVERYTHING_ELSE = """
+import sys
 from pathlib import Path
+from distributed import Client
 from lidarpool import LidarpoolError, Scene, Survey, read_cloud, simulate, save_cloud
 from lidarpool.cli.commands import main
 from lidarpool.live.view import open_result, result_page
@@ -22,7 +24,9 @@ if __name__ == "__main__":
     command("plot", "out", "--only", "cloud", "--colour", "object", "--size", "480x480")
     with result_page(open_result(Path("out")), port=0, browser=False):
         print("shown")
-    points = simulate(Scene.seed(), Survey(poses=[(0, 0, 1)], keep_every=5)).points
+    client = Client(sys.argv[1])
+    survey = Survey(poses=[(0, 0, 1)], keep_every=5)
+    points = simulate(Scene.seed(), survey, client=client).points
     assert len(points) == len(read_cloud("out/cloud.ply"))
     save_cloud(points, "again.laz")
     try:
@@ -39,8 +43,8 @@ def test_what_writes_no_ply_does_without_it(cluster, lidarpool, no_pictures, tmp
     (tmp_path / "open3d").mkdir()
     (tmp_path / "open3d" / "__init__.py").write_text("raise ImportError('there is no Open3D')")
     (tmp_path / "script.py").write_text(EVERYTHING_ELSE)
-    done = subprocess.run(  # a script's folder is searched first, by its workers as well
-        [sys.executable, "script.py"], capture_output=True, text=True
+    done = subprocess.run(  # a script's folder is searched first
+        [sys.executable, "script.py", cluster], capture_output=True, text=True
     )
     assert done.returncode == 0, done.stderr
     *_, shown, refused = done.stdout.splitlines()
