@@ -187,7 +187,7 @@ def test_splits_are_names_of_files(tmp_path, split):
 def test_memory_is_bounded():
     """A job takes some numbers."""
     tracemalloc.start()
-    figures = Figures(NAMES, (row(k % 30) for k in range(5_000)))
+    figures = Figures(NAMES, (row(k % 30) for k in range(20_000)))
     taken = tracemalloc.get_traced_memory()[0]
     tracemalloc.stop()
-    assert figures.jobs == 5_000 and taken < 5_000 * 100
+    assert figures.jobs == 20_000 and taken < 20_000 * 100

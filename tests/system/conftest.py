@@ -20,6 +20,8 @@ from tests.daemons import wait_until
 
 import lidarpool.base.fork_server
 import lidarpool.pipeline.long_stages
+import lidarpool.report.campaign_report
+import lidarpool.report.charts
 import lidarpool.report.result_pictures
 from lidarpool import Cloud
 from lidarpool.base.tracing import trace_to
@@ -250,11 +252,21 @@ class BlankPage:
 
 
 @pytest.fixture
-def no_pictures(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Leave the drawing out, which takes longer than a small survey."""
+def pictures() -> None:
+    """Have pictures drawn."""
+
+
+@pytest.fixture(autouse=True)
+def _no_pictures(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Leave the drawing out otherwise, which takes longer than a small survey."""
+    if "pictures" in request.fixturenames:
+        return
     monkeypatch.setattr(lidarpool.report.result_pictures, "take_shot", lambda *_, **__: None)
     for name in ("draw_scene", "draw_hits", "draw_cloud", "draw_path"):
         monkeypatch.setattr(lidarpool.report.result_pictures, name, lambda *_, **__: BlankPage())
+    for name in ("draw_varied", "draw_results"):
+        monkeypatch.setattr(lidarpool.report.campaign_report, name, lambda *_: None)
+    monkeypatch.setattr(lidarpool.report.charts, "draw_sweep", lambda *_: None)
 
 
 @pytest.fixture

@@ -111,7 +111,7 @@ def job(sensor: Sensor, number: int, **survey: Any) -> Job:
 # -- each job alone -------------------------------------------------------------------------------
 
 
-def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots, no_pictures):
+def test_each_job_alone_has_the_bytes_of_the_data_set(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--only", "cloud"]
     for number in (1, 5):
         out = files / f"job-{number}"
@@ -234,7 +234,7 @@ def test_a_job_that_cannot_be_written_fails_alone_and_leaves_nothing(client, tmp
     assert not (tmp_path / "ds" / "jobs" / "0001").exists()
 
 
-def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots, no_pictures):
+def test_a_broken_mesh_is_named_with_its_values(files, lidarpool, slots):
     (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
     vary = "scene.files.0.file: {each: [a.obj, b.obj]}"
     (files / "c.yaml").write_text(f"base: base.yaml\ncount: 4\nvary: {{{vary}}}\nkeep: folder\n")
@@ -315,9 +315,7 @@ HARM = {
 
 
 @pytest.mark.parametrize("harm", quick(("cut", "manifest flipped"), HARM))
-def test_a_damaged_job_is_named_and_made_again(
-    files, finished, whole, lidarpool, slots, no_pictures, harm
-):
+def test_a_damaged_job_is_named_and_made_again(files, finished, whole, lidarpool, slots, harm):
     change, name = HARM[harm]
     run = ["run", files / "c.yaml", "--scheduler", slots, "--out", files / "ds"]
     shutil.copytree(finished, files / "ds")
@@ -361,7 +359,7 @@ def test_nothing_but_a_data_set_can_be_verified(files, lidarpool):
 SQUARE = "v -9 -9 0\nv 9 -9 0\nv 9 9 0\nf 1 2 3\n"
 
 
-def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots, no_pictures):
+def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, slots):
     (files / "base.yaml").write_text(BASE + "scene: {files: {file: a.obj}}\n")
     vary = "scene.files.0.file: {each: [a.obj, b.obj, c.obj]}"
     (files / "c.yaml").write_text(f"base: base.yaml\nvary: {{{vary}}}\nkeep: folder\n")
@@ -388,7 +386,7 @@ def test_a_mended_mesh_is_taken_and_another_is_not_mixed_in(files, lidarpool, sl
     assert "bit for bit" in lidarpool(*run, "--job", 1).out
 
 
-def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots, no_pictures):
+def test_a_campaign_grows_and_keeps_its_jobs(files, whole, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds", "--resume"]
     for count in (2, 6):
         (files / "c.yaml").write_text(CAMPAIGN.replace("count: 6", f"count: {count}"))
@@ -414,7 +412,7 @@ def test_one_slot_too_few_names_what_it_is_for(files, lidarpool, tmp_path):
     assert "kept in" not in refused.err and not (files / "ds").exists()
 
 
-def test_other_content_or_software_is_refused(files, finished, lidarpool, slots, no_pictures):
+def test_other_content_or_software_is_refused(files, finished, lidarpool, slots):
     run = ["run", files / "c.yaml", "-q", "--scheduler", slots, "--out", files / "ds"]
     (files / "c.yaml").write_text(CAMPAIGN.replace("[2, 3, 4]", "[2, 3, 4.5]"))
     assert lidarpool(*run).code == 2 and not (files / "ds").exists()
@@ -590,6 +588,7 @@ def test_a_run_removes_its_own_files_only(client, here, unwritten):
     assert [*(here / "mine").iterdir()] == []
 
 
+@pytest.mark.usefixtures("pictures")
 @pytest.mark.parametrize("kept", quick(("folder", "kitti"), DATA_SETS))
 def test_a_finished_data_set_is_replaced_on_request_only(client, tmp_path, kept):
     ds = tmp_path / "ds"
@@ -635,7 +634,7 @@ def test_options_that_do_not_go_together(files, lidarpool, options, words, slots
     assert not (files / "ds").exists()
 
 
-def test_several_scenarios_are_a_campaign(files, lidarpool, slots, no_pictures):
+def test_several_scenarios_are_a_campaign(files, lidarpool, slots):
     (files / "other.yaml").write_text(BASE.replace("steps: 45", "steps: 30"))
     two = [files / "base.yaml", files / "other.yaml"]
     done = lidarpool("run", *two, "-q", "--scheduler", slots, "--out", files / "ds")

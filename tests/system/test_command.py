@@ -136,7 +136,7 @@ def test_the_demo_listens_on_loopback_only(demo):
 
 
 @pytest.fixture
-def run(tmp_path, lidarpool, cluster, no_pictures) -> Callable[..., Any]:
+def run(tmp_path, lidarpool, cluster) -> Callable[..., Any]:
     """Run a scenario on the threads' cluster, into the folder `out`."""
 
     def run(*options: str, text: str = SHORT) -> Any:
@@ -224,6 +224,7 @@ def test_info_tells_versions_backends_and_gpus(lidarpool):
     assert lidarpool("--version").out.startswith("lidarpool, version ")
 
 
+@pytest.mark.usefixtures("pictures")
 def test_the_pictures_of_a_run_are_drawn_again_to_the_bit(demo, lidarpool, tmp_path):
     out = demo.out
     again = lidarpool("plot", out, "--only", "scene", "--only", "path", "--out", tmp_path)

@@ -95,7 +95,7 @@ def test_a_frame_says_whose_it_is(cluster_client):
     assert [frame.sensor for frame in frames] == ["roof"] * 3 + ["nose"] * 3
 
 
-def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster, no_pictures):
+def test_a_drive_with_actors_on_a_cluster(town, lidarpool, cluster):
     """As rigs of this process cast it, and again with smaller batches."""
     out = town / "out"
     done = lidarpool("run", town / "drive.yaml", "--out", out, "--scheduler", cluster)

@@ -99,7 +99,7 @@ def test_a_disk_without_room_for_anything(disk, run):
 
 
 def test_the_disk_of_the_result_is_full(
-    disk, run, expected, cluster, lidarpool, tmp_path, monkeypatch, no_pictures
+    disk, run, expected, cluster, lidarpool, tmp_path, monkeypatch
 ):
     """The run is complete, and there is no room for its files beside an earlier result."""
     monkeypatch.setattr(lidarpool_output, "ROOM_BYTES", 0)  # else it would be refused at once

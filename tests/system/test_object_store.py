@@ -261,7 +261,7 @@ def test_drivers_are_killed_and_the_next_has_nothing_but_the_bucket(
 
 @pytest.mark.slow
 def test_a_campaign_goes_to_the_bucket_though_its_driver_is_killed(
-    environment, lidarpool, tmp_path, no_pictures
+    environment, lidarpool, tmp_path
 ):
     (tmp_path / "base.yaml").write_text(BASE)
     (tmp_path / "c.yaml").write_text(CAMPAIGN)

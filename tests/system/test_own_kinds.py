@@ -107,7 +107,7 @@ def test_points_and_cloud_are_saved_alike_with_every_column(result, tmp_path):
     assert len(list((tmp_path / "pcd").iterdir())) == len(result.cloud.sweeps())
 
 
-def test_both_are_in_the_files_of_the_result(result, tmp_path, no_pictures):
+def test_both_are_in_the_files_of_the_result(result, tmp_path):
     result.report(tmp_path)
     report = json.loads((tmp_path / "report.json").read_text())
     names = [column["name"] for column in report["columns"]]

@@ -53,6 +53,7 @@ def test_it_is_told_in_three_lines_and_shown_as_a_table_with_pictures(result, sc
     assert result.objects == scene.names
 
 
+@pytest.mark.usefixtures("pictures")
 def test_pictures_are_drawn_and_what_they_cannot_be_is_told(result, tmp_path):
     made = result.pictures(tmp_path / "new", only=["cloud"], size=(480, 480), colour="channel")
     assert made == [tmp_path / "new/cloud.png"] and made[0].read_bytes().startswith(b"\x89PNG")

@@ -94,7 +94,7 @@ def test_a_driver_is_killed_at_several_moments(drive, undisturbed, tmp_path):
 
 
 def test_an_unfinished_run_is_refused_resumed_or_dropped(
-    cluster, drive, lidarpool, undisturbed, tmp_path, no_pictures
+    cluster, drive, lidarpool, undisturbed, tmp_path
 ):
     out = tmp_path / "out"
     assert drive([("driver.points", 12)]) == [-signal.SIGKILL]

@@ -12,6 +12,8 @@ from lidarpool.report.result_pictures import COLOURS, COVERED, UNCOVERED
 from lidarpool.scenario.build import build
 from lidarpool.scenario.scenario import Scenario
 
+pytestmark = pytest.mark.usefixtures("pictures")
+
 
 @pytest.fixture
 def hall(tmp_path):

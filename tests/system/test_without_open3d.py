@@ -36,7 +36,7 @@ if __name__ == "__main__":
 """
 
 
-def test_what_writes_no_ply_does_without_it(cluster, lidarpool, no_pictures, tmp_path):
+def test_what_writes_no_ply_does_without_it(cluster, lidarpool, tmp_path):
     (tmp_path / "s.yaml").write_text(SCENARIO)
     made = lidarpool("run", "s.yaml", "--out", "out", "--scheduler", cluster)
     assert made.code == 0, made.err
