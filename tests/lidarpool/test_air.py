@@ -7,7 +7,7 @@ from statistics import NormalDist
 
 import numpy as np
 import pytest
-from tests.shapes import CPU, box, made, quad, wall
+from tests.shapes import box, made, quad, wall
 
 from lidarpool import (
     Beams,
@@ -26,7 +26,6 @@ from lidarpool.columns.table import CAUSES
 from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.sensor.materials import extinction
 from lidarpool.sensor.weather import EXIT_M, dust, rain, snow
-from lidarpool.simulator import echoes
 from lidarpool.simulator.air import highest
 from lidarpool.simulator.rig import Rig
 
@@ -304,45 +303,6 @@ def test_reflectivities_in_the_thickest_dust_are_finite():
 
 
 # -- bytes -----------------------------------------------------------------------------------------
-
-
-STORM = {
-    "rain_mm_h": 30.0,
-    "snow_mm_h": 1.0,
-    "dust_mg_m3": 50.0,
-    "visibility_km": 0.2,
-    "fog_lidar_ratio_sr": 18.8,
-    "noise": Noise(detection_range_m=150, range_m=0.01, angle_deg=0.01, seed=5),
-    "returns": Returns("dual", subrays=7, divergence_mrad=3, pulse_ns=5),
-    "keep_every": 3,
-}
-
-
-@pytest.mark.parametrize("backend", CPU)
-def test_batches_chunks_and_backends_do_not_matter(backend, monkeypatch):
-    sensor = Sensor(
-        Beams(np.radians(np.linspace(-30, 30, 16))), Spin(720, 30), 0.5, 100,
-        optics=Optics(divergence_mrad=3.0),
-    )  # fmt: skip
-    survey = survey_of(sensor, **STORM | {"steps": 6})
-    scene = Scene.from_meshes([wall("Near", 4, (0, 9)), wall("Far", 30)])
-    rig = Rig(scene, survey, backend)
-
-    def values(*spans):
-        found = [batch for span in spans for batch in rig.cast(*span)]
-        return {
-            column.name: np.concatenate([column.make(batch) for batch in found])
-            for column in survey.stored_columns
-        }
-
-    whole = values((0, 6))
-    assert {0, AIR} == {*whole["cause"].tolist()}
-    assert same(whole, values(*((n, n + 1) for n in range(6))))
-    plain = Rig(scene, survey, "numpy")
-    (batch,) = plain.cast(0, 6)
-    assert all(np.array_equal(whole[c.name], c.make(batch)) for c in survey.stored_columns)
-    monkeypatch.setattr(echoes, "CHUNK_RAYS", 700)
-    assert same(whole, values((0, 6)))
 
 
 def test_what_is_no_surface_is_grey_and_of_no_class():

@@ -614,17 +614,6 @@ def two(run):
     return run
 
 
-def test_a_job_takes_no_more_than_there_is_room_for_while_another_wants_scans(two):
-    two.stages.advice = 1
-    most = most_under_way(2, 2)
-    for _ in range(5 * most):
-        two.step()
-        two.stages.generate()
-    assert len(two.driver.dispatcher.batches) == most and not two.stages.wanted
-    assert two.other.generated == 0
-    two.end()
-
-
 @pytest.mark.parametrize("how", ["failed", "intersect", "collect", "cast"])
 def test_a_job_that_fails_leaves_and_the_other_goes_on(two, how):
     two.stages.advice = 1

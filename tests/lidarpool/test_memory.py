@@ -57,14 +57,7 @@ FAINT = {"detection_range_m": 500.0}
 EVERY = {"returns": Returns("all")}
 SIGN = {"materials": [Material("*", 0.5), Material("Sign", 1.0, retro=True)]}
 
-QUICK = (
-    "positions",
-    "one beam, on the move",
-    "lost returns",
-    "noise and colours",
-    "rain",
-    "crosstalk",
-)
+QUICK = ("positions", "one beam, on the move", "lost returns", "rain", "crosstalk")
 SURVEYS = {
     "positions": Survey(MANY, **STILL),
     "all columns, on the move": Survey(MANY, **WAY, **ALL),

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections import Counter
-from itertools import pairwise
 from types import SimpleNamespace
 
 import pytest
@@ -184,16 +183,6 @@ def test_totals_are_exact_however_many_tasks_there_are():
     assert totals.workers == {"w0", "w1", "w2"}
     assert totals.resources == {"GPU": count}
     assert totals.violations == 0
-
-
-def test_the_timeline_is_thinned_evenly():
-    totals = StageTotals("intersect", "GPU")
-    for number in range(5 * RECORDS_MOST):
-        totals.add(record(number))
-    kept = [r.start for r in totals.records]
-    assert RECORDS_MOST / 2 <= len(kept) <= RECORDS_MOST
-    steps = {b - a for a, b in pairwise(kept)}
-    assert len(steps) == 1 and kept[0] == 0
 
 
 def test_tasks_elsewhere_are_counted_and_the_first_are_kept():

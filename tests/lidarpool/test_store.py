@@ -593,35 +593,6 @@ def test_it_goes_on_from_the_last_copy(remote_run):
     assert left(remote_run) == set()
 
 
-def test_it_is_refused_or_dropped(remote_run):
-    kept = f"{remote_run} holds an unfinished run, 2 of 6 scans: continue it with --resume"
-    with pytest.raises(LidarpoolError, match=kept):
-        opened(remote_run)
-    with pytest.raises(LidarpoolError, match=f"{remote_run} cannot be continued, .* another scene"):
-        opened(remote_run, resume=True, job=OTHERS["scene"])
-    remove_run(remote_run)
-    remove_run(remote_run)
-    assert left(remote_run) == set()
-    assert opened(remote_run, job=OTHERS["scene"]).only.resumed == 0
-
-
-def test_foreign_objects_stay(remote_run):
-    parts = Storage.at(f"{remote_run}/parts")
-    foreign = {"a.npz", "arch.npz.bak", ".tmp-5.npz-1a2b"}
-    for name in foreign:
-        parts.write(name, b"mine")
-    Storage.at(f"{parts}/deeper").write("a.npz", b"mine")
-    remove_run(remote_run)
-    assert left(remote_run) == foreign
-    assert Storage.at(f"{parts}/deeper").sizes() == {"a.npz": 4}
-
-
-def test_one_of_another_format(remote_run, monkeypatch):
-    monkeypatch.setattr("lidarpool.pipeline.database.FORMAT", 99)
-    with pytest.raises(LidarpoolError, match=rf"^{remote_run}/run.db is damaged \(it is of format"):
-        opened(remote_run)
-
-
 def test_copies_are_made_now_and_then(url, monkeypatch):
     store = opened(url)
     first = Storage.at(url).read("run.db")

@@ -3,11 +3,10 @@
 import os
 import signal
 import time
-from pathlib import Path
 from typing import Any
 
 import pytest
-from distributed import Client, Worker, WorkerPlugin
+from distributed import Client
 
 import lidarpool.pipeline.long_stages
 import lidarpool.pipeline.rigs
@@ -64,43 +63,6 @@ def test_summaries_that_kill_the_sorter_end_the_run(client, sabotage, monkeypatc
     with pytest.raises(LidarpoolError, match=r"stage \w+ was started 3 times, and each time"):
         simulate(Scene.seed(), SURVEY, client=client)
     assert left_over(client) == ([], [], [])
-
-
-@pytest.mark.slow
-def test_a_scene_that_kills_its_workers_ends_the_run_after_a_few_deaths(
-    client, tmp_path, left_over
-):
-    deaths = tmp_path / "deaths"
-    client.register_plugin(_Deadly(deaths))
-    try:
-        with pytest.raises(LidarpoolError, match=r"^GPU workers die whatever they cast first: 3 "):
-            simulate(Scene.seed(), SURVEY, client=client)
-    finally:
-        client.unregister_worker_plugin("deadly")
-    assert 5 <= deaths.stat().st_size <= 9
-    assert left_over(client) == ([], [], [])
-
-
-class _Deadly(WorkerPlugin):
-    """Ends workers that make a rig, and counts them in the size of a file."""
-
-    name = "deadly"
-
-    def __init__(self, deaths: Path) -> None:
-        self.deaths = deaths
-
-    def setup(self, worker: Worker) -> None:
-        deaths = self.deaths
-
-        def die(*arguments: object, **_: object) -> None:
-            with deaths.open("ab") as file:
-                file.write(b"x")
-            os.kill(os.getpid(), signal.SIGKILL)
-
-        self.rig, lidarpool.pipeline.rigs.Rig = lidarpool.pipeline.rigs.Rig, die
-
-    def teardown(self, worker: Worker) -> None:
-        lidarpool.pipeline.rigs.Rig = self.rig
 
 
 def test_a_worker_that_was_ended_for_its_memory_is_known(cluster_client: Client):

@@ -1,7 +1,6 @@
 """What a survey gives, against what it must give by geometry."""
 
 import logging
-import re
 import urllib.error
 import urllib.request
 
@@ -11,8 +10,6 @@ from distributed import Client
 from tests.shapes import room
 
 from lidarpool import LidarpoolError, Planning, ScanSpec, Sensor, Survey, simulate
-from lidarpool.simulator.rig import Rig
-from poolpart import PoolError
 
 
 @pytest.fixture
@@ -130,30 +127,3 @@ def test_a_failure_anywhere_ends_the_run_and_says_where(
     with pytest.raises(LidarpoolError, match=message):
         simulate(room(), survey, planning, client=client)
     assert left_over(client) == ([], [], [])
-
-
-def test_of_several_batches_in_a_task_the_one_that_fails_is_named(client, monkeypatch):
-    cast = Rig.cast
-
-    def fail(rig, first, stop):
-        if first <= 7 < stop:
-            raise FloatingPointError("the mirror is loose")
-        return cast(rig, first, stop)
-
-    monkeypatch.setattr(Rig, "cast", fail)
-    monkeypatch.setattr("lidarpool.pipeline.policies.batches_per_task", lambda *_: 4)
-    with pytest.raises(LidarpoolError) as raised:
-        simulate(room(), Survey(SENSOR, [(0, 0, 0)], 20), client=client)
-    first, last = re.match(
-        r"stage intersect failed: scans? (\d+)(?: to (\d+))?: FloatingPointError", str(raised.value)
-    ).groups()
-    assert int(first) <= 7 <= int(last or first)
-
-
-@pytest.mark.parametrize(
-    "wrong", [{"collectors": 0}, {"queue_capacity": 0}, {"gpu_workers": 0}, {"other_workers": -1}]
-)
-def test_numbers_below_one_are_refused(wrong):
-    ((name, value),) = wrong.items()
-    with pytest.raises((LidarpoolError, PoolError), match=rf"({name}|'OTHER') is {value}; "):
-        simulate(room(), Survey(SENSOR, [(0, 0, 0)]), **wrong)
