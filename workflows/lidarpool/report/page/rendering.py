@@ -7,13 +7,14 @@ import re
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from datetime import UTC, datetime
+from functools import cache
 from heapq import nlargest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import yaml
-from jinja2 import Environment, PackageLoader, StrictUndefined
+from jinja2 import Environment, PackageLoader, StrictUndefined, Template
 from markupsafe import Markup
 
 from poolpart import TaskRecord
@@ -83,10 +84,19 @@ def rendered(
     `pictures` are elements of HTML, and `stages` are for a timeline. All other values are escaped
     as the format needs; a missing one is an error.
     """
-    escaped = markdown if template.endswith(".md") else printable
+    return _template(template).render(
+        pictures={name: Markup(image) for name, image in (pictures or {}).items()},
+        timeline=make_timeline(stages),
+        **values,
+    )
+
+
+@cache  # compiling one takes longer than filling it
+def _template(name: str) -> Template:
+    escaped = markdown if name.endswith(".md") else printable
     environment = Environment(
         loader=PackageLoader(__package__ or ""),
-        autoescape=template.endswith(".html"),
+        autoescape=name.endswith(".html"),
         undefined=StrictUndefined,
         trim_blocks=True,
         lstrip_blocks=True,
@@ -104,11 +114,7 @@ def rendered(
     environment.filters["labels"] = lambda names: dict(
         zip(names, without_common_prefix([*names]), strict=True)
     )
-    return environment.get_template(template).render(
-        pictures={name: Markup(image) for name, image in (pictures or {}).items()},
-        timeline=make_timeline(stages),
-        **values,
-    )
+    return environment.get_template(name)
 
 
 def _written(scenario: Scenario) -> str:
