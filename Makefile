@@ -19,9 +19,9 @@ demo:  ## the default survey, then a drive through a city; results in $(OUT)/ an
 	$(BIN)/lidarpool scene city $(OUT)/drive/city.glb --overwrite
 	$(BIN)/lidarpool run $(OUT)/drive/drive.yaml --out $(OUT)/drive --overwrite
 
-# Whole runs wait for processes and timers: four processes keep two cores busy. The tests of a
+# Whole runs wait for processes and timers: three processes keep two cores busy. The tests of a
 # file stay together, for they share clusters; files come in the order of testpaths.
-PARALLEL := -n 4 --dist loadfile --no-loadscope-reorder
+PARALLEL := -n 3 --dist loadfile --no-loadscope-reorder
 
 test: dev  ## run the test suite
 	$(BIN)/python -m pytest $(PARALLEL)
