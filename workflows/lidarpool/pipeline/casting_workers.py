@@ -141,8 +141,6 @@ class CastingWorkers:
             spare = [key for key, scene in self._scenes.items() if scene not in used]
             old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
         for packed in old:
-            if isinstance(packed.data, Future):
-                packed.data.release()  # frames of an error may keep it until garbage is collected
             for address in packed.sent & self._checked.keys():
                 self._unneeded.setdefault(address, []).append(packed.name)
 
