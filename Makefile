@@ -24,7 +24,7 @@ demo:  ## the default survey, then a drive through a city; results in $(OUT)/ an
 PARALLEL := -n 3 --dist loadfile --no-loadscope-reorder
 
 test: dev  ## run the test suite
-	$(BIN)/python -m pytest $(PARALLEL)
+	$(BIN)/python -m pytest $(PARALLEL) $(MORE)
 
 slow: dev  ## the tests that take minutes, which `test` leaves out
 	@VENV=$(VENV) sh .ci/setup slow

@@ -5,6 +5,7 @@ from .caster import RayCaster
 from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
+from .moving import Moving, MovingHits, hits_on
 from .opacity import Opacity
 from .pattern import Pattern
 from .poses import Motion
@@ -18,6 +19,8 @@ __all__ = [
     "Instance",
     "Mesh",
     "Motion",
+    "Moving",
+    "MovingHits",
     "Opacity",
     "OtherHits",
     "Outbox",
@@ -28,4 +31,5 @@ __all__ = [
     "available_backends",
     "backend_build",
     "check_scan",
+    "hits_on",
 ]

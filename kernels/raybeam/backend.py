@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 
-from .arrays import Floats, Integers, Ints32
-from .hits import Hits, ScanReturns
+from .arrays import Floats, Integers, Ints, Ints32
+from .device import DeviceHits, OtherHits
+from .hits import Counted, Hits, Part, ScanReturns, joined
 from .instances import Scene
 from .rays import Rays
 from .scan import Collector, Scan
@@ -59,6 +61,8 @@ class Backend(ABC):
     # chunk.
     chunk: ClassVar[int]
 
+    on_device: ClassVar[bool] = False  # whether hits can stay on a CUDA device, see `visit`
+
     @classmethod
     @abstractmethod
     def missing(cls) -> str:
@@ -79,6 +83,20 @@ class Backend(ABC):
     @abstractmethod
     def closest(self, rays: Rays) -> Found:
         """Closest hits of at most `chunk` rays."""
+
+    def nearest(self, rays: Rays) -> Part:
+        """Closest hits of rays, without weights, misses left out, in ray order."""
+        parts: list[Part] = []
+        for start in range(0, len(rays), self.chunk):
+            ray, t, triangle, instance = self.found(rays.part(start, start + self.chunk))
+            distance = t / self._scene.frame.scale
+            parts.append((ray.astype(np.uint32) + np.uint32(start), distance, triangle, instance))
+        return joined(parts)
+
+    def found(self, rays: Rays) -> tuple[Integers, Floats, Ints32, Ints32]:
+        """As `closest`, without weights: numbers, distances, triangles, instances."""
+        found = self.closest(rays)
+        return found.ray, found.t, found.triangle, found.instance
 
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""
@@ -108,3 +126,15 @@ class Backend(ABC):
             hits = found.triangle[kept], found.instance[kept]
             collector.add(start, found.ray[kept], distance, *hits)
         return collector.result()
+
+    def visit(
+        self,
+        scan: Scan,
+        use: Callable[[DeviceHits], object],
+        counters: tuple[Ints, int] | None = None,
+        others: OtherHits | None = None,
+    ) -> tuple[Ints, Counted | None]:
+        """See `RayCaster.visit`."""
+        raise BackendUnavailable(
+            f"Hits of backend {self.name!r} are on no device: use scan, or backend='cuda'."
+        )

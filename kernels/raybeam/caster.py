@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from .arrays import Ints
-from .backend import Backend, BackendUnavailable
-from .cuda_backend import CudaBackend
+from .backend import Backend
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
@@ -136,7 +135,7 @@ class RayCaster:
     @property
     def on_device(self) -> bool:
         """Whether hits can stay on a CUDA device, see `visit`."""
-        return isinstance(self._engine, CudaBackend)
+        return self._engine.on_device
 
     @property
     def face_count(self) -> int:
@@ -182,8 +181,9 @@ class RayCaster:
             self._transforms[index(number)] = matrix
             self._moved = True
 
-    def _ready(self) -> Backend:
-        """Return the engine, with all instances in their places."""
+    @property
+    def engine(self) -> Backend:
+        """The engine, with all instances in their places."""
         with self._lock:
             if self._moved:
                 self._scene = place(self._scene.meshes, self._scene.mesh, self._transforms)
@@ -217,7 +217,7 @@ class RayCaster:
             If a direction is zero, a value is NaN or infinite (the message names the first such
             row), or the shapes do not fit.
         """
-        return self._ready().cast(check_rays(origins, directions, t_min, t_max))
+        return self.engine.cast(check_rays(origins, directions, t_min, t_max))
 
     def scan(
         self,
@@ -282,7 +282,7 @@ class RayCaster:
         >>> found.ray.tolist(), found.hits.tolist()
         ([0, 2, 4], [6])
         """
-        return self._ready().scan(
+        return self.engine.scan(
             check_scan(
                 pattern,
                 positions,
@@ -334,9 +334,4 @@ class RayCaster:
         BackendUnavailable
             If this caster's backend is not cuda.
         """
-        engine = self._ready()
-        if not isinstance(engine, CudaBackend):
-            raise BackendUnavailable(
-                f"Hits of backend {self.backend!r} are on no device: use scan, or backend='cuda'."
-            )
-        return engine.visit(scan, use, counters, others)
+        return self.engine.visit(scan, use, counters, others)

@@ -43,6 +43,7 @@ class CudaBackend(Backend):
     """
 
     name: ClassVar[str] = "cuda"
+    on_device: ClassVar[bool] = True
     # Rays: some 300 MB on the device, and while columns are copied again as much. Grid, sums of
     # hits and indices into a chunk's arrays stay far below 2**31; only the number of a ray needs
     # 64 bits.

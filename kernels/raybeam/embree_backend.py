@@ -12,7 +12,7 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from . import embree_library
-from .arrays import AnyArray, Floats, Ints, Ints32
+from .arrays import AnyArray, Floats, Indices, Integers, Ints, Ints32
 from .backend import Backend, Found
 from .hits import ScanReturns
 from .instances import Scene
@@ -107,23 +107,33 @@ class EmbreeBackend(Backend):
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        frame = self._scene.frame
-        each = len(rays) if len(rays.origins) == 1 else 1
-        source = _Source(rays.directions.T, None, Poses(rays.origins, None, each), frame)
-        limits = (rays.t_min, rays.t_max)
-        t, place, instance = self._cast(source, 0, (0, len(rays)), limits, 1, self._room(len(rays)))
-        ray = np.flatnonzero(place >= 0)
-        hits = place[ray]
-        instance = instance[ray] if self._scene.nested else np.zeros(len(ray), np.int32)
+        ray, t, place, instance = self._hits(rays)
         u, v = np.empty((2, len(ray)))
-        origins = frame.to_local(rays.origins)
+        origins = self._scene.frame.to_local(rays.origins)
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
         self._kernels.weigh(
-            self._meshes.ctypes.data, self._records_at, origins, directions, hits, instance, u, v
+            self._meshes.ctypes.data, self._records_at, origins, directions, place, instance, u, v
         )
-        return Found(ray, t[ray], self._index[hits], u, v, instance)
+        return Found(ray, t, self._index[place], u, v, instance)
+
+    def found(self, rays: Rays) -> tuple[Integers, Floats, Ints32, Ints32]:
+        """See `Backend.found`."""
+        ray, t, place, instance = self._hits(rays)
+        return ray, t, self._index[place], instance
+
+    def _hits(self, rays: Rays) -> tuple[Indices, Floats, Ints32, Ints32]:
+        """Rays that hit, local distances, places in `index`, and instances."""
+        each = len(rays) if len(rays.origins) == 1 else 1
+        source = _Source(
+            rays.directions.T, None, Poses(rays.origins, None, each), self._scene.frame
+        )
+        limits = (rays.t_min, rays.t_max)
+        t, place, instance = self._cast(source, 0, (0, len(rays)), limits, 1, self._room(len(rays)))
+        ray = np.flatnonzero(place >= 0)
+        instance = instance[ray] if self._scene.nested else np.zeros(len(ray), np.int32)
+        return ray, t[ray], place[ray], instance
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`."""

@@ -27,6 +27,7 @@ import numpy as np
 from numba import cfunc, njit, types
 from numba.extending import intrinsic
 
+from .compiled import OPTIONS
 from .embree_library import find
 from .mesh import NEAR
 
@@ -82,19 +83,6 @@ _STRAIGHT = 1 + 2.0**-20  # sum of a direction's components, so near to an axis
 
 _inline = njit(forceinline=True, error_model="numpy")
 _seldom = njit(error_model="numpy")  # called so seldom that a copy at each call is not worth it
-
-
-def _keeps() -> bool:
-    """Whether numba has a folder for compiled code; else each process compiles it in 5 s."""
-    try:
-        njit(cache=True)(_keeps)
-    except RuntimeError:  # neither beside this file nor in the user's home
-        return False
-    return True
-
-
-# Compiled when this module is imported, or loaded from numba's cache.
-_OPTIONS: dict[str, Any] = {"cache": _keeps(), "error_model": "numpy"}
 
 
 def _pointer(kind: Any) -> Any:
@@ -283,7 +271,7 @@ def plain_proposer(count: int) -> Any:
     """
     packet = _SINGLE if count == 1 else _PACKET
 
-    @cfunc(types.void(types.CPointer(types.int64)), **_OPTIONS)
+    @cfunc(types.void(types.CPointer(types.int64)), **OPTIONS)
     def propose(arguments):  # type: ignore[no-untyped-def]
         valid, scratch, hits = _int32s(arguments[0]), arguments[2], _int32s(arguments[4])
         lane = _int64s(scratch)[_LANE] if count == 1 else 0
@@ -312,7 +300,7 @@ def _key(hits, count, k, instances):  # type: ignore[no-untyped-def]
     return key + _NUMBER * hits[7 * count + k] if instances != 0 else key
 
 
-@cfunc(types.void(types.CPointer(types.int64)), **_OPTIONS)
+@cfunc(types.void(types.CPointer(types.int64)), **OPTIONS)
 def propose(arguments):  # type: ignore[no-untyped-def]
     """Filter function: keep the closest triangle, and another that float32 cannot tell from it.
 
@@ -362,7 +350,7 @@ def _consider(scratch, lane, key):  # type: ignore[no-untyped-def]
     return _clearly(a, b, c, det)
 
 
-@cfunc(types.boolean(types.CPointer(types.int64)), **_OPTIONS)
+@cfunc(types.boolean(types.CPointer(types.int64)), **OPTIONS)
 def nearby(arguments):  # type: ignore[no-untyped-def]
     """Consider a triangle near a point; `arguments` is an RTCPointQueryFunctionArguments."""
     scratch, instance = arguments[1], _int32s(arguments[3])[32]
@@ -373,7 +361,7 @@ def nearby(arguments):  # type: ignore[no-untyped-def]
     return False  # the distance of interest stays
 
 
-@cfunc(types.void(types.CPointer(types.int64)), **_OPTIONS)
+@cfunc(types.void(types.CPointer(types.int64)), **OPTIONS)
 def decide(arguments):  # type: ignore[no-untyped-def]
     """Filter function for single rays: accept what is closer in float64.
 
@@ -649,7 +637,7 @@ def _apart(floats, lanes, coherence):  # type: ignore[no-untyped-def]
     "(i8, i8, i8, i8, b1, i8[::1], i8[::1], f8[::1], b1, b1, i8, i8, i8, i8, i8, i8, "
     "f8, f8, f8, f8[::1], i4[::1], i4[::1])",
     nogil=True,
-    **_OPTIONS,
+    **OPTIONS,
 )
 def trace(  # type: ignore[no-untyped-def]
     scene, scratch, mesh, instances, masked, filters, addresses, frame, near, still,
@@ -818,7 +806,7 @@ def trace(  # type: ignore[no-untyped-def]
     "i8(f8[::1], i4[::1], i4[::1], i4[::1], i8, f8, i8[::1], i8, i8, i8[::1], i8[::1], "
     "u4[::1], f8[::1], i4[::1], i4[::1])",
     nogil=True,
-    **_OPTIONS,
+    **OPTIONS,
 )
 def gather(  # type: ignore[no-untyped-def]
     distance, place, instance, index, start, metre, groups, group, every, hits, tally,
@@ -872,9 +860,7 @@ def gather(  # type: ignore[no-untyped-def]
     return kept
 
 
-@njit(
-    "(i8, i8, f8[:, ::1], f8[:, ::1], i4[::1], i4[::1], f8[::1], f8[::1])", nogil=True, **_OPTIONS
-)
+@njit("(i8, i8, f8[:, ::1], f8[:, ::1], i4[::1], i4[::1], f8[::1], f8[::1])", nogil=True, **OPTIONS)
 def weigh(mesh, instances, origins, directions, place, instance, u, v):  # type: ignore[no-untyped-def]
     """Write weights of the second and third corner for hits of rays (m, 3), local to the scene.
 

@@ -99,7 +99,6 @@ def points_in(text):
     return int(found[1].replace(",", "")) if found else 0
 
 
-@pytest.mark.sample
 def test_points_grow_until_all_are_there(client, live, new_tab, tmp_path):
     live, job = live
     tab, other = opened(new_tab, live), opened(new_tab, live)

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from tests.shapes import block
 
-from lidarpool import Planning, Result, Scene, Sensor, Survey, remove_run, simulate
+from lidarpool import Actor, Planning, Result, Scene, Sensor, Survey, Track, remove_run, simulate
 from poolpart import placement_violations
 
 from .arena import Arena
@@ -31,8 +31,13 @@ PLANNING = Planning((25, 25), (-30, -20), [(0, 0)], 2.0, trials=12, particles=60
 
 
 def room() -> Scene:
-    """A room of 10 by 8 by 6 metres around the sensor: every ray hits."""
-    return Scene.from_meshes([block("room", (10, 8, 6))])
+    """A room of 10 by 8 by 6 metres around the sensor, and what moves in it: every ray hits."""
+    ways = [[(-3, -3, -2), (-3, 3, 2)], [(4, 3, 0), (4, -3, 1)]]
+    moving = [
+        Actor(block(f"block {k}", (1, 1, 1)), Track([0, 9], way, beyond="hold"))
+        for k, way in enumerate(ways)
+    ]
+    return Scene.from_meshes([block("room", (10, 8, 6))]).with_actors(tuple(moving))
 
 
 def survey(poses: int = POSES, layers: int = 8) -> Survey:

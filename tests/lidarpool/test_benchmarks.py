@@ -7,7 +7,7 @@ import shutil
 
 import numpy as np
 import pytest
-from benchmarks import raycast, scanner, trees
+from benchmarks import raycast, realism, scanner, trees
 
 from lidarpool.scene.generated.city import city
 from lidarpool.scene.scene_file import write_scene
@@ -65,3 +65,11 @@ def test_a_scanner_finds_what_a_cast_and_open3d_find(tmp_path, capsys):
         assert row["hits"]["open3d"] == pytest.approx(row["hits"]["cast"], abs=2e-3)
     said = capsys.readouterr().out
     assert "mujoco-lidar: not installed" in said and said.count("the bar of 1.3 x the cast is") == 3
+
+
+def test_what_is_real_is_measured_beside_what_is_bare(capsys):
+    toy = ["--triangles", "2000", "--cars", "2", "3", "--sensor", "velodyne/vlp16"]
+    assert realism.main([*toy, "--rounds", "1", "--json"]) == 0
+    rows = json.loads(capsys.readouterr().out)["rows"]
+    assert rows["bare"]["times"] == 1 and all(row["points"] > 500 for row in rows.values())
+    assert {"3 boxes, moving", "19 sub-rays", "rain", "fog", "snow", "all"} <= rows.keys()

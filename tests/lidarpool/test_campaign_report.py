@@ -184,6 +184,7 @@ def test_splits_are_names_of_files(tmp_path, split):
         write(Storage.at(tmp_path), [row(0, split=split)])
 
 
+@pytest.mark.slow
 def test_memory_is_bounded():
     """A job takes some numbers."""
     tracemalloc.start()

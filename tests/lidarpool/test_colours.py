@@ -5,7 +5,6 @@ from __future__ import annotations
 import io
 import logging
 import pickle
-import runpy
 from dataclasses import replace
 from pathlib import Path
 
@@ -389,27 +388,6 @@ def test_each_sub_ray_has_the_light_of_its_own_hit():
     assert np.std(noisy["reflectivity"]) == pytest.approx(spread[0], rel=0.1)
 
 
-def test_lane_markings_stand_out_in_intensity():
-    scene = Scene.load(EXAMPLES / "road.glb", up_axis="y", colours=True)
-    assert colours_summary([scene.colours]) == "1 texture, 2 plain colours"
-    materials = [Material("*", "texture"), Material("Pavement*", material="concrete, road")]
-    pose = Pose((-6.0, -2.4, 1.9))
-    sensor = Sensor.grid(rays_per_revolution=1800, layers=64, vertical_fov_deg=80)
-    cloud, found = sweep(scene, "intensity", sensor=sensor, pose=pose, materials=materials)
-    x, y, _ = cloud.positions.T
-    road, (asphalt, white) = cloud["object"] == 0, ((88, 88, 90), (236, 236, 230))
-    marking = road & (found == white).all(axis=1)
-    bare = road & (found == asphalt).all(axis=1)
-    edge = np.abs(np.abs(y) - 4.3) < 0.1
-    assert marking[road & edge].mean() > 0.95 and marking.sum() > 100
-    # Side by side, at one distance.
-    near = (np.abs(x + 6) < 2) & (y < -3.8)
-    bright, dark = (np.median(cloud["intensity"][some & near]) for some in (marking, bare))
-    assert bright > 5 * dark
-    flat = sweep(scene, "intensity", sensor=sensor, pose=pose)[0]["intensity"]
-    assert np.median(flat[marking & near]) < 1.3 * np.median(flat[bare & near])
-
-
 def test_colours_that_do_not_fit_are_refused():
     vertices, faces, _ = hills()
     for colours in (
@@ -502,13 +480,3 @@ def test_colours_of_vertices_with_too_few_numbers_are_a_note(tmp_path, caplog):
     attributes["COLOR_0"] = attributes["TEXCOORD_0"]
     found, _, _ = on_card(tmp_path, header, body)
     assert "its COLOR_0 is not red" in caplog.text and (found == GREY[0, 0]).all()
-
-
-def test_the_script_of_the_example_makes_its_file(tmp_path):
-    road = runpy.run_path(str(EXAMPLES / "road.py"), run_name="road")["road"]
-    (tmp_path / "road.glb").write_bytes(road().export(file_type="glb"))
-    made, kept = (
-        Scene.load(folder / "road.glb", up_axis="y", colours=True)
-        for folder in (tmp_path, EXAMPLES)
-    )
-    np.testing.assert_array_equal(made.vertices, kept.vertices)

@@ -180,16 +180,6 @@ def test_the_step_is_found_where_most_returns_are_lost():
     assert image["no_return"]["returns_in_both"] == CELLS / 2
 
 
-def test_a_step_that_does_not_divide_the_turn():
-    """As of a Velodyne: 1808.449 firings a turn."""
-    azimuth = np.arange(COLUMNS) * 0.199066 + 3  # not all around: a sector of 143 degrees
-    ranges = room(azimuth)
-    image = of_image(cloud(ranges + 0.01, azimuth=azimuth), cloud(ranges, azimuth=azimuth))
-    assert image["azimuth_step_deg"] == pytest.approx(0.199066, rel=1e-6)
-    assert image["columns"] == COLUMNS and image["no_return"]["in_both"] == 0
-    assert image["residual"]["median_m"] == pytest.approx(0.01, abs=1e-6)
-
-
 def test_the_first_of_several_returns_counts():
     first, second = cloud(), cloud(RANGES + 3)
     dual = Cloud.joined([second, first])

@@ -2,7 +2,6 @@
 
 import dataclasses
 import hashlib
-import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -80,21 +79,6 @@ def test_values_keep_their_types(tmp_path_factory, rows):
 
 def _sorted(values):
     return dict(sorted(values.items()))
-
-
-def test_memory_is_bounded(tmp_path):
-    """Two row groups take no more memory than one."""
-    place = Storage.at(tmp_path, durable=False)
-    row = dataclasses.replace(DONE, classes={k: k for k in range(30)})
-    write_table(place, NAMES, lambda: [row])  # which imports pyarrow
-    tracemalloc.start()
-    write_table(place, NAMES, lambda: (dataclasses.replace(row, number=k) for k in range(4_000)))
-    written = tracemalloc.get_traced_memory()[1]
-    tracemalloc.reset_peak()
-    assert sum(1 for _ in read_table(place)) == 4_000
-    read = tracemalloc.get_traced_memory()[1]
-    tracemalloc.stop()
-    assert written < 12e6 and read < 2e6
 
 
 def test_a_table_is_whole_or_not_there(tmp_path):

@@ -24,9 +24,9 @@ from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.optics import Returns
-from lidarpool.simulator import world
 from lidarpool.simulator.motion import into_axes
 from lidarpool.simulator.rig import Rig
+from raybeam import moving_loops
 
 WALL_M = 8.0
 PRECISION_M = 0.001
@@ -187,9 +187,19 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     survey = Survey(sensors=sensors, keep_every=1, columns=COLUMNS, **options[name])
     found = made(survey, scene)
     asked = []
-    monkeypatch.setattr(
-        world._Cells, "near", lambda cells, *_: asked.append(1) or np.arange(cells._rays)
-    )
+
+    def every_ray(origins, directions, ends, cell, *_):
+        asked.append(1)
+        row = (cell[:, None] * moving_loops.CELL + np.arange(moving_loops.CELL)).ravel()
+        pair = np.repeat(np.arange(len(cell)), moving_loops.CELL)
+        return row[row < len(ends)], pair[row < len(ends)]
+
+    def every_cell(cells, number, middles, *_):
+        bodies = len(middles)
+        return np.tile(np.arange(len(cells)), bodies), np.repeat(np.arange(bodies), len(cells))
+
+    monkeypatch.setattr(moving_loops, "through", every_ray)
+    monkeypatch.setattr(moving_loops, "meet", every_cell)
     every = made(survey, scene)
     assert asked
     assert (every["object"] == len(scene.names)).sum() > (0 if name == "turned" else 100)

@@ -214,6 +214,7 @@ finally:
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(sys.platform != "linux", reason="needs /proc")
 def test_looking_around_in_a_forest_takes_little_memory():
     """300 trees of 50,000 leaves: all triangles that pictures show took over a gigabyte."""

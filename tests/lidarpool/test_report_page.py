@@ -13,7 +13,6 @@ import pytest
 import yaml
 from lxml import html
 
-import lidarpool.report.page
 from lidarpool import (
     Cloud,
     Mounted,
@@ -30,7 +29,7 @@ from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
 from lidarpool.report.page.rendering import ROWS_MOST, write_page
-from lidarpool.report.report import STAGES, CountedCloud, make_report
+from lidarpool.report.report import CountedCloud, make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.scene_mesh import SceneMesh
@@ -311,16 +310,6 @@ def test_without_planning(write):
     assert "The path" not in text and "swarm" not in text and text.count("<figure>") == 4
 
 
-def test_a_path_far_from_zero_is_told_in_world_coordinates(write):
-    _, near = write()
-    _, far = write(origin=(500_000.0, 4_000_000.0, 100.0))
-    for place in ("start", "target"):
-        assert far["planning"][place] == np.add(near["planning"][place], (5e5, 4e6)).tolist()
-    shift = np.subtract(far["planning"]["path"], near["planning"]["path"])
-    np.testing.assert_allclose(shift, np.full(shift.shape, (5e5, 4e6)), atol=1e-8)
-    assert far["planning"]["best_length"] == near["planning"]["best_length"]
-
-
 def test_the_scenario_on_the_page_is_the_scenario(write):
     scenario = Scenario.from_data(
         {
@@ -337,10 +326,3 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
     assert Scenario.from_data(yaml.safe_load(shown)).model_dump() == scenario.model_dump()
     many = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
     assert len(write(scenario=many)[0]) < len(write()[0]) + 60_000
-
-
-def test_each_stage_has_a_colour_in_light_and_dark():
-    css = (Path(lidarpool.report.page.__file__).parent / "templates" / "page.css").read_text()
-    for stage in STAGES:
-        assert css.count(f"--{stage}: #") == 2, stage
-        assert f".c-{stage} {{" in css and f".s-{stage} {{" in css, stage

@@ -5,13 +5,16 @@ from __future__ import annotations
 import subprocess
 import sys
 import zipfile
+from contextlib import closing
 from importlib.util import find_spec
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from PIL import Image
+from tests.usd_server import UsdServer
 
 from lidarpool import Pose, Scanner, Scene, Sensor
 from lidarpool.base import allowance
@@ -28,6 +31,20 @@ from lidarpool.scene.scene_instances import SceneInstance
 from lidarpool.scene.transform import Transform
 
 pytestmark = pytest.mark.skipif(find_spec("pxr") is None, reason="needs usd-core, an extra")
+
+
+@pytest.fixture(autouse=True)
+def forked(server, monkeypatch):
+    """Processes of one that has imported usd-core once."""
+    names = {name: getattr(subprocess, name) for name in ("DEVNULL", "PIPE")}
+    monkeypatch.setattr(usd, "subprocess", SimpleNamespace(Popen=server, **names))
+
+
+@pytest.fixture(scope="module")
+def server():
+    with closing(UsdServer()) as server:
+        yield server
+
 
 METRES = 'metersPerUnit = 1\nupAxis = "Z"'
 QUAD = """
@@ -413,6 +430,7 @@ def test_few_lines_do_not_make_millions_of_objects(tmp_path):
 
 @pytest.mark.skipif(sys.platform != "linux", reason="limits of memory are Linux's")
 def test_a_library_that_dies_or_wants_too_much_ends_itself_only(tmp_path, monkeypatch):
+    monkeypatch.setattr(usd, "subprocess", subprocess)
     monkeypatch.setattr(usd, "_BASE", 0)
     monkeypatch.setattr(usd, "memory_share", lambda: 60 * 2**20)
     with pytest.raises(LidarpoolError, match=r"m\.usda is broken or cut short \("):

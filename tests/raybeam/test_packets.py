@@ -105,7 +105,7 @@ def ties(backend):
     return found.hexdigest()
 
 
-@pytest.mark.parametrize("isa", quick(("SSE4.2", "AVX2"), ("SSE4.2", "AVX", "AVX2", "AVX512")))
+@pytest.mark.parametrize("isa", quick(("AVX2",), ("SSE4.2", "AVX", "AVX2", "AVX512")))
 def test_the_lowest_of_equals_wins_with_every_instruction_set(isa):
     """Packets of 4, 8 and 16 rays, with and without fused multiply-adds."""
     flag = {"SSE4.2": "SSE42", "AVX512": "AVX512_SKX"}.get(isa, isa)

@@ -248,7 +248,10 @@ def test_help_and_completion_load_nothing_of_a_run(words):
     assert not {"numpy", "dask", "distributed", "pydantic", "rich", "trimesh"} & loaded
 
 
-@pytest.mark.parametrize("arguments", [["sensors"], ["run", "s.yaml", "--only", "cloud", "-q"]])
+@pytest.mark.parametrize(
+    "arguments",
+    [["sensors"], pytest.param(["run", "s.yaml", "--only", "cloud", "-q"], marks=pytest.mark.slow)],
+)
 def test_a_reader_that_leaves_ends_the_printing_only(tmp_path, arguments):
     (tmp_path / "s.yaml").write_text("sensor: {layers: 2}\nplanning: {enabled: false}\n")
     with subprocess.Popen(

@@ -174,8 +174,10 @@ class Environment:
 
 
 @pytest.mark.slow
-@pytest.mark.sample
-@pytest.mark.parametrize(("extra", "backend"), [("", "numpy"), ("[embree]", "embree")])
+@pytest.mark.parametrize(
+    ("extra", "backend"),
+    [pytest.param("", "numpy", marks=pytest.mark.sample), ("[embree]", "embree")],
+)
 def test_raybeam_alone_needs_numpy_alone(built, tmp_path, extra, backend):
     alone = Environment(tmp_path / "venv", built, f"raybeam{extra}")
     assert alone.names() - {"embreex", "numba", "llvmlite"} == {"raybeam", "numpy"}
@@ -207,7 +209,6 @@ def test_lidarpool_alone_needs_no_more_than_it_declares(built, tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_the_three_together_share_equal_files(built, tmp_path):
     """Uninstalling a part takes its files from lidarpool, which is then to be installed again."""
     together = Environment(tmp_path / "venv", built, *FOLDERS)

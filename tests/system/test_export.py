@@ -190,7 +190,6 @@ Storage.write = write_and_die
 
 
 @pytest.mark.slow
-@pytest.mark.sample
 def test_another_worker_writes_the_range_of_one_that_dies(
     cluster, outside, lidarpool, tmp_path, monkeypatch
 ):

@@ -13,7 +13,6 @@ from fsspec.registry import _registry
 from tests.clusters import thread_cluster
 from tests.drives import the_scene, the_sweeps, write_set
 from tests.killed_drivers import drive
-from tests.rows import quick
 from tests.system.default_survey import DEFAULT_CLOUD_SHA256
 from tests.system.test_campaigns import BASE, CAMPAIGN, bytes_of
 from tests.system.test_resume import SCANS
@@ -159,10 +158,8 @@ def test_workers_put_files_of_sweeps_there(cluster, lidarpool, tmp_path, environ
     assert not {"nuscenes", "report.json"} & Storage.at(url).entries().keys()
 
 
-@pytest.mark.parametrize(
-    "format",
-    quick(("kitti",), DATA_SETS),
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("format", DATA_SETS)
 def test_a_data_set_is_written_and_read_in_the_bucket(environment, tmp_path, format):  # noqa: A002
     scene, url, here = the_scene(), f"{BUCKET}/sets/{format}", tmp_path / "here"
     sweeps = the_sweeps(scene)

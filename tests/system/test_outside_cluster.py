@@ -45,6 +45,7 @@ def test_an_outside_cluster_gives_the_same_bytes(lidarpool, outside, tmp_path, a
     assert "6 workers" in told.out and "GPU-0" in told.out.split()
 
 
+@pytest.mark.slow
 def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_client, same_cloud):
     """Another instruction set, for example: workers like most others cast."""
     expected = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="numpy")

@@ -81,6 +81,7 @@ MOMENTS = [
 ]
 
 
+@pytest.mark.slow
 def test_a_driver_is_killed_at_several_moments(drive, undisturbed, tmp_path):
     out = tmp_path / "out"
     assert drive([*MOMENTS, ("", 1)]) == [-signal.SIGKILL] * len(MOMENTS) + [0]

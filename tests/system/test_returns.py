@@ -94,7 +94,11 @@ EVERY_EFFECT = Survey(
 )
 
 
-@pytest.mark.parametrize("survey", [SURVEY, EVERY_EFFECT], ids=["returns", "every effect"])
+@pytest.mark.parametrize(
+    "survey",
+    [SURVEY, pytest.param(EVERY_EFFECT, marks=pytest.mark.slow)],
+    ids=["returns", "every effect"],
+)
 def test_another_cluster_other_batches_and_a_killed_worker_give_the_same_bytes(
     survey, client, cluster_client, small_batches, same_cloud
 ):

@@ -48,6 +48,11 @@ class _Packed:
     sent: set[str] = field(default_factory=set)  # addresses of workers that it was sent to
     there: set[str] = field(default_factory=set)  # of those that have it
 
+    def release(self) -> None:
+        """Let the cluster forget it now: frames of a job's error may keep this object a while."""
+        if isinstance(self.data, Future):
+            self.data.release()
+
 
 class CastingWorkers:
     """The GPU workers that may cast, and their casting tasks, for all jobs of a run.
@@ -141,6 +146,7 @@ class CastingWorkers:
             spare = [key for key, scene in self._scenes.items() if scene not in used]
             old += [self._scenes.pop(key) for key in spare[: max(0, len(spare) - SPARE_SCENES)]]
         for packed in old:
+            packed.release()
             for address in packed.sent & self._checked.keys():
                 self._unneeded.setdefault(address, []).append(packed.name)
 
@@ -271,6 +277,8 @@ class CastingWorkers:
             self._wanted = slots
             self._adapts = self._partition.want(slots)
         if not slots:  # what workers have for tasks would keep these workers
+            for packed in self._packed_things:
+                packed.release()
             self._jobs.clear()
             self._scenes.clear()
 

@@ -322,6 +322,11 @@ class Track:
         first, last = (self.times_s[[0, -1]] - self.start_s) * 1e9
         return float(first), float(last)
 
+    @property
+    def slack_s(self) -> float:
+        """How far outside the trajectory a time may be, seconds."""
+        return _FIRING_S if self.beyond == "refuse" else np.inf
+
     def pose(self, station: int, time_ns: float = 0.0) -> Pose:
         """See `Trajectory.pose`."""
         positions, rotations = self.poses(station, np.array([time_ns], np.float64))
@@ -342,7 +347,7 @@ class Track:
             return values[:3].T, matrices(turns.T)
         if len(segment) and segment.max() == segment.min():
             segment = segment[:1]  # all are in one
-        start, speed, turn, rates, _ = self._segments
+        start, speed, turn, rates, _ = self.segments
         positions = speed.take(segment, axis=1) * since + start.take(segment, axis=1)
         angle = since * rates.take(segment)
         rotations = turn[0].take(segment, axis=1)
@@ -365,7 +370,7 @@ class Track:
             turn = q[6] * p[3:6] - p[6] * q[3:6] - np.cross(p[3:6], q[3:6], axis=0)
             speeds, rates = p[:3], 2 * turn / (q[3:] ** 2).sum(axis=0)
         else:
-            speeds, rates = (self._segments[k].take(segment, axis=1) for k in (1, 4))
+            speeds, rates = (self.segments[k].take(segment, axis=1) for k in (1, 4))
         return (speeds * within).T, (rates * within).T
 
     def _at(self, times_ns: Floats) -> tuple[Indices, Floats, Bools]:
@@ -378,7 +383,7 @@ class Track:
         if self.beyond != "refuse":
             within = (times[0] <= at) & (at <= times[-1])
             at = at.clip(times[0], times[-1])
-        elif gap > _FIRING_S:
+        elif gap > self.slack_s:
             raise LidarpoolError(
                 f"The trajectory goes from {times[0]:.9g} to {times[-1]:.9g} s; poses are asked "
                 f"for from {low:.9g} to {high:.9g} s, {gap:.6g} s outside."
@@ -397,7 +402,7 @@ class Track:
         return np.concatenate(knots, axis=1), np.diff(self.times_s)
 
     @cached_property
-    def _segments(self) -> tuple[Floats, ...]:
+    def segments(self) -> tuple[Floats, ...]:
         """Coefficients of poses on straight ways, one column for each of s segments.
 
         Positions at their starts and velocities (3, s); of the rotation (3, 9, s), which is

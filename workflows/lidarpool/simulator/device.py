@@ -136,7 +136,7 @@ class DeviceColumns:
             pattern, **poses.given, window=window, t_min=reach[0], t_max=reach[1],
             keep_every=every, groups=groups, tally=True,
         )  # fmt: skip
-        others = self._world.on_actors(pattern, poses, window, reach) if poses.ways else None
+        others = self._world.on_actors(scan, poses) if poses.ways else None
         if others is not None:  # rows of the actors' body
             others = replace(others, triangle=others.triangle - np.int32(self.bodies[-1, 0]))
         making = _Making(self, specs, groups, most=-(-len(scan) // every) + len(groups))

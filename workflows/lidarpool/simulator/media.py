@@ -19,7 +19,6 @@ from raybeam import Pattern
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..scene.scene import Scene
-from ..sensor import Trajectory
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.noise import Purpose
@@ -27,6 +26,7 @@ from ..sensor.optics import any_axes
 from .hits import selected
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces
+from .ways import Ways
 from .world import World
 
 DEPTH = 8  # media around a place that are known at most
@@ -43,7 +43,7 @@ class Rays(NamedTuple):
     origins: Floats  # (n, 3)
     directions: Floats  # (n, 3)
     times: Floats  # (n,)
-    ways: tuple[Trajectory, ...]
+    ways: Ways
 
 
 @dataclass
@@ -213,7 +213,7 @@ class Media:
         world: World,
         origins: Floats,
         times: Floats,
-        ways: tuple[Trajectory, ...],
+        ways: Ways,
     ) -> Around:
         """Look upwards: a medium that light leaves without having entered it is around it."""
         surfaces = self._surfaces

@@ -14,6 +14,7 @@ from raybeam import Motion, Pattern
 from ..base.arrays import Floats, Integers
 from ..sensor import Mounted, Trajectory
 from ..sensor.trajectory import velocities
+from .ways import Ways
 
 
 @dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Clock:
 
     begins: Floats  # (f,): of each firing
     delays: Floats  # (m,): of each ray of a firing
-    ways: tuple[Trajectory, ...]  # of the actors, or that of the carrier
+    ways: Ways  # of the actors, or that of the carrier
     start: int = 0  # first ray
     subrays: int = 1  # of each ray
 
@@ -62,9 +63,9 @@ class Poses:
         }
 
     @property
-    def ways(self) -> tuple[Trajectory, ...]:
+    def ways(self) -> Ways:
         """Trajectories of the actors."""
-        return () if self.clock is None else self.clock.ways
+        return Ways() if self.clock is None else self.clock.ways
 
     def times(self, ray: Integers) -> Floats:
         """Return firing times of rays, nanoseconds since the survey's start; for actors."""

@@ -12,6 +12,7 @@ import numpy as np
 from raybeam import Pattern
 
 from ..base.arrays import Floats, Floats32
+from ..base.errors import LidarpoolError
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
@@ -20,6 +21,7 @@ from .echoes import PATTERN_RAYS, EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
 from .returns import BatchReturns
 from .surfaces import Surfaces
+from .ways import Ways
 from .world import World
 
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
@@ -64,6 +66,7 @@ class Rig:
         self, scene: Scene, survey: Survey, options: dict[str, Any], like: World | None
     ) -> None:
         self.scene, self.survey, self._options = scene, survey, options
+        self._ways = Ways(actor.trajectory for actor in scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
         self._world = World(scene, self._surfaces, like, **options)
@@ -105,7 +108,19 @@ class Rig:
         """Return the same rig with other trajectories of the actors; the trees are shared."""
         rig = copy(self)
         rig.scene = self.scene.with_actors(actors)
+        rig._ways = Ways(actor.trajectory for actor in actors)
         return rig
+
+    def check_actors(self, begin_ns: float, end_ns: float) -> None:
+        """Check that the trajectories of actors cover a time; LidarpoolError if not."""
+        moving = np.flatnonzero([way.moves for way in self._ways])
+        try:
+            times = np.repeat([begin_ns, end_ns], len(moving)).astype(np.float64)
+            self._ways.poses(np.tile(moving, 2), times)
+        except LidarpoolError:
+            for number in moving:
+                self.scene.actors[number].check(begin_ns, end_ns)  # which names it
+            raise
 
     def moved(self, owner: int, pose: Pose) -> Rig:
         """Return the same rig with the instances of an object at a pose, see `Scene.moved`.
@@ -181,7 +196,7 @@ class Rig:
         if path.moves:
             firings = np.arange(first, stop, dtype=np.int64)
             begins = carried.sensor.begins_ns(firings) + late_ns
-            carrier = Clock(begins, carried.sensor.beams.time_ns, (path,))
+            carrier = Clock(begins, carried.sensor.beams.time_ns, Ways((path,)))
             poses = replace(poses, carrier=carrier, station=specs[0].station)
         if whole is not None:
             pattern, start = whole, first * channels % len(whole)
@@ -203,8 +218,7 @@ class Rig:
         sensor = self.survey.carried[specs[0].sensor].sensor
         firings = np.arange(specs[0].firings[0], specs[-1].firings[1], dtype=np.int64)
         begins = np.tile(sensor.begins_ns(firings) + specs[0].start_ns, times)
-        ways = tuple(actor.trajectory for actor in self.scene.actors)
-        return replace(poses, clock=Clock(begins, sensor.beams.time_ns, ways))
+        return replace(poses, clock=Clock(begins, sensor.beams.time_ns, self._ways))
 
     def ranges(
         self,

@@ -328,9 +328,7 @@ class Scanner:
             for step in steps
         ]
         begin_ns, end_ns = _span_ns(rig, specs)
-        for actor in rig.scene.actors:
-            if actor.trajectory.moves:
-                actor.check(begin_ns, end_ns)
+        rig.check_actors(begin_ns, end_ns)
         return specs, late_ns
 
     @contextmanager

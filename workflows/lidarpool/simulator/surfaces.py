@@ -14,11 +14,12 @@ from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints
 from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
-from ..sensor import Sensor, Survey, Trajectory
+from ..sensor import Sensor, Survey
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ..sensor.trajectory import velocities
 from .motion import carried_at, into_axes, products
 from .voxels import Grids
+from .ways import Ways
 
 _log = logging.getLogger(__name__)
 
@@ -120,9 +121,7 @@ class Surfaces:
         which = np.searchsorted(self._begins, triangle[on], side="right") - 1
         return rows, on, which
 
-    def normals(
-        self, triangle: Integers, times: Floats | Ints, ways: tuple[Trajectory, ...]
-    ) -> Floats:
+    def normals(self, triangle: Integers, times: Floats | Ints, ways: Ways) -> Floats:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
@@ -136,14 +135,20 @@ class Surfaces:
             turns = self._turns[which].transpose(1, 2, 0)
             x, y, z = (products(row, normals[:, on]) for row in turns)
             normals[:, on] = [x, y, z] / np.sqrt((x * x + y * y) + z * z)
-        objects = self.objects(triangle) if ways else None
-        for number, way in enumerate(ways, self._standing):
-            rows = np.flatnonzero(objects == number)
-            _, rotations = way.poses(0, times[rows].astype(np.float64))
-            if rotations is not None:
-                turned = (rotations * normals.T[rows, None, :]).sum(axis=2)
-                normals[:, rows] = turned.T
+        rows, actor = self._on_actors(triangle, ways)
+        if len(rows):
+            _, rotations = ways.poses(actor, times[rows].astype(np.float64))
+            own = normals[:, rows]
+            for out, row in zip(normals, rotations.transpose(1, 2, 0), strict=True):
+                out[rows] = products(row, own)
         return normals.T
+
+    def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
+        """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
+        if not ways:
+            return _NONE, _NONE
+        rows = np.flatnonzero(triangle >= self._begins[-1])
+        return rows, self.objects(triangle[rows]) - self._standing
 
     def _rows(self, triangle: Integers) -> tuple[Integers, Indices, Indices]:
         """Rows among the triangles that are kept once, and the others as `_found`."""
@@ -164,7 +169,7 @@ class Surfaces:
         triangle: Integers,
         points: Floats,
         times: Floats | Ints,
-        ways: tuple[Trajectory, ...],
+        ways: Ways,
     ) -> UInts32:
         """Colours of points (n, 3) on triangles (n,), packed; others as for `normals`."""
         if self._lookup is None:
@@ -175,9 +180,7 @@ class Surfaces:
             out[block] = self._colours(triangle[block], points[block], times[block], ways)
         return out
 
-    def _colours(
-        self, triangle: Integers, points: Floats, times: Any, ways: tuple[Trajectory, ...]
-    ) -> UInts32:
+    def _colours(self, triangle: Integers, points: Floats, times: Any, ways: Ways) -> UInts32:
         assert self._lookup is not None
         rows, on, which = self._rows(triangle)
         if len(on) or ways:
@@ -186,12 +189,10 @@ class Surfaces:
             assert self._scene.instances is not None
             back = points[on] - self._scene.instances.transforms[which, :, 3]
             points[on] = np.einsum("ni,nij->nj", back, self._turns[which])
-        objects = self.objects(triangle) if ways else None
-        for number, way in enumerate(ways, self._standing):
-            moving = np.flatnonzero(objects == number)
-            if len(moving):
-                places, rotations = way.poses(0, times[moving].astype(np.float64))
-                points[moving] = into_axes(points[moving] - places, rotations)
+        moving, actor = self._on_actors(triangle, ways)
+        if len(moving):
+            places, rotations = ways.poses(actor, times[moving].astype(np.float64))
+            points[moving] = into_axes(points[moving] - places, rotations)
         return self._lookup.at(rows, points)
 
     def velocities(
@@ -199,14 +200,14 @@ class Surfaces:
         triangle: Integers,
         points: Floats,
         times: Floats | Ints,
-        ways: tuple[Trajectory, ...],
+        ways: Ways,
     ) -> Floats:
         """Velocities of points (n, 3) on triangles (n,), m/s: (n, 3); others as for `normals`."""
         out = np.zeros((len(triangle), 3))
-        objects = self.objects(triangle) if ways else None
-        for number, way in enumerate(ways, self._standing):
-            rows = np.flatnonzero(objects == number) if way.moves else _NONE
-            if len(rows):
+        moving, actor = self._on_actors(triangle, ways)
+        for number in np.unique(actor).tolist():
+            way, rows = ways[number], moving[actor == number]
+            if way.moves:
                 at = times[rows].astype(np.float64)
                 places, _ = way.poses(0, at)
                 out[rows] = carried_at(*velocities(way, 0, at), points[rows] - places)

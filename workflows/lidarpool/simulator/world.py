@@ -1,13 +1,11 @@
 """The ray caster of a whole world: the static scene, its instances, and moving actors.
 
-Each ray is transformed to an actor's axes at its own time, so that no tree is ever rebuilt. Only
-rays that come near the actor's bounding sphere are made and cast; the position of the sphere in the
-axes of each pose selects them.
+Each ray is transformed to an actor's axes at its own time, so that no tree is ever rebuilt: see
+`raybeam.moving`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
@@ -16,33 +14,31 @@ import numpy as np
 from raybeam import (
     Instance,
     Mesh,
+    Moving,
     Opacity,
     OtherHits,
     Pattern,
     RayCaster,
+    Scan,
     ScanReturns,
     available_backends,
+    check_scan,
+    hits_on,
 )
 
 from ..base.arrays import Bools, Floats, Indices, Ints, Ints32
 from ..base.errors import LidarpoolError
 from ..base.interrupts import deferred_interrupts
 from ..base.words import did_you_mean
-from ..scene.actors import shapes_of
+from ..scene.actors import Actor, shapes_of
 from ..scene.scene import Scene
 from ..scene.scene_instances import Instances, MeshPart, parts_of
-from ..scene.scene_mesh import SceneMesh as ActorMesh
-from ..sensor import Trajectory
-from ..sensor.trajectory import presence_ns
-from .motion import Clock, Poses, into_axes, products
+from .motion import Clock, Poses
 from .surfaces import Surfaces
+from .ways import Ways
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
-CELL_RAYS = 1 << 10  # rays in a cell of a still sensor, which are fired at nearly one time
-CELLS = 64  # cells that share one look at an actor's trajectory
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
-NEAR_M = 1.0  # rays of a cell start no farther than this from its position
-TURN = 2e-3  # radians: rays of a cell deviate at most so much from the pattern in its pose
 
 
 def check_backend_here(wanted: str, advice: str = AUTO_TAKES) -> None:
@@ -87,8 +83,7 @@ class World:
             self.caster: RayCaster = _caster_of(scene, vertices, options)
         else:
             self.caster = like.caster
-        moving, self._shape_of = shapes_of(scene.actors)
-        self._shapes = [_Shape(mesh, options) for mesh in moving]
+        self._shapes = _shapes(scene.actors, options)
         sizes = [len(actor.mesh.faces) for actor in scene.actors]
         self._firsts = (faces + np.cumsum([0, *sizes[:-1]])).astype(np.int32)  # triangles
 
@@ -128,7 +123,7 @@ class World:
         common: dict[str, Any] = {
             **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
         }  # fmt: skip
-        if self._begins is None and not self._shapes:
+        if self._begins is None and self._shapes is None:
             return self.caster.scan(
                 pattern, **common, keep_every=keep_every, groups=groups, tally=tally
             )
@@ -136,9 +131,9 @@ class World:
         if self._begins is not None:
             found = replace(found, triangle=found.triangle + self._begins[found.instance])
         ray, distance, triangle = found.ray.astype(np.int64), found.distance, found.triangle
-        if self._shapes:
-            window, reach = (start, stop), (t_min, t_max)
-            ray, distance, triangle = self._with_actors(found, pattern, poses, window, reach)
+        if self._shapes is not None:
+            scan = check_scan(pattern, **common)
+            ray, distance, triangle = self._with_actors(found, scan, poses)
         begins = np.zeros(1, np.int64) if groups is None else groups
         cuts = np.append(np.searchsorted(ray, begins), len(ray))
         counts = np.diff(cuts)
@@ -160,7 +155,7 @@ class World:
         towards: Floats,
         distance: Floats,
         times: Floats,
-        ways: tuple[Trajectory, ...],
+        ways: Ways,
     ) -> Bools:
         """Whether nothing stands before points (n, 3), seen from origins, at times (n,)."""
         free = np.ones(len(distance), np.bool_)
@@ -171,84 +166,29 @@ class World:
         return free
 
     def _with_actors(
-        self,
-        found: ScanReturns,
-        pattern: Pattern,
-        poses: Poses,
-        window: tuple[int, int],
-        reach: tuple[float, float],
+        self, found: ScanReturns, scan: Scan, poses: Poses
     ) -> tuple[Ints, Floats, Ints32]:
         """Rays, distances and triangles of all hits, those on actors among them."""
-        rays = window[1] - window[0]
-        distance = np.full(rays, np.inf)
-        triangle = np.full(rays, -1, np.int32)
+        distance, triangle = np.full(len(scan), np.inf), np.full(len(scan), -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
-        moving = self.on_actors(pattern, poses, window, reach)
-        nearer = moving.distance < distance[moving.ray]
-        there = moving.ray[nearer]
-        distance[there], triangle[there] = moving.distance[nearer], moving.triangle[nearer]
+        on = self.on_actors(scan, poses, distance)
+        nearer = on.distance < distance[on.ray]
+        there = on.ray[nearer]
+        distance[there], triangle[there] = on.distance[nearer], on.triangle[nearer]
         ray = np.flatnonzero(triangle >= 0)
         return ray, distance[ray], triangle[ray]
 
-    def on_actors(
-        self, pattern: Pattern, poses: Poses, window: tuple[int, int], reach: tuple[float, float]
-    ) -> OtherHits:
-        """Find the nearest hits of rays on actors, whether something stands before them or not."""
-        cells = _Cells(pattern, poses, *window)
-        found: list[tuple[Any, ...]] = []
-        waiting: list[tuple[int, Indices, tuple[Floats, Floats | None]]] = []
-        for number, way in enumerate(poses.ways):
-            ray = cells.near(self._shapes[self._shape_of[number]], way, reach[1])
-            if not len(ray):
-                continue
-            times = poses.times(ray)
-            first, last = presence_ns(way)
-            if first > times.min() or times.max() > last:
-                there = (first <= times) & (times <= last)
-                ray, times = ray[there], times[there]
-            waiting.append((number, ray, way.poses(0, times)))
-            # Those of several actors together, because most calls have few rays; all would be many.
-            if sum(len(ray) for _, ray, _ in waiting) > window[1] - window[0]:
-                found += self._cast_near(waiting, pattern, poses, window[0], reach)
-                waiting = []
-        found += self._cast_near(waiting, pattern, poses, window[0], reach)
-        if not found:
-            return OtherHits(np.zeros(0, np.uint32), np.zeros(0), np.zeros(0, np.int32))
-        ray, t, face = map(np.concatenate, zip(*found, strict=True))
-        order = np.lexsort((t, ray))  # of equal distances, that of the first actor comes first
-        order = order[np.diff(ray[order], prepend=-1) > 0]
-        return OtherHits(ray[order].astype(np.uint32), t[order], face[order])
-
-    def _cast_near(
-        self,
-        near: list[tuple[int, Indices, tuple[Floats, Floats | None]]],
-        pattern: Pattern,
-        poses: Poses,
-        start: int,
-        reach: tuple[float, float],
-    ) -> Iterator[tuple[Any, ...]]:
-        """Rays, distances and triangles of hits of rays near actors, each with its number."""
-        if not near:
-            return
-        sizes = [len(ray) for _, ray, _ in near]
-        numbers = np.repeat([number for number, _, _ in near], sizes)
-        ray = np.concatenate([ray for _, ray, _ in near])
-        origins, directions = poses.rays(pattern, ray, start)
-        places = np.concatenate([places for *_, (places, _) in near])
-        starts, ways = origins - places, directions
-        if any(turns is not None for *_, (_, turns) in near):
-            turns = [np.eye(3)[None].repeat(n, axis=0) if t is None else t
-                     for n, (*_, (_, t)) in zip(sizes, near, strict=True)]  # fmt: skip
-            rotations = np.concatenate([t.transpose(1, 2, 0) for t in turns], axis=2)
-            rotations = rotations.transpose(2, 0, 1)
-            starts, ways = into_axes(starts, rotations), into_axes(directions, rotations)
-        for shape in np.unique(self._shape_of[numbers]).tolist():
-            own = np.flatnonzero(self._shape_of[numbers] == shape)
-            on, distance, triangle = self._shapes[shape].hits(starts[own], ways[own], *reach)
-            on = own[on]
-            # Directions of a sensor that turns during a pose are not quite of unit length.
-            lengths = np.linalg.norm(directions[on], axis=1)
-            yield ray[on], distance / lengths, triangle + self._firsts[numbers[on]]
+    def on_actors(self, scan: Scan, poses: Poses, before: Floats | None = None) -> OtherHits:
+        """Find the nearest hits of rays on actors; some behind distances `before` may lack."""
+        assert self._shapes is not None
+        casters, boxes, parts, shape = self._shapes
+        ways = poses.ways
+        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.poses)
+        hits = hits_on(moving, scan, poses.times, before)
+        triangle = hits.triangle + parts[shape[hits.body], hits.instance]
+        return OtherHits(
+            hits.ray.astype(np.uint32), hits.distance, triangle + self._firsts[hits.body]
+        )
 
 
 def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:
@@ -268,89 +208,20 @@ def _mesh_of(part: MeshPart) -> Mesh:
     return Mesh(part.vertices, part.faces, opacity)
 
 
-class _Cells:
-    """Cells of the rays of a scan's window, which start and are fired nearly together."""
+def _shapes(
+    actors: tuple[Actor, ...], options: dict[str, Any]
+) -> tuple[tuple[RayCaster, ...], Floats, Ints32, Indices] | None:
+    """Shapes of actors: casters, boxes (s, 2, 3), first triangles of parts (s, p), and whose (a,).
 
-    def __init__(self, pattern: Pattern, poses: Poses, start: int, stop: int) -> None:
-        self._rays, each, places = stop - start, poses.rays_per_pose, poses.positions
-        rotations = None if poses.rotations is None else poses.rotations.reshape(-1, 3, 3)
-        self._rotations = rotations
-        reach = 0.0 if pattern.origins is None else 2 * float(np.abs(pattern.origins).max())
-        apart = each is None and reach > NEAR_M
-        self._each = each = 1 if apart else each or CELL_RAYS
-        cells = -(-self._rays // each)
-        rows = (start + np.arange(cells * each)) % len(pattern)
-        if apart and pattern.origins is not None:
-            origins = pattern.origins.take(rows, axis=0)
-            back = None if rotations is None else rotations.transpose(0, 2, 1)
-            places, reach = places + into_axes(origins, back), 0.0
-        self._reach = reach
-        self._places = np.broadcast_to(places, (cells, 3))
-        alike = len(pattern) == each and start % each == 0
-        directions = pattern.directions if alike else pattern.directions.take(rows, axis=0)
-        self._directions = directions.reshape(-1, each, 3).transpose(2, 0, 1)
-        # A cone around the rays of a cell.
-        middle = self._directions.mean(axis=2)
-        self._axes = middle / np.maximum(np.linalg.norm(middle, axis=0), 1e-9)
-        cosines = products(self._axes[:, :, None], self._directions)
-        self._opening = np.arccos(np.clip(cosines.min(axis=1, initial=1), -1, 1))
-        first = np.arange(0, self._rays, each)
-        last = np.minimum(first + each, self._rays) - 1
-        self._begins = poses.times(first)
-        ends = poses.times(last)
-        self._lasts, self._end = (ends - self._begins).max(initial=0), ends.max(initial=0)
-
-    def near(self, actor: _Shape, way: Trajectory, t_max: float) -> Indices:
-        """Numbers of the rays that come near an actor; no other ray hits it."""
-        if not self._rays:
-            return np.zeros(0, np.intp)
-        low, high = self._begins.min(), self._begins.max()
-        first, last = presence_ns(way)
-        if self._end < first or last < low:
-            return np.zeros(0, np.intp)
-        step = max((high - low) * CELLS / len(self._begins), self._lasts, 1.0)
-        times = low + step * np.arange((high - low) // step + 1)
-        places, rotations = way.poses(0, np.append(times, self._end))
-        places = places + (actor.middle if rotations is None else rotations @ actor.middle)
-        between = np.linalg.norm(np.diff(places, axis=0), axis=1).max()
-        radius = actor.radius + 2 * between + self._reach + 1e-3
-        number = ((self._begins - low) // step).astype(np.intp)
-        centre = into_axes(places[number] - self._places, self._rotations).T
-        far = np.sqrt(products(centre, centre))
-        with np.errstate(invalid="ignore", divide="ignore"):
-            seen = np.where(far > radius, np.arcsin(radius / far), np.pi) + TURN
-            off = np.arccos(np.clip(products(self._axes, centre) / far, -1, 1))
-        cell = np.flatnonzero((far <= t_max + radius) & ~(off > self._opening + seen))
-        directions = self._directions
-        if directions.shape[1] > 1:
-            directions = directions[:, cell]
-        along = products(centre[:, cell, None], directions)
-        least = far[cell] * np.cos(np.minimum(seen[cell], np.pi))
-        found = np.flatnonzero(along >= least[:, None])
-        ray = cell[found // self._each] * self._each + found % self._each
-        return ray[ray < self._rays]
-
-
-class _Shape:
-    """A mesh of actors with its ray caster, and the bounding sphere of its vertices."""
-
-    def __init__(self, mesh: ActorMesh, options: dict[str, Any]) -> None:
-        parts = [*parts_of(mesh)]
-        self._caster = RayCaster.of([Instance(_mesh_of(part)) for part in parts], **options)
-        sizes = [len(part.faces) for part in parts]
-        self._parts = np.cumsum([0, *sizes[:-1]]).astype(np.int32)
-        self.middle = (mesh.vertices.min(axis=0) + mesh.vertices.max(axis=0)) / 2
-        self.radius = float(np.linalg.norm(mesh.vertices - self.middle, axis=1).max())
-
-    def hits(
-        self, origins: Floats, directions: Floats, t_min: float, t_max: float
-    ) -> tuple[Indices, Floats, Ints32]:
-        """Hits on it of rays (m, 3) in its own axes.
-
-        Returns
-        -------
-        Numbers of the rays that hit (h,), distances, and triangles.
-        """
-        hits = self._caster.cast(origins, directions, t_min, t_max)
-        on = np.flatnonzero(hits.hit)
-        return on, hits.distance[on], hits.triangle[on] + self._parts[hits.instance[on]]
+    None without actors.
+    """
+    if not actors:
+        return None
+    meshes, shape = shapes_of(actors)
+    parts = [[*parts_of(mesh)] for mesh in meshes]
+    firsts = np.zeros((len(meshes), max(map(len, parts))), np.int32)
+    for row, own in zip(firsts, parts, strict=True):
+        row[1 : len(own)] = np.cumsum([len(part.faces) for part in own])[:-1]
+    casters = [RayCaster.of([Instance(_mesh_of(part)) for part in own], **options) for own in parts]
+    boxes = [(mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)) for mesh in meshes]
+    return tuple(casters), np.array(boxes), firsts, shape

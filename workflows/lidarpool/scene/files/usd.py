@@ -100,7 +100,9 @@ def _frames(path: Path, wanted: Wanted, allowance: Allowance) -> Generator[_Fram
     memory = memory_share() + _BASE
     # The user's plug-ins and search paths would make it another scene.
     environment = {name: text for name, text in os.environ.items() if not name.startswith("PXR_")}
-    environment |= {"PXR_WORK_THREAD_LIMIT": "4", "OPENBLAS_NUM_THREADS": "1"}
+    # A thread that is refused for the memory limit would be waited for until the alarm. One thread
+    # takes a sixth longer for 100 layers.
+    environment |= {"PXR_WORK_THREAD_LIMIT": "1", "OPENBLAS_NUM_THREADS": "1"}
     asked: dict[str, Any] = {"most": _MOST, "masks": wanted.masks, "colours": wanted.colours}
     asked |= {"memory": memory, "folders": [str(folder) for folder in wanted.folders]}
     with subprocess.Popen(

@@ -1,0 +1,149 @@
+"""What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
+
+One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
+and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, in rain, fog and snow,
+and all of it. Each figure is the median of the rounds, and a multiple of the bare sweep's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from typing import Any
+
+import numpy as np
+
+from lidarpool import Actor, Noise, Returns, Scanner, Scene, Track, load_sensor
+from lidarpool.scene.actors import box
+from lidarpool.scene.generated.city import city
+from lidarpool.scene.scene_mesh import SceneMesh
+from raybeam import available_backends
+
+from .raycast import environment
+
+PLACE = (0.0, 0.0, 1.9)
+SPEED_M_S, TURN_S, FIELD_M = 20.0, 0.1, (5.0, 60.0)
+COLUMNS = ("time", "range", "intensity", "class", "sensor")
+COUNTS = (10, 100, 300)
+
+
+def fine_box(triangles: int) -> SceneMesh:
+    """Make the box of a car of so many triangles, at least."""
+    mesh = box("Car", (4.5, 1.8, 1.5))
+    vertices, faces = mesh.vertices, mesh.faces
+    while len(faces) < triangles:  # each in four
+        corners = vertices[faces]
+        middles = (corners + np.roll(corners, -1, axis=1)) / 2
+        (a, b, c), (p, q, r) = corners.transpose(1, 0, 2), middles.transpose(1, 0, 2)
+        corners = np.stack([a, p, r, p, b, q, r, q, c, p, q, r], axis=1).reshape(-1, 3)
+        vertices, faces = corners, np.arange(len(corners)).reshape(-1, 3)
+    return SceneMesh("Car", vertices, faces)
+
+
+def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
+    """Make cars around the sensor, at 10 m/s, some of which turn."""
+    random = np.random.default_rng(seed)
+    angle, heading = random.uniform(0, 2 * np.pi, (2, count))
+    radius = random.uniform(*FIELD_M, count)
+    turns = random.uniform(-0.5, 0.5, count)
+    made = []
+    for k in range(count):
+        begin = radius[k] * np.array([np.cos(angle[k]), np.sin(angle[k]), 0])
+        ahead = 10 * np.array([np.cos(heading[k]), np.sin(heading[k]), 0])
+        yaw = heading[k] + turns[k] * np.array([0, 1])
+        quaternions = np.stack([0 * yaw, 0 * yaw, np.sin(yaw / 2), np.cos(yaw / 2)], axis=1)
+        made.append(Actor(mesh, Track([0, 1], [begin, begin + ahead], quaternions)))
+    return made
+
+
+def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
+    """Make a function of the round for each row, which gives its number of points."""
+    lidar = load_sensor(sensor)
+    weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 1.0}}
+    weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 18.8}
+    plain, fine = box("Car", (4.5, 1.8, 1.5)), fine_box(1_000)
+    way = Track([0, 1], [PLACE, (PLACE[0] + SPEED_M_S, *PLACE[1:])])
+
+    def case(actors: list[Actor], where: Any = PLACE, **options: Any) -> Any:
+        scanner = Scanner(
+            scene.with_actors(tuple(actors)),
+            lidar,
+            columns=COLUMNS,
+            backend=backend,
+            threads=1,
+            **options,
+        )
+        return lambda number: len(scanner.sweep(where, number=number))
+
+    rows = {"bare": case([])}
+    for count in counts:
+        rows[f"{count} boxes"] = case(cars(count, plain, count))
+        rows[f"{count} meshes"] = case(cars(count, fine, count))
+    some = counts[len(counts) // 2]
+    rows[f"{some} boxes, moving"] = case(cars(some, plain, some), way)
+    for subrays in (7, 19):
+        rows[f"{subrays} sub-rays"] = case([], returns=Returns(subrays=subrays, divergence_mrad=3))
+    noise = Noise(detection_range_m=90)  # without which no weather returns light
+    rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
+    together = {name: value for options in weather.values() for name, value in options.items()}
+    rows["all"] = case(
+        cars(some, fine, some),
+        way,
+        noise=noise,
+        returns=Returns(subrays=7, divergence_mrad=3),
+        **together,
+    )
+    return rows
+
+
+def measure(rows: dict[str, Any], rounds: int) -> dict[str, dict[str, float]]:
+    """Time all rows, in another order each round; the first round warms up."""
+    seconds: dict[str, list[float]] = {row: [] for row in rows}
+    points = {}
+    for number in range(rounds + 1):
+        for row in np.random.default_rng(number).permutation(list(rows)).tolist():
+            start = time.process_time()
+            points[row] = rows[row](number % 5)
+            if number:
+                seconds[row].append(time.process_time() - start)
+    bare = float(np.median(seconds["bare"]))
+    return {
+        row: {
+            "ms": 1e3 * float(np.median(spent)),
+            "times": float(np.median(spent)) / bare,
+            "points": points[row],
+        }
+        for row, spent in seconds.items()
+    }
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the benchmark, and return the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--rounds", type=int, default=9)
+    parser.add_argument("--triangles", type=int, default=100_000)
+    parser.add_argument("--cars", type=int, nargs="+", default=COUNTS)
+    parser.add_argument("--sensor", default="ouster/os1-64")
+    parser.add_argument("--rows", nargs="*", help="those to measure, beside the bare one")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args(arguments)
+    backend = next(name for name in ("embree", "numpy") if not available_backends()[name])
+    scene = city(options.triangles)
+    rows = cases(scene, backend, tuple(options.cars), options.sensor)
+    if options.rows is not None:
+        rows = {row: rows[row] for row in ["bare", *options.rows]}
+    found = measure(rows, options.rounds)
+    if options.json:
+        print(json.dumps({**environment(1, "cpu"), "backend": backend, "rows": found}))
+        return 0
+    for row, figures in found.items():
+        print(
+            f"{row:20} {figures['ms']:8.2f} ms {figures['times']:6.2f} x bare "
+            f"{figures['points']:10,} points"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

@@ -1,0 +1,66 @@
+"""Poses of many actors at once have the bits of each trajectory's own."""
+
+import numpy as np
+import pytest
+
+from lidarpool import LidarpoolError, Pose, Track
+from lidarpool.sensor import Stations
+from lidarpool.simulator.ways import Ways
+
+
+class Circle:
+    """A user's own."""
+
+    stations, moves, duration_ns = 1, True, np.inf
+
+    def poses(self, station, times_ns):
+        angle = times_ns / 1e9
+        return np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1), None
+
+
+def track(seed, **options):
+    random = np.random.default_rng(seed)
+    count = int(random.integers(2, 12))
+    times = np.cumsum(random.uniform(0.01, 0.5, count))
+    turns = random.normal(size=(count, 4))
+    turns /= np.linalg.norm(turns, axis=1)[:, None]
+    return Track(times, random.normal(size=(count, 3)), turns, **options)
+
+
+WAYS = Ways(
+    [
+        *(track(seed, beyond="hold") for seed in range(6)),
+        track(7, smooth=True, beyond="hold"),
+        Circle(),
+        Stations((Pose((1, 2, 3), 20),)),
+        Stations((Pose((1, 2, 3)),)),
+        track(9, beyond="absent"),
+    ]
+)
+
+
+@pytest.mark.parametrize("members", [WAYS, Ways(WAYS[:6]), Ways(WAYS[7:9])])
+@pytest.mark.parametrize("each", [1, 5])
+def test_poses_are_those_of_each_trajectory(members, each):
+    random = np.random.default_rng(0)
+    number = np.repeat(random.integers(0, len(members), 300), each)
+    times = np.repeat(random.uniform(-0.5e9, 4e9, 300), each)
+    positions, rotations = members.poses(number, times)
+    for way, at, position, rotation in zip(number, times, positions, rotations, strict=True):
+        (place,), turns = members[way].poses(0, np.array([at]))
+        assert np.array_equal(position, place)
+        assert np.array_equal(rotation, np.eye(3) if turns is None else turns[0])
+
+
+def test_a_time_outside_is_refused_as_by_the_trajectory():
+    ways = Ways([*WAYS, track(3)])
+    last = ways[-1].duration_ns
+    ways.poses(np.array([len(WAYS)]), np.array([last]))
+    with pytest.raises(LidarpoolError, match=r"The trajectory goes from .* 1 s outside"):
+        ways.poses(np.array([0, len(WAYS)]), np.array([0.0, last + 1e9]))
+
+
+def test_there_may_be_none():
+    positions, rotations = Ways().poses(np.zeros(0, np.intp), np.zeros(0))
+    assert positions.shape == (0, 3) and rotations.shape == (0, 3, 3)
+    assert Ways().presence_ns.shape == (0, 2)

@@ -1,0 +1,188 @@
+"""Bodies that move: hits are those of each ray on each body, where that is at the ray's time."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from raybeam import (
+    Instance,
+    Mesh,
+    Motion,
+    Moving,
+    Opacity,
+    Pattern,
+    RayCaster,
+    check_scan,
+    hits_on,
+    moving_loops,
+)
+from raybeam import moving as module
+
+RAYS, PERIOD = 3_000, 0.1
+FLAT = np.array([[-1.0, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]]), [[0, 1, 2], [0, 2, 3]]
+
+
+def ball(rings=12):
+    """Vertices and faces of a ball of 1 m, and of two triangles a square."""
+    v, u = np.meshgrid(np.linspace(0, np.pi, rings), np.linspace(0, 2 * np.pi, 2 * rings))
+    points = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], -1).reshape(-1, 3)
+    a = (np.arange(2 * rings - 1)[:, None] * rings + np.arange(rings - 1)).ravel()
+    faces = [[a, a + 1, a + rings], [a + 1, a + rings + 1, a + rings]]
+    return points * [2, 1, 0.7], np.concatenate([np.stack(face, axis=1) for face in faces])
+
+
+class Bodies:
+    """Bodies on curves that turn about any axis; some appear late or leave early."""
+
+    def __init__(self, count, seed, around=(0.0, 0, 0), speed=20.0):
+        random = np.random.default_rng(seed)
+        self.start = random.uniform(-12, 12, (count, 3)) + around
+        self.speed = random.uniform(-speed, speed, (count, 3))
+        self.axis = random.normal(size=(count, 3))
+        self.axis /= np.linalg.norm(self.axis, axis=1)[:, None]
+        self.rate = random.uniform(-10, 10, count)
+        self.there = np.tile([-np.inf, np.inf], (count, 1))
+        self.there[::3] = [0.3 * PERIOD, 0.7 * PERIOD]
+        self.shape = random.integers(0, 3, count)
+
+    def poses(self, body, times):
+        assert (self.there[body, 0] <= times).all() and (times <= self.there[body, 1]).all()
+        places = self.start[body] + times[:, None] * self.speed[body]
+        places[:, 2] += np.sin(30 * times)
+        angle, axis = self.rate[body] * times, self.axis[body]
+        cross = np.cross(np.eye(3), axis[:, None])
+        spin = np.sin(angle)[:, None, None] * cross
+        return places, np.eye(3) + spin + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
+
+    def moving(self, backend):
+        mask = np.array([[False, True], [True, False]])
+        uv = np.array([[0, 0], [1, 0], [1, 1], [0, 0], [1, 1], [0, 1]], np.float32).reshape(2, 3, 2)
+        shapes = [Mesh(*ball()), Mesh(*FLAT, Opacity(mask, uv)), Mesh(*FLAT)]
+        casters = [RayCaster.of([Instance(mesh)], backend, threads=1) for mesh in shapes]
+        boxes = np.array([[[-2, -1, -0.7], [2, 1, 0.7]], *2 * [[[-1.0, -1, 0], [1, 1, 0]]]])
+        return Moving(tuple(casters), boxes, self.shape, self.there, self.poses)
+
+
+def fan(count):
+    """Firings of 16 beams around."""
+    azimuth = np.repeat(np.linspace(0, 2 * np.pi, count // 16), 16)
+    elevation = np.tile(np.linspace(-0.4, 0.4, 16), count // 16)
+    flat = np.cos(elevation)
+    return np.stack([np.cos(azimuth) * flat, np.sin(azimuth) * flat, np.sin(elevation)], axis=1)
+
+
+def scans(kind):
+    """Scan, times of its rays, and where its bodies are."""
+    random, far = np.random.default_rng(5), np.zeros(3)
+    directions, each = random.normal(size=(RAYS, 3)), {}
+    origins, places = None, far
+    if kind == "far":
+        far = np.array([690_000.0, 5_335_000, 500])
+    if kind in ("fan", "far", "moving"):
+        directions, places = fan(RAYS), far
+    if kind == "apart":
+        origins = random.uniform(-20, 20, (RAYS, 3))
+    if kind == "moving":
+        firings = len(directions) // 16
+        angle = 0.02 * np.arange(firings)
+        turns = np.tile(np.eye(3), (firings, 1, 1))
+        turns[:, 0, 0] = turns[:, 1, 1] = np.cos(angle)
+        turns[:, 1, 0], turns[:, 0, 1] = np.sin(angle), -np.sin(angle)
+        places = np.linspace([-5, 0, 0], [5, 1, 0], firings)
+        velocity, rate = np.tile([5.0, 0, 0], (firings, 1)), np.tile([0, 0, 0.5], (firings, 1))
+        motion = Motion(np.linspace(0, 1e-4, 16), velocity, rate)
+        each = {"rotations": turns, "rays_per_pose": 16, "motion": motion}
+    pattern = Pattern(directions, origins)
+    scan = check_scan(pattern, places, t_min=0.5, t_max=200, **each)
+    times = np.sort(random.uniform(0, PERIOD, len(pattern))) if kind != "fan" else np.repeat(
+        PERIOD * np.arange(len(pattern) // 16) / (len(pattern) // 16), 16)  # fmt: skip
+    return scan, times, far
+
+
+def by_all(moving, scan, times):
+    """Nearest hits, of each ray cast by itself at every body that is there."""
+    origins, directions = scan.pattern.made(scan.first, np.arange(len(scan)), scan.poses)
+    best = {}
+    for body, (first, last) in enumerate(moving.there):
+        rows = np.flatnonzero((first <= times) & (times <= last))
+        places, turns = moving.poses(np.full(len(rows), body), times[rows])
+        starts = np.broadcast_to(origins, directions.shape)[rows] - places
+        local = [
+            np.stack([(x * a + y * b) + z * c for a, b, c in turns.transpose(2, 1, 0)], axis=1)
+            for x, y, z in (starts.T, directions[rows].T)
+        ]
+        hits = moving.shapes[moving.shape[body]].cast(*local, scan.t_min, scan.t_max)
+        x, y, z = local[1].T
+        distance = hits.distance / np.sqrt((x * x + y * y) + z * z)
+        for row in np.flatnonzero(hits.hit):
+            found = (distance[row], body, hits.triangle[row])
+            best[rows[row]] = min(best.get(rows[row], found), found)
+    return [(ray, *best[ray]) for ray in sorted(best)]
+
+
+def listed(hits):
+    columns = hits.ray, hits.distance, hits.body, hits.triangle
+    return [*zip(*(column.tolist() for column in columns), strict=True)]
+
+
+@pytest.mark.parametrize("kind", ["fan", "any", "apart", "moving", "far"])
+@pytest.mark.parametrize("backend", ["embree", "numpy"])
+def test_hits_are_those_of_every_ray_on_every_body(kind, backend, monkeypatch):
+    scan, times, around = scans(kind)
+    moving = Bodies(70, 1, around).moving(backend)
+    hits = hits_on(moving, scan, lambda ray: times[ray])
+    expected = by_all(moving, scan, times)
+    assert len(expected) > 80 and listed(hits) == expected
+    assert len({body for _, _, body, _ in expected}) > 10
+    monkeypatch.setattr(module, "_CHUNK", 650)
+    monkeypatch.setattr(module, "_PAIRS", 7)
+    assert listed(hits_on(moving, scan, lambda ray: times[ray])) == expected
+
+
+def test_loops_that_are_not_compiled_give_the_same(monkeypatch):
+    scan, times, _ = scans("moving")
+    moving = Bodies(20, 1).moving("numpy")
+    compiled = listed(hits_on(moving, scan, lambda ray: times[ray]))
+    for name in ("_make", "cells_of", "_meet", "_through", "_local", "_nearest"):
+        loop = getattr(moving_loops, name)
+        monkeypatch.setattr(moving_loops, name, getattr(loop, "py_func", loop))
+    assert listed(hits_on(moving, scan, lambda ray: times[ray])) == compiled != []
+
+
+def test_rays_end_at_what_stands_before():
+    scan, times, _ = scans("fan")
+    moving = Bodies(24, 1).moving("numpy")
+    hits = hits_on(moving, scan, lambda ray: times[ray])
+    ends = np.full(len(scan), np.inf)
+    ends[hits.ray[::2]] = hits.distance[::2]
+    ends[hits.ray[1::2]] = hits.distance[1::2] / 2
+    before = hits_on(moving, scan, lambda ray: times[ray], ends)
+    nearer = before.distance <= ends[before.ray]
+    assert before.ray[nearer].tolist() == hits.ray[::2].tolist()
+    assert before.distance[nearer].tolist() == hits.distance[::2].tolist()
+
+
+def test_of_equal_distances_the_first_body_counts():
+    bodies = Bodies(4, 1)
+    bodies.start[:], bodies.speed[:], bodies.rate[:] = [5, 0, 0], 0, 0
+    bodies.there[:], bodies.shape[:] = [-np.inf, np.inf], 0
+    scan, times, _ = scans("fan")
+    hits = hits_on(bodies.moving("numpy"), scan, lambda ray: times[ray])
+    assert len(hits.ray) > 50 and not hits.body.any()
+
+
+def test_most_rays_are_not_looked_at(monkeypatch):
+    """As many as pass through boxes, of 24 bodies."""
+    scan, times, _ = scans("fan")
+    moving, asked = Bodies(24, 1).moving("numpy"), []
+    local = moving_loops.local
+    monkeypatch.setattr(moving_loops, "local", lambda *a: asked.append(len(a[3])) or local(*a))
+    hits = hits_on(moving, scan, lambda ray: times[ray])
+    assert len(hits.ray) <= sum(asked) < 12 * len(hits.ray)
+
+
+def test_no_loop_is_compiled_with_fast_mathematics():
+    """Functions that such a loop calls would inherit that, and round otherwise."""
+    sources = [path.read_text() for path in Path(module.__file__).parent.glob("*.py")]
+    assert len(sources) > 20 and not any("fastmath" in source for source in sources)
