@@ -12,16 +12,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .arrays import Floats, Indices, Ints, Ints32
+from .caster import RayCaster
 from .rays import Rays
 from .scan import Scan
-
-if TYPE_CHECKING:
-    from .caster import RayCaster
 
 _CHUNK = 1 << 15  # rays at a time
 _PAIRS = 1 << 11  # of cells and bodies at a time
