@@ -45,9 +45,9 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
     rig = Rig(scene, Survey(SENSOR, poses=[(0, 0, 0)], steps=1, returns=returns), "numpy")
     beams = rig._echoes[0].divided(rig.pattern(0, 0, 1))
     assert beams is not None
-    starts = np.zeros((len(beams), 3)) if beams.origins is None else beams.origins
-    hits = rig._world.caster.cast(starts, beams.directions)
-    ends = starts + hits.distance[:, None] * beams.directions
+    starts, directions = beams.rays(np.arange(len(beams)), (0, 0, 0))
+    hits = rig._world.caster.cast(starts, directions)
+    ends = starts + hits.distance[:, None] * directions
     return np.asarray(ends[:, 1:])
 
 

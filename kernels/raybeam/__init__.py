@@ -11,6 +11,7 @@ from .pattern import Pattern
 from .poses import Motion
 from .registry import available_backends, backend_build
 from .scan import Scan, check_scan
+from .sub_rays import SubRays, any_axes
 
 __all__ = [
     "BackendUnavailable",
@@ -28,6 +29,8 @@ __all__ = [
     "RayCaster",
     "Scan",
     "ScanReturns",
+    "SubRays",
+    "any_axes",
     "available_backends",
     "backend_build",
     "check_scan",

@@ -88,15 +88,11 @@ class Backend(ABC):
         """Closest hits of rays, without weights, misses left out, in ray order."""
         parts: list[Part] = []
         for start in range(0, len(rays), self.chunk):
-            ray, t, triangle, instance = self.found(rays.part(start, start + self.chunk))
-            distance = t / self._scene.frame.scale
-            parts.append((ray.astype(np.uint32) + np.uint32(start), distance, triangle, instance))
+            found = self.closest(rays.part(start, start + self.chunk))
+            ray = found.ray.astype(np.uint32) + np.uint32(start)
+            distance = found.t / self._scene.frame.scale
+            parts.append((ray, distance, found.triangle, found.instance))
         return joined(parts)
-
-    def found(self, rays: Rays) -> tuple[Integers, Floats, Ints32, Ints32]:
-        """As `closest`, without weights: numbers, distances, triangles, instances."""
-        found = self.closest(rays)
-        return found.ray, found.t, found.triangle, found.instance
 
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""

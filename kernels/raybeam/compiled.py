@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 try:
     from numba import njit
+    from numba.core.ccallback import CFunc
 except ImportError:
     njit = None
 
@@ -20,18 +22,60 @@ def _keeps() -> bool:
     return True
 
 
-# Compiled when a module is imported, or loaded from numba's cache.
-OPTIONS: dict[str, Any] = {"cache": _keeps(), "error_model": "numpy"}
+_KEEPS = _keeps()
 
 
-def compiled(*signature: str) -> Callable[[Any], Any]:
+def _stamp() -> tuple[int, ...]:
+    """Return what changes with any file beside this one: numba looks only at a loop's own."""
+    found = sorted(Path(__file__).parent.glob("*.py"))
+    return tuple(number for f in found for number in (f.stat().st_mtime_ns, f.stat().st_size))
+
+
+def _kept(made: Any) -> Any:
+    """Let compiled code be loaded if this very version of the package had compiled it."""
+    if _KEEPS:
+        made.enable_caching()
+        made._cache._cache_file._source_stamp = _STAMP
+    return made
+
+
+_STAMP = _stamp()
+
+
+def compiled(*signature: Any) -> Callable[[Any], Any]:
     """Compile a function of a signature of numba's; without one when it is called first."""
     if njit is None:
         return lambda function: function
-    made: Callable[[Any], Any] = njit(*signature, nogil=True, **OPTIONS)
-    return made
+
+    def make(function: Any) -> Any:
+        made = _kept(njit(nogil=True, error_model="numpy")(function))
+        for one in signature:
+            made.compile(one)
+        return made
+
+    return make
+
+
+def callback(signature: Any) -> Callable[[Any], Any]:
+    """Compile a function that C calls."""
+
+    def make(function: Any) -> Any:
+        kind = signature.args, signature.return_type
+        made = _kept(CFunc(function, kind, {}, {"error_model": "numpy"}))
+        made.compile()
+        return made
+
+    return make
 
 
 def inlined(function: Any) -> Any:
     """Let a function become part of compiled ones."""
     return function if njit is None else njit(forceinline=True, error_model="numpy")(function)
+
+
+def stage(function: Any) -> Any:
+    """Compile a function by itself before others call it: so its loops become vector instructions.
+
+    As a part of a longer function they do not.
+    """
+    return function if njit is None else njit(error_model="numpy")(function)

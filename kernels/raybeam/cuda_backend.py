@@ -131,6 +131,8 @@ class CudaBackend(Backend):
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`."""
+        if scan.pattern.sub_rays is not None:  # which the kernel does not make
+            return super().scan(scan)
         kept: list[Part] = []
         hits, counted = self.visit(scan, lambda found: kept.append(found.get()))
         ray, distance, triangle, instance = joined(kept)

@@ -5,30 +5,45 @@ from __future__ import annotations
 import importlib.util
 import os
 import threading
+import time
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import ClassVar
-from weakref import WeakKeyDictionary
+from typing import ClassVar, NamedTuple
+from weakref import ref
 
 import numpy as np
 
 from . import embree_library
-from .arrays import AnyArray, Floats, Indices, Integers, Ints, Ints32
+from .arrays import AnyArray, Floats
 from .backend import Backend, Found
-from .hits import ScanReturns
+from .hits import Part, ScanReturns, joined
 from .instances import Scene
-from .mesh import NEAR, Frame
-from .pattern import Pattern
+from .mesh import NEAR
 from .poses import Poses
 from .rays import Rays
-from .scan import Scan
-
-_Room = tuple[Floats, Ints32, Ints32]
+from .scan import Collector, Scan
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 # Cosine of 20 degrees. Packets of 16 rays within that are cast four to six times as fast as single
-# rays, wider ones more slowly. Packets are made along a ring (`Pattern.step`): along a firing, they
-# are slower than single rays in fine terrain.
+# rays, wider ones more slowly.
 _COHERENCE = 0.94
+_SHAPES = ((16, 1), (8, 2), (4, 4))  # rays along a ring and across, that go together
+_MOST = 1 << 15  # rays of a block
+_TRIED = 1 << 13  # rays that are cast in each way before the fastest is chosen
+_LIKE = 0.02  # between the cosines of patterns for which the same way is the fastest
+_PLANS = 16  # kept
+
+
+class _Way(NamedTuple):
+    """How rays are grouped, see `embree_packets`."""
+
+    step: int
+    high: int
+    wide: int
+    coherence: float = _COHERENCE
+
+
+_IN_TURN = _Way(1, 16, 1)
 
 
 class EmbreeBackend(Backend):
@@ -60,7 +75,7 @@ class EmbreeBackend(Backend):
         return embree_library.build()
 
     def __init__(self, scene: Scene, threads: int | None = None, device: int | None = None) -> None:
-        from . import embree_kernels
+        from . import embree_exact, embree_memory, embree_packets
 
         super().__init__(scene, threads, device)
         count = threads or os.cpu_count() or 1
@@ -69,229 +84,278 @@ class EmbreeBackend(Backend):
         self._instances = (
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
-        self._tree = self._instances or trees[0]
-        self._width = embree_library.packet_width()
-        self._steps: WeakKeyDictionary[Pattern, dict[int, int]] = WeakKeyDictionary()
-        self._kernels = embree_kernels
+        self._plans: dict[tuple[int, int], _Plan] = {}
+        self._loops, self._memory = embree_packets, embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
-        self._meshes = np.zeros((len(scene.meshes), embree_kernels.MESH_RECORD), np.int64)
+        self._meshes = np.zeros(len(scene.meshes), embree_memory.MESH)
         for record, mesh, corners in zip(self._meshes, scene.meshes, self._corners, strict=True):
-            record[0] = corners.ctypes.data
+            record["corners"] = corners.ctypes.data
             if (opacity := mesh.opacity) is not None:
-                tables = opacity.uv.ctypes.data, opacity.mask.ctypes.data
-                record[1:] = *tables, *opacity.mask.shape
-        self._masked = any(mesh.opacity is not None for mesh in scene.meshes)
-        proposers = [embree_kernels.propose] * 2
-        if not (scene.nested or self._masked):
-            proposers = [embree_kernels.plain_proposer(n) for n in (self._width, 1)]
-        called = (*proposers, embree_kernels.decide, embree_kernels.nearby)
-        filters = [function.address for function in called]
-        self._filters = np.array(filters, np.int64)
+                record["uv"], record["mask"] = opacity.uv.ctypes.data, opacity.mask.ctypes.data
+                record["high"], record["wide"] = opacity.mask.shape
         self._index = np.concatenate([mesh.index for mesh in scene.meshes])
+        masked = any(mesh.opacity is not None for mesh in scene.meshes)
+        width = embree_library.packet_width()
+        packets = [embree_exact.propose] * min(16 // width, 4)  # none, for packets of 1
+        single = embree_exact.propose
+        if not (scene.nested or masked):
+            packets = [embree_exact.plain_proposer(width, k) for k in range(len(packets))]
+            single = embree_exact.plain_proposer(1)
+        cast = np.zeros(1, embree_memory.CAST)
+        cast["scene"] = (self._instances or trees[0]).address
+        cast["mesh"], cast["masked"] = self._meshes.ctypes.data, masked
+        cast["packets"][0, : len(packets)] = [one.address for one in packets]
+        cast["single"], cast["decide"] = single.address, embree_exact.decide.address
+        cast["nearby"], cast["width"] = embree_exact.nearby.address, width
+        cast["coherence"], cast["index"] = _COHERENCE, self._index.ctypes.data
+        self._trees, self._base = trees, cast  # which keep what has an address
         self.place(scene)
 
     def place(self, scene: Scene) -> None:
         """See `Backend.place`."""
         super().place(scene)
-        self._frame = scene.frame.table
-        self._records_at = 0
+        frame, base = scene.frame, self._base
+        base["centre"], base["scale"], base["low"] = frame.centre, frame.scale, frame.low
+        base["upper"] = frame.high
         if self._instances is not None:
             self._instances.place(scene)
             first = np.cumsum([0, *(len(corners) for corners in self._corners[:-1])])
-            self._records = np.empty((len(scene.mesh), self._kernels.RECORD))
-            self._records[:, :12] = scene.matrices
-            rows = self._meshes.ctypes.data + self._meshes.strides[0] * scene.mesh
-            self._records.view(np.int64)[:, 12] = rows
-            self._records.view(np.int64)[:, 13] = first[scene.mesh]
-            self._records_at = self._records.ctypes.data
+            records = np.zeros(len(scene.mesh), self._memory.INSTANCE)
+            records["matrix"] = scene.matrices
+            records["mesh"] = self._meshes.ctypes.data + self._meshes.itemsize * scene.mesh
+            records["first"] = first[scene.mesh]
+            self._records, self._base["instances"] = records, records.ctypes.data
 
     def closest(self, rays: Rays) -> Found:
         """See `Backend.closest`."""
-        ray, t, place, instance = self._hits(rays)
+        cast = self._of_rays(rays)
+        cast.record["index"] = 0
+        ray, distance, place, instance = self._cast(cast, 0, len(rays))
         u, v = np.empty((2, len(ray)))
         origins = self._scene.frame.to_local(rays.origins)
         if len(origins) > 1:
             origins = np.ascontiguousarray(origins[ray])
         directions = np.ascontiguousarray(rays.directions[ray])
-        self._kernels.weigh(
-            self._meshes.ctypes.data, self._records_at, origins, directions, place, instance, u, v
-        )
+        self._loops.weigh(cast.record, origins, directions, place, instance, u, v)
+        t = distance * self._scene.frame.scale  # a power of two
         return Found(ray, t, self._index[place], u, v, instance)
 
-    def found(self, rays: Rays) -> tuple[Integers, Floats, Ints32, Ints32]:
-        """See `Backend.found`."""
-        ray, t, place, instance = self._hits(rays)
-        return ray, t, self._index[place], instance
-
-    def _hits(self, rays: Rays) -> tuple[Indices, Floats, Ints32, Ints32]:
-        """Rays that hit, local distances, places in `index`, and instances."""
-        each = len(rays) if len(rays.origins) == 1 else 1
-        source = _Source(
-            rays.directions.T, None, Poses(rays.origins, None, each), self._scene.frame
-        )
-        limits = (rays.t_min, rays.t_max)
-        t, place, instance = self._cast(source, 0, (0, len(rays)), limits, 1, self._room(len(rays)))
-        ray = np.flatnonzero(place >= 0)
-        instance = instance[ray] if self._scene.nested else np.zeros(len(ray), np.int32)
-        return ray, t[ray], place[ray], instance
+    def nearest(self, rays: Rays) -> Part:
+        """See `Backend.nearest`."""
+        return self._cast(self._of_rays(rays.part(0, len(rays))), 0, len(rays))
 
     def scan(self, scan: Scan) -> ScanReturns:
         """See `Backend.scan`."""
-        pattern, frame = scan.pattern, self._scene.frame
-        origins = None if pattern.origins is None else pattern.origins.T
-        source = _Source(pattern.directions.T, origins, scan.poses, frame)
-        step, limits = self._step(scan), (scan.t_min, scan.t_max)
-        room = self._room(min(len(scan), self.chunk))
-        groups = np.array(scan.groups)
-        hits = np.zeros(len(groups), np.int64)
-        tally = np.zeros(len(self._index) if scan.tally else 0, np.int64)
-        # Pages of what is not written take no memory.
-        ray, metres = np.empty(len(scan), np.uint32), np.empty(len(scan))
-        triangle, instance = np.empty(len(scan), np.int32), np.zeros(len(scan), np.int32)
-        kept = 0
+        collector = Collector(scan, self._scene.face_count)
+        cast, plan = self._of_scan(scan), self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
-            t, place, chosen = self._cast(source, scan.first, (start, stop), limits, step, room)
-            kept += self._kernels.gather(
-                t,
-                place,
-                chosen,
-                self._index,
-                start,
-                1 / frame.scale,
-                groups,
-                int(np.searchsorted(groups, start, side="right")) - 1,
-                scan.keep_every,
-                hits,
-                tally,
-                ray[kept:],
-                metres[kept:],
-                triangle[kept:],
-                instance[kept:],
-            )
-        found = ray[:kept], metres[:kept], triangle[:kept]
-        counts = self._by_face(tally) if scan.tally else None
-        return ScanReturns(*found, hits, counts, instance[:kept])
+            for begin, end, way in plan.pieces(start, stop):
+                since = time.thread_time()
+                ray, distance, triangle, instance = self._cast(cast, begin, end, way)
+                plan.took(way, end - begin, time.thread_time() - since)
+                collector.tally(self._scene.tally_rows(instance, triangle))
+                kept = collector.keep(ray, begin, end)
+                collector.add(begin, ray[kept], distance[kept], triangle[kept], instance[kept])
+        return collector.result()
 
-    def _by_face(self, tally: Ints) -> Ints:
-        """Count hits of all faces, from those of triangles that have an area."""
-        counts, start = np.zeros(self._scene.face_count, np.int64), 0
-        for mesh, first in zip(self._scene.meshes, self._scene.first_face, strict=False):
-            stop = start + len(mesh.index)
-            counts[first + mesh.index] = tally[start:stop]
-            start = stop
-        return counts
+    def _of_rays(self, rays: Rays) -> _Cast:
+        """Prepare to cast rays that are not of a pattern."""
+        one = len(rays.origins) == 1
+        origins, at = (None, rays.origins) if one else (rays.origins, np.zeros((1, 3)))
+        poses = Poses(at, None, max(len(rays), 1))
+        return self._made(rays.directions, origins, poses, 0, (rays.t_min, rays.t_max))
 
-    def _room(self, rays: int) -> _Room:
-        """Arrays for distances, places, and instances if there are any."""
-        instances = np.empty(rays if self._scene.nested else 0, np.int32)
-        return np.empty(rays), np.empty(rays, np.int32), instances
+    def _of_scan(self, scan: Scan) -> _Cast:
+        """Prepare to cast a scan."""
+        pattern, limits = scan.pattern, (scan.t_min, scan.t_max)
+        cast = self._made(pattern.directions, pattern.origins, scan.poses, scan.first, limits)
+        sub_rays = pattern.sub_rays
+        if sub_rays is not None:
+            record = cast.record
+            table = np.zeros((5, len(sub_rays)))
+            table[:3] = sub_rays.shares()
+            if pattern.offsets is not None:  # shares differ by beam
+                table[1:3] = sub_rays.angles.T
+            if sub_rays.starts is not None:
+                table[3:] = sub_rays.starts.T
+            record["subrays"], record["shares"] = len(sub_rays), cast.keep(table)
+            record["begins"] = sub_rays.starts is not None
+            record["offsets"] = cast.keep(pattern.offsets)
+            if sub_rays.axis is not None:
+                record["about"], record["axis"] = 1, sub_rays.axis
+            if sub_rays.starts is not None:
+                record["still"] = 0
+                record["near"] &= (
+                    float(np.abs(sub_rays.starts).max()) * self._scene.frame.scale < 0.5
+                )
+        return cast
 
-    def _step(self, scan: Scan) -> int:
-        """How far apart the rays of a packet are; found once for a pattern with one or many poses.
-
-        It is that for which they differ least; 1 for rays that have nothing in common.
-        """
-        each = scan.poses.rays if len(scan.poses) > 1 else 0
-        steps = self._steps.setdefault(scan.pattern, {})
-        if each not in steps:
-            spreads = {
-                step: self._spread(scan, step) for step in {1, scan.pattern.step, each} - {0}
-            }
-            best = max(spreads, key=lambda step: spreads[step])
-            steps[each] = best if spreads[best] > _COHERENCE else 1
-        return steps[each]
-
-    def _spread(self, scan: Scan, step: int) -> float:
-        """Mean over some packets of the least cosine between their first ray and some others."""
-        lags = step * np.array([0, self._width // 4, self._width // 2, self._width - 1])
-        room = len(scan) - int(lags[-1])
-        if room <= 0:
-            return -1.0
-        ray = np.linspace(0, room - 1, 32).astype(np.int64)[:, None] + lags
-        _, directions = scan.pattern.made(scan.first, ray.reshape(-1), scan.poses)
-        packets = directions.reshape(-1, len(lags), 3)
-        return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())
-
-    def _cast(
+    def _made(
         self,
-        source: _Source,
+        directions: Floats,
+        origins: Floats | None,
+        poses: Poses,
         first: int,
-        rays: tuple[int, int],
         limits: tuple[float, float],
-        step: int,
-        room: _Room,
-    ) -> _Room:
-        """Local distances (n,), inf for a miss; places in `index` (n,), -1; instances, if any."""
-        start, stop = rays
-        scale = self._scene.frame.scale
-        n = stop - start
-        t, place, instance = room[0][:n], room[1][:n], room[2][:n]
-
-        def part(begin: int) -> None:
-            end = min(begin + share, stop)
-            self._kernels.trace(
-                self._tree.address,
-                _scratch(self._kernels.SIZE),
-                self._meshes.ctypes.data,
-                self._records_at,
-                self._masked,
-                self._filters,
-                source.addresses,
-                self._frame,
-                source.near,
-                source.still,
-                first,
-                begin,
-                end,
-                source.each,
-                step,
-                self._width,
-                _COHERENCE,
-                limits[0] * scale,
-                limits[1] * scale,
-                t[begin - start : end - start],
-                place[begin - start : end - start],
-                instance[begin - start : end - start],
-            )
-
-        span = step * self._width
-        share = max(_SHARE // span, 1) * span
-        if self._threads is None or stop - start <= share:
-            share = stop - start
-            part(start)
-        else:
-            list(self._threads.map(part, range(start, stop, share)))
-        return t, place, instance
-
-
-class _Source:
-    """Arrays from which rays are made, and their addresses for compiled code; see `trace`."""
-
-    def __init__(
-        self, directions: Floats, origins: Floats | None, poses: Poses, frame: Frame
-    ) -> None:
-        motion, self.each = poses.motion, poses.rays
-        tables = [directions, origins, poses.positions, poses.rotations]
-        tables += [None] * 3 if motion is None else [motion.delays, motion.velocities, motion.rates]
-        self._kept = [None if a is None else np.ascontiguousarray(a, np.float64) for a in tables]
-        places = [0 if a is None else a.ctypes.data for a in self._kept]
-        self.addresses = np.array([*places, directions.shape[1]], np.int64)
+    ) -> _Cast:
+        cast, motion, frame = _Cast(self._base), poses.motion, self._scene.frame
+        record = cast.record
+        record["directions"] = cast.keep(directions.T)
+        record["origins"] = cast.keep(None if origins is None else origins.T)
+        record["positions"] = cast.keep(poses.positions.T)
+        turns = poses.rotations
+        record["rotations"] = cast.keep(None if turns is None else np.moveaxis(turns, 0, -1))
         reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
         if origins is not None:
             reach += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
         if motion is not None:
+            record["delays"] = cast.keep(motion.delays)
+            record["velocities"] = cast.keep(motion.velocities.T)
+            record["rates"] = cast.keep(motion.rates.T)
             way = np.abs(motion.delays).max(initial=0) * np.abs(motion.velocities).max(initial=0)
             reach += 2 * float(way) * frame.scale
-        self.near = reach < NEAR
-        self.still = len(poses) == 1 and origins is None and motion is None
+        record["rows"], record["poses"], record["each"] = len(directions), len(poses), poses.rays
+        record["first"], record["subrays"] = first, 1
+        record["still"] = len(poses) == 1 and origins is None and motion is None
+        record["near"] = reach < NEAR
+        record["t_min"], record["t_max"] = (limit * frame.scale for limit in limits)
+        return cast
+
+    def _plan(self, scan: Scan) -> _Plan:
+        """Ways to group the rays of a scan: those that were the fastest for others like it."""
+        each = scan.poses.rays if len(scan.poses) > 1 else 0
+        plan = self._plans.get((len(scan.pattern), each))
+        if plan is None or not plan.fits(scan):
+            if len(self._plans) >= _PLANS:
+                self._plans.clear()
+            plan = self._plans[len(scan.pattern), each] = _Plan(scan, each)
+        return plan
+
+    def _cast(self, cast: _Cast, start: int, stop: int, way: _Way = _IN_TURN) -> Part:
+        """Hits of rays `start` to `stop`, in their order, numbered from `start`."""
+        n = stop - start
+        ray, distance, triangle = np.empty(n, np.uint32), np.empty(n), np.empty(n, np.int32)
+        instance = (np.empty if self._scene.nested else np.zeros)(n, np.int32)
+
+        def part(begin: int) -> Part:
+            own, at = cast.record.copy(), begin - start
+            own["step"], own["high"], own["wide"] = way.step, way.high, way.wide
+            own["coherence"], own["before"] = way.coherence, start
+            own["scratch"], own["room"] = _own.memory(way.step * way.high)
+            own["ray"], own["distance"] = _address(ray[at:]), _address(distance[at:])
+            own["triangle"], own["instance"] = _address(triangle[at:]), _address(instance[at:])
+            count = self._loops.trace(own, begin, min(begin + share, stop))
+            here = slice(at, at + count)
+            return ray[here], distance[here], triangle[here], instance[here]
+
+        span = way.step * way.high
+        share = max(_SHARE // span, 1) * span
+        if self._threads is None or n <= share:
+            share = n
+            return part(start)
+        return joined(list(self._threads.map(part, range(start, stop, share))))
 
 
-_own = threading.local()  # threads of one worker may cast at the same time
+class _Plan:
+    """Ways to group the rays of a pattern, of which the fastest is found while they are cast.
+
+    Rays of a group are those of a ring that differ least, or some of a ring and their neighbours,
+    or each is cast by itself: what is fastest depends on the scene. No way changes a result.
+    """
+
+    def __init__(self, scan: Scan, each: int) -> None:
+        self._pattern = ref(scan.pattern)
+        many = scan.pattern.each
+        steps = {1, scan.pattern.step * many, each} - {0}
+        spreads = {step: _spread(scan, _Way(step, 16, 1)) for step in steps}
+        self._step = max(spreads, key=lambda step: spreads[step])
+        self._spread = spreads[self._step]
+        self.ways = [_IN_TURN]
+        if self._spread > _COHERENCE:
+            ways = {_Way(self._step, high, wide) for high, wide in _SHAPES}
+            ways |= {_IN_TURN} if many > 1 else set()
+            self.ways = [
+                way
+                for way in sorted(ways)
+                if way.step * way.high <= _MOST and _spread(scan, way) > _COHERENCE
+            ] or self.ways
+            self.ways.append(_Way(1, 16, 1, 2.0))
+        self._rays = dict.fromkeys(self.ways, 0)
+        self._seconds = dict.fromkeys(self.ways, 0.0)
+
+    def fits(self, scan: Scan) -> bool:
+        """Whether the rays of a scan are as close together as those for which this was made."""
+        if self._pattern() is scan.pattern:
+            return True
+        return abs(_spread(scan, _Way(self._step, 16, 1)) - self._spread) < _LIKE
+
+    def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, _Way]]:
+        """Parts of rays `start` to `stop`, each with the way to cast it."""
+        while start < stop:
+            way, end = self.ways[0], stop
+            if len(self.ways) > 1:
+                way = min(self.ways, key=lambda way: self._rays[way])
+                end = min(start + max(other.step * other.high for other in self.ways), stop)
+            yield start, end, way
+            start = end
+
+    def took(self, way: _Way, rays: int, seconds: float) -> None:
+        """Note how long a part took."""
+        if len(self.ways) > 1:
+            self._rays[way] += rays
+            self._seconds[way] += seconds
+            if min(self._rays[way] for way in self.ways) >= _TRIED:
+                self.ways = [min(self.ways, key=lambda way: self._seconds[way] / self._rays[way])]
 
 
-def _scratch(size: int) -> int:
-    """Address of scratch memory of this thread, a multiple of 64."""
-    room: AnyArray | None = getattr(_own, "room", None)
-    if room is None:
-        room = _own.room = np.zeros(size + 8, np.int64)
-    return room.ctypes.data + -room.ctypes.data % 64
+def _spread(scan: Scan, way: _Way) -> float:
+    """Mean over some groups of the least cosine between their first ray and some others."""
+    lanes = np.array([0, 5, 10, 15])
+    lags = way.step * (lanes // way.wide) + lanes % way.wide
+    room = len(scan) - int(lags[-1])
+    if room <= 0:
+        return -1.0
+    ray = np.linspace(0, room - 1, 32).astype(np.int64)[:, None] + lags
+    _, directions = scan.pattern.made(scan.first, ray.reshape(-1), scan.poses)
+    packets = directions.reshape(-1, len(lags), 3)
+    return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())
+
+
+def _address(array: AnyArray) -> int:
+    return int(array.ctypes.data)
+
+
+class _Cast:
+    """A `CAST`, and the arrays whose addresses it has."""
+
+    def __init__(self, base: AnyArray) -> None:
+        self.record = base.copy()
+        self._kept: list[AnyArray] = []
+
+    def keep(self, array: AnyArray | None) -> int:
+        """Address of an array, in float64 and contiguous; 0 for none."""
+        if array is None:
+            return 0
+        self._kept.append(np.ascontiguousarray(array, np.float64))
+        return self._kept[-1].ctypes.data
+
+
+class _Own(threading.local):
+    """Memory of a thread, since threads of one worker may cast at the same time."""
+
+    def __init__(self) -> None:
+        self._scratch, self._room = np.zeros(0, np.int64), np.zeros(0)
+
+    def memory(self, rays: int) -> tuple[int, int]:
+        """Addresses of the scratch memory, a multiple of 64, and of room for rays of a block."""
+        from .embree_memory import SCRATCH
+
+        if not len(self._scratch):
+            self._scratch = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64)
+        if len(self._room) < 2 * rays:
+            self._room = np.zeros(2 * rays)
+        address = self._scratch.ctypes.data
+        return address + -address % 64, self._room.ctypes.data
+
+
+_own = _Own()

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 from .arrays import Floats, Ints
 from .poses import Motion, Poses, check_poses
 from .rays import check_origins, unit_directions
+from .sub_rays import SubRays, spread
 
 _MOST_STEP = 1 << 10  # beams of a lidar, by far
 _BLOCK = 1 << 14  # rays that are made at a time: their arrays stay in a core's cache
@@ -28,6 +29,11 @@ class Pattern:
     origins
         (n, 3), metres, in the sensor's axes: start of each ray relative to the sensor's position;
         (3,) for all rays; None if all start at that position.
+    sub_rays
+        Sub-rays of each direction, one after the other: these are the rays, made when they are
+        cast. None for one ray of each direction.
+    offsets
+        (n, 2): angles across and up, radians, that are added to those of the sub-rays of each.
 
     Raises
     ------
@@ -45,35 +51,53 @@ class Pattern:
     [[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [1.0, 0.0, 0.0]]
     """
 
-    def __init__(self, directions: ArrayLike, origins: ArrayLike | None = None) -> None:
+    def __init__(
+        self,
+        directions: ArrayLike,
+        origins: ArrayLike | None = None,
+        sub_rays: SubRays | None = None,
+        offsets: ArrayLike | None = None,
+    ) -> None:
         self._directions = unit_directions(directions).T
         self._directions.flags.writeable = False
         self._origins: Floats | None = None
+        rows = self._directions.shape[1]
         if origins is not None:
-            self._origins = np.empty((3, len(self)))
-            self._origins[...] = check_origins(origins, len(self)).T
+            self._origins = np.empty((3, rows))
+            self._origins[...] = check_origins(origins, rows).T
             self._origins.flags.writeable = False
+        self.sub_rays = sub_rays
+        self.offsets: Floats | None = None  # (2, n)
+        if sub_rays is not None and offsets is not None:
+            self.offsets = np.ascontiguousarray(np.asarray(offsets, np.float64).T)
 
     def __len__(self) -> int:
-        return self._directions.shape[1]
+        return self._directions.shape[1] * self.each
 
     def __repr__(self) -> str:
-        return f"Pattern({len(self)} directions{'' if self._origins is None else ', origins'})"
+        many = "" if self.sub_rays is None else f", {self.each} sub-rays each"
+        beams = self._directions.shape[1]
+        return f"Pattern({beams} directions{'' if self._origins is None else ', origins'}{many})"
+
+    @property
+    def each(self) -> int:
+        """Rays of each direction."""
+        return 1 if self.sub_rays is None else len(self.sub_rays)
 
     @property
     def directions(self) -> Floats:
-        """Unit vectors (n, 3), read-only; transposed, they are contiguous."""
+        """Unit vectors (n, 3), of beams, read-only; transposed, they are contiguous."""
         return self._directions.T
 
     @property
     def origins(self) -> Floats | None:
-        """Starts of the rays (n, 3), metres, read-only and contiguous as `directions`; or None."""
+        """Starts of beams (n, 3), metres, read-only and contiguous as `directions`; or None."""
         return None if self._origins is None else self._origins.T
 
     @cached_property
     def step(self) -> int:
         """Rows from a ray to its neighbour along a ring: the step at which rays differ least."""
-        rows = len(self)
+        rows = self._directions.shape[1]
         steps = np.arange(1, min(rows // 32, _MOST_STEP) + 1)
         if not len(steps):
             return 1
@@ -136,7 +160,9 @@ class Pattern:
         Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
         lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
         """
+        sub_rays = self.sub_rays
         one = len(poses) == 1 and self._origins is None and poses.motion is None
+        one &= sub_rays is None or sub_rays.starts is None
         places, directions = np.empty((2, 3, len(ray)))
         room = np.empty((18, min(len(ray), _BLOCK)))
         for start in range(0, len(ray), _BLOCK):
@@ -144,12 +170,20 @@ class Pattern:
             some = ray[block]
             row, these = first + some, poses.of(some, room[:, : len(some)])
             row -= row // len(self) * len(self)  # takes half as long as the remainder
-            directions[:, block] = these.turned(_columns(self._directions, row))
+            beam = row if sub_rays is None else row // len(sub_rays)
+            ahead, begun = _columns(self._directions, beam), None
+            if sub_rays is not None:
+                own = None if self.offsets is None else self.offsets[:, beam]
+                ahead, begun = spread(sub_rays, ahead, row - beam * len(sub_rays), own)
+            directions[:, block] = these.turned(ahead)
             if one:
                 continue
             at = these.positions
             if self._origins is not None:
-                at = these.turned(_columns(self._origins, row)) + at
+                here = _columns(self._origins, beam)
+                begun = here if begun is None else here + begun
+            if begun is not None:
+                at = these.turned(begun) + at
             places[:, block] = these.moved(at)
         return (poses.positions if one else places.T), directions.T
 

@@ -285,7 +285,6 @@ def test_batches_and_chunks_leave_no_trace(options, path, per_turn, monkeypatch)
     assert len(whole[0]["x"]) > 200
     assert cast_between(rig, survey, [0, 1, 5, 14, 17, 28]) == whole
     monkeypatch.setattr("lidarpool.simulator.echoes.CHUNK_RAYS", 100)
-    monkeypatch.setattr("lidarpool.simulator.echoes.BLOCK_RAYS", 7)
     assert cast_between(rig, survey, list(range(29))) == whole
 
 

@@ -45,9 +45,8 @@ from ..scene.scene import Scene
 from ..scene.simplified import DRAWN_TRIANGLES
 from ..sensor import Sensor, Survey
 from ..sensor.beams import Beams
-from ..simulator.echoes import PATTERN_RAYS
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
-from ..simulator.rig import Rig
+from ..simulator.rig import PATTERN_RAYS, Rig
 from ..simulator.world import check_backend_here
 from .run_command import no_hits
 from .terminal import Terminal
@@ -422,11 +421,9 @@ def _look_at_folder(out: Path | Storage) -> list[str]:
 def _worker_bytes(job: Job) -> int:
     """Memory of a GPU worker, without what it casts."""
     patterns = 0
-    for carried, returns in zip(job.survey.carried, job.survey.returns_each, strict=True):
+    for carried in job.survey.carried:
         sensor = carried.sensor
-        rays = min((sensor.period or 0) * sensor.channels * returns.subrays, PATTERN_RAYS)
-        own_starts = returns.beam(sensor.optics).starts is not None
-        patterns += RAY_BYTES * rays * (1 + own_starts)
+        patterns += RAY_BYTES * min((sensor.period or 0) * sensor.channels, PATTERN_RAYS)
     triangles = (SCENE_BYTES + TRIANGLE_BYTES) * job.scene.kept_triangles
     images = {id(one): one.nbytes for each in job.scene.coloured for one in each.images}
     copies = COPY_BYTES * len(job.scene.instances or ())

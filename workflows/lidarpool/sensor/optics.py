@@ -10,7 +10,6 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from ..base.arrays import Floats
 from ..base.declared import about, allowed
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
@@ -185,58 +184,3 @@ class Returns:
                 "or give a longer pulse_ns."
             )
         return sigma
-
-
-def spread(
-    directions: Floats,
-    across: Floats,
-    up: Floats,
-    axes: tuple[Floats, Floats] | None = None,
-) -> Floats:
-    """Turn unit directions (n, 3) by small angles (n, k) or (1, k), radians: (n, k, 3), unit.
-
-    By default, the two axes across a ray are those of `any_axes`.
-    """
-    one, other = any_axes(directions) if axes is None else axes
-    straight = 1 / np.sqrt(1 + across**2 + up**2)
-    across, up = across * straight, up * straight
-    out = np.empty((3, len(directions), across.shape[1]))
-    for axis in range(3):
-        ahead, first, second = (v[:, axis, None] for v in (directions, one, other))
-        out[axis] = (straight * ahead + across * first) + up * second
-    return out.transpose(1, 2, 0)
-
-
-def any_axes(directions: Floats) -> tuple[Floats, Floats]:
-    """Two axes across unit directions (n, 3): those of Duff et al. 2017, which always exist."""
-    x, y, z = directions.T
-    sign = np.where(z < 0, -1.0, 1.0)
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    one = np.stack([1 + sign * x * x * a, sign * b, -sign * x], axis=1)
-    other = np.stack([b, sign + y * y * a, -y], axis=1)
-    return one, other
-
-
-def axes_about(directions: Floats, axis: Floats) -> tuple[Floats, Floats]:
-    """Axes across unit directions (n, 3): counter-clockwise about an axis (3,), and towards it.
-
-    Straight along the axis, they are those of `any_axes`.
-    """
-    x, y, z = directions.T
-    a, b, c = axis
-    across = np.stack([b * z - c * y, c * x - a * z, a * y - b * x])
-    length = np.sqrt((across[0] ** 2 + across[1] ** 2) + across[2] ** 2)
-    one = (across / np.maximum(length, 1e-300)).T
-    other = np.stack(
-        [
-            y * one[:, 2] - z * one[:, 1],
-            z * one[:, 0] - x * one[:, 2],
-            x * one[:, 1] - y * one[:, 0],
-        ],
-        axis=1,
-    )
-    along = length < 1e-6
-    if along.any():
-        one[along], other[along] = any_axes(directions[along])
-    return one, other

@@ -9,14 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from raybeam import Pattern, ScanReturns
+from raybeam import Pattern, ScanReturns, SubRays
 
 from ..base.arrays import Bools, Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..scene.scene import Scene
 from ..sensor import Returns, Sensor, Survey
-from ..sensor.disc import Beam
 from ..sensor.noise import THRESHOLD_SIGMAS
-from ..sensor.optics import Mode, any_axes, axes_about, spread
+from ..sensor.optics import Mode
 from .air import AirCaster
 from .doppler import radial_velocities
 from .hits import NO_SURFACE, Hits, Keys, joined, numbers, runs
@@ -28,9 +27,7 @@ from .surfaces import Surfaces
 from .waveform import Digitizer, recorded, returns_in
 from .world import World
 
-PATTERN_RAYS = 20_000_000  # sub-rays of a head's period that are kept; 24 bytes each
 CHUNK_RAYS = 1 << 18  # sub-rays that are cast at a time
-BLOCK_RAYS = 1 << 14  # rays whose sub-rays are made at a time, to fit a cache
 
 
 @dataclass(frozen=True)
@@ -83,17 +80,15 @@ class EchoCaster:
         self._receiver = Receiver(number, survey, caster, scene, surfaces, self._paths)
 
     def divided(self, pattern: Pattern, *, by_head: bool = False) -> Pattern | None:
-        """Make the sub-rays of a repeated pattern, if they are few and always the same.
+        """Give a repeated pattern its sub-rays, if they are always the same.
 
         `by_head` says that it is in the axes of the head.
         """
-        subrays = len(self._beam)
-        if len(pattern) * subrays > PATTERN_RAYS or self._noise.angle_deg:
+        if self._noise.angle_deg:
             return None
-        if subrays == 1:
+        if len(self._beam) == 1:
             return pattern
-        keys = Keys(0, np.zeros(1, int))
-        return self._beams(self._beam, pattern, 0, keys, (0, len(pattern)), by_head)
+        return Pattern(pattern.directions, pattern.origins, self._sub_rays(by_head=by_head))
 
     def scan(
         self,
@@ -115,7 +110,7 @@ class EchoCaster:
         keys = Keys(scan, groups)
         if self._one_each:
             if noise.angle_deg:
-                beams = self._beams(self._beam, pattern, first, keys, (0, rays))
+                beams = self._beams(pattern, first, keys, (0, rays))
                 pattern, first = beams, 0
             found = self._once(pattern, poses, (first, first + rays), groups, tally)
         else:
@@ -129,8 +124,7 @@ class EchoCaster:
                 stop = min(start + size, rays)
                 row = (first + start) * len(beam)
                 if divided is None:
-                    some = start, stop
-                    beams, row = self._beams(beam, pattern, first, keys, some, poses.by_head), 0
+                    beams, row = self._beams(pattern, first, keys, (start, stop), poses.by_head), 0
                 else:
                     beams = divided
                 window = (row, row + (stop - start) * len(beam))
@@ -162,38 +156,26 @@ class EchoCaster:
 
     def _beams(
         self,
-        beam: Beam,
         pattern: Pattern,
         first: int,
         keys: Keys,
         which: tuple[int, int],
         by_head: bool = False,
     ) -> Pattern:
-        """Make the sub-rays of some rays, from one to another, with noise of angles, ray by ray."""
+        """Give some rays, from one to another, sub-rays with noise of angles, ray by ray."""
         rays = np.arange(*which)
         rows = (first + rays) % len(pattern)
-        directions = np.empty((len(rays), len(beam), 3))
-        origins = pattern.origins
-        if origins is not None:
-            origins = np.repeat(origins[rows], len(beam), axis=0)
-        elif beam.starts is not None:
-            origins = np.zeros((len(rays) * len(beam), 3))
+        origins = None if pattern.origins is None else pattern.origins[rows]
+        offsets = None
+        if self._noise.angle_deg:
+            offsets = np.stack(self._noise.angles(*keys.of(rays)), axis=1)
+        return Pattern(pattern.directions[rows], origins, self._sub_rays(by_head=by_head), offsets)
+
+    def _sub_rays(self, *, by_head: bool) -> SubRays:
+        """Return the sub-rays of beams whose directions are in the axes of the head or carrier."""
+        beam = self._beam
         axis = np.array([0.0, 0, 1]) if by_head else self._axis
-        for begin in range(0, len(rays), BLOCK_RAYS):
-            block = slice(begin, begin + BLOCK_RAYS)
-            across, up = beam.angles.T[:, None]
-            if self._noise.angle_deg:
-                off_across, off_up = self._noise.angles(*keys.of(rays[block]))
-                across, up = across + off_across[:, None], up + off_up[:, None]
-            ahead, axes = pattern.directions[rows[block]], None
-            if beam.oval or beam.starts is not None:
-                axes = axes_about(ahead, axis) if beam.oval else any_axes(ahead)
-            directions[block] = spread(ahead, across, up, axes)
-            if beam.starts is not None and axes is not None and origins is not None:
-                one, other = axes
-                here = origins.reshape(directions.shape)[block]  # a view
-                here += beam.starts[:, :1] * one[:, None] + beam.starts[:, 1:] * other[:, None]
-        return Pattern(directions.reshape(-1, 3), origins)
+        return SubRays(beam.angles, beam.starts, axis if beam.oval else None)
 
     def _once(
         self,

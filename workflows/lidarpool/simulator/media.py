@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from raybeam import Pattern
+from raybeam import Pattern, any_axes
 
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
 from ..base.errors import LidarpoolError
@@ -22,7 +22,6 @@ from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.noise import Purpose
-from ..sensor.optics import any_axes
 from .hits import selected
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces
@@ -101,7 +100,7 @@ class Bundle:
     @classmethod
     def of(cls, directions: Floats, index: Floats) -> Bundle:
         """Make those of light that begins."""
-        ways = np.stack(any_axes(directions), axis=1)
+        ways = np.stack([axis.T for axis in any_axes(directions.T)], axis=1)
         none = np.zeros(len(ways))
         return cls(index.copy(), index, none, np.zeros_like(ways), ways)
 

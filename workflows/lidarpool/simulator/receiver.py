@@ -8,14 +8,14 @@ from functools import cached_property
 
 import numpy as np
 
-from raybeam import Pattern
+from raybeam import Pattern, any_axes
 
 from ..base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
 from ..sensor import Survey
 from ..sensor.noise import Purpose
-from ..sensor.optics import LIGHT_M_NS, any_axes
+from ..sensor.optics import LIGHT_M_NS
 from .crosstalk import Crosstalk
 from .hits import BLOOMING, CROSSTALK, FALSE_ALARM, NO_SURFACE, Hits, Keys, joined, numbers
 from .motion import Poses, into_axes, products
@@ -199,7 +199,7 @@ class Receiver:
 
         The light comes from the point of the triangles that is nearest to the ray by angle.
         """
-        across, up = any_axes(ahead)
+        across, up = (axis.T for axis in any_axes(ahead.T))
         best, ends = np.zeros(len(starts)), np.zeros((len(starts), 3))
         nearest = _first_few(retro, starts, ahead)
         for which in nearest.T:

@@ -17,13 +17,14 @@ from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
 from .device import DeviceColumns, DeviceReturns
-from .echoes import PATTERN_RAYS, EchoCaster
+from .echoes import EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
 from .returns import BatchReturns
 from .surfaces import Surfaces
 from .ways import Ways
 from .world import World
 
+PATTERN_RAYS = 20_000_000  # rays of a head's period that are kept; 24 bytes each
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
 KEPT = 8  # turns whose rays are kept for the next images
 

@@ -1,0 +1,152 @@
+"""What the compiled loops around Embree read and write: one cast, and a thread's scratch memory."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numba
+import numpy as np
+from numba import types
+from numba.extending import intrinsic
+
+LANES = 16  # rays that go together; Embree takes them at once, or in two or four packets
+
+# One cast: addresses of what the loops read, and numbers. Addresses are 0 for what there is not.
+CAST = np.dtype(
+    [
+        ("scene", "i8"),  # the RTCScene
+        ("scratch", "i8"),  # `SCRATCH`, at a multiple of 64
+        ("mesh", "i8"),  # `MESH` of a plain scene
+        ("instances", "i8"),  # `INSTANCE` of each; 0 in a plain scene
+        ("masked", "i8"),  # whether any mesh has an opacity
+        ("packets", "i8", 4),  # filters for the packets of a group
+        ("single", "i8"),  # filter for single rays
+        ("decide", "i8"),
+        ("nearby", "i8"),
+        ("directions", "i8"),  # float64 (3, rows), unit vectors
+        ("origins", "i8"),  # float64 (3, rows), metres
+        ("positions", "i8"),  # float64 (3, poses)
+        ("rotations", "i8"),  # float64 (9, poses)
+        ("delays", "i8"),  # float64 (each,)
+        ("velocities", "i8"),  # float64 (3, poses)
+        ("rates", "i8"),  # float64 (3, poses)
+        ("rows", "i8"),
+        ("poses", "i8"),
+        ("each", "i8"),  # rays of a pose
+        ("first", "i8"),  # row of ray 0, counted in sub-rays
+        ("subrays", "i8"),  # of each row
+        ("shares", "i8"),  # float64 (5, subrays): ahead, across, up, and starts
+        ("offsets", "i8"),  # float64 (2, rows): angles, added to those in `shares`
+        ("about", "i8"),  # whether across and up are those about `axis`
+        ("begins", "i8"),  # whether sub-rays have starts of their own
+        ("axis", "f8", 3),
+        ("centre", "f8", 3),  # these four of the `Frame`
+        ("scale", "f8"),
+        ("low", "f8", 3),
+        ("upper", "f8", 3),
+        ("near", "i8"),  # whether all rays start near the scene's box
+        ("still", "i8"),  # whether all rays start at the position of one pose
+        ("step", "i8"),  # rays to the next one of a ring
+        ("high", "i8"),  # so many of a ring are in a group
+        ("wide", "i8"),  # and so many neighbours of each
+        ("width", "i8"),  # rays that Embree takes at once, 1 for no packets
+        ("coherence", "f8"),  # a group with a smaller cosine between two rays is cast ray by ray
+        ("t_min", "f8"),  # local
+        ("t_max", "f8"),
+        ("index", "i8"),  # int32: the caller's triangle of each place; if 0, places are written
+        ("room", "i8"),  # float64, then twice int32: for the rays of a block
+        ("before", "i8"),  # the ray whose number is written as 0
+        ("ray", "i8"),  # what is written, of hits: uint32
+        ("distance", "i8"),  # float64, metres
+        ("triangle", "i8"),  # int32
+        ("instance", "i8"),  # int32
+    ]
+)  # fmt: skip
+
+# Of a mesh: addresses of its corners, and of the uv and the mask of its opacity; the mask's height,
+# 0 if the mesh is opaque, and width.
+MESH = np.dtype([("corners", "i8"), ("uv", "i8"), ("mask", "i8"), ("high", "i8"), ("wide", "i8")])
+INSTANCE = np.dtype(
+    [
+        ("matrix", "f8", 12),  # to the mesh's coordinates
+        ("mesh", "i8"),  # address of the `MESH`
+        ("first", "i8"),  # the mesh's first place in `index`
+    ]
+)
+
+SCRATCH = np.dtype(
+    [
+        ("context", "i8", 8),  # RTCRayQueryContext: Embree hands its address to the filters
+        ("mesh", "i8"),
+        ("instances", "i8"),
+        ("masked", "i8"),
+        ("t_min", "f8"),
+        ("t_max", "f8"),
+        ("lane", "i8"),  # first ray of a packet, or the single one
+        ("scene", "i8"),
+        ("nearby", "i8"),
+        ("arguments", "i8", 8),  # RTCIntersectArguments
+        ("valid", "i4", LANES),
+        ("single", "f4", 32),  # RTCRayHit
+        ("packet", "f4", 22 * LANES),  # RTCRayHit16, two RTCRayHit8 or four RTCRayHit4
+        ("query", "f4", 8),  # RTCPointQuery, and its context: zeros
+        ("query_context", "i8", 28),
+        ("tile", "i8", LANES),  # rays of a group, counted from its first
+        ("ray", "i8", LANES),  # the same, counted from the first of the block
+        ("real", "i8", LANES),  # whether there is one; if not, it is a copy
+        ("ox", "f8", LANES), ("oy", "f8", LANES), ("oz", "f8", LANES),  # local
+        ("dx", "f8", LANES), ("dy", "f8", LANES), ("dz", "f8", LANES),
+        ("entry", "f8", LANES),  # distance of the start that Embree sees from the origin
+        # The longest axis of the direction, the origin with that axis last, and the shear, see
+        # triangle.py; then the instance in whose coordinates they are, -1 for none yet, and the
+        # length of the direction there.
+        ("axis", "i8", LANES),
+        ("u", "f8", LANES), ("v", "f8", LANES), ("w", "f8", LANES),
+        ("sx", "f8", LANES), ("sy", "f8", LANES), ("sz", "f8", LANES),
+        ("inside", "i8", LANES), ("length", "f8", LANES),
+        # What filters have found: the least distance in float32, its triangle, and another that is
+        # as near; -1 for none, -2 for several. The same in 32 bits for plain scenes.
+        ("rough", "f8", LANES), ("one", "i8", LANES), ("other", "i8", LANES),
+        ("rough_32", "f4", LANES), ("one_32", "i4", LANES), ("other_32", "i4", LANES),
+        # The closest triangle that the ray hits, by key: row of the mesh's corners, and `NUMBER`
+        # times the instance's number. Of equally close ones that of the lowest key.
+        ("t", "f8", LANES), ("key", "i8", LANES), ("sure", "i8", LANES),
+        ("corners", "f8", 9 * LANES),  # of a triangle of each ray
+        ("row", "i8", LANES), ("pose", "i8", LANES), ("within", "i8", LANES),
+        ("straight", "f8", LANES), ("across", "f8", LANES), ("up", "f8", LANES),
+        ("aside", "f8", LANES), ("above", "f8", LANES),  # starts of sub-rays
+    ]
+)  # fmt: skip
+
+NUMBER = np.int64(1) << 32  # of keys
+
+
+def offset(name: str) -> int:
+    """Where a field of the scratch memory begins, in bytes."""
+    return int(SCRATCH.fields[name][1])  # type: ignore[index]
+
+
+def at(name: str) -> int:
+    """Where a field of the scratch memory begins, in units of its own numbers."""
+    field = SCRATCH[name]
+    return offset(name) // (field.subdtype[0] if field.subdtype else field).itemsize
+
+
+def pointer(kind: Any) -> Any:
+    """Make a function of compiled code that takes an address for a pointer to numbers."""
+
+    @intrinsic
+    def read(context: Any, address: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            return builder.inttoptr(arguments[0], context.get_value_type(signature.return_type))
+
+        return types.CPointer(kind)(types.int64), generate
+
+    return read
+
+
+int32s, int64s = pointer(types.int32), pointer(types.int64)
+float32s, float64s = pointer(types.float32), pointer(types.float64)
+uint8s, uint32s = pointer(types.uint8), pointer(types.uint32)
+
+CASTS = types.Array(numba.from_dtype(CAST), 1, "C")  # of one cast

@@ -1,0 +1,356 @@
+"""The loop that casts a scan: groups of 16 neighbouring rays in Embree's packets, hits in order.
+
+A block is some neighbours along a ring (`high`, each `step` rays on from the last) times all rays
+between them; a group has `high` times `wide` of its rays. When a block is done, its hits are
+written in the order of rays.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import types
+
+from . import embree_memory as memory
+from .compiled import compiled, inlined, stage
+from .embree_exact import (
+    CALL_FILTER,
+    COHERENT,
+    FAR,
+    MARGIN,
+    along,
+    areas,
+    begun,
+    corners_of,
+    decided,
+    entered,
+    shear,
+    shear_all,
+    single,
+    verify,
+    verify_all,
+)
+from .embree_memory import (
+    CASTS,
+    LANES,
+    NUMBER,
+    at,
+    float32s,
+    float64s,
+    int32s,
+    int64s,
+    offset,
+    uint32s,
+)
+from .embree_rays import begin, make, stand
+
+_ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
+_VALID, _VALID_AT, _PACKET, _PACKET_AT = (
+    at("valid"),
+    offset("valid"),
+    at("packet"),
+    offset("packet"),
+)
+_TILE, _LANE, _RAY, _REAL, _ENTRY = at("tile"), at("lane"), at("ray"), at("real"), at("entry")
+_OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
+_MESH, _INSTANCES, _MASKED = at("mesh"), at("instances"), at("masked")
+_T_MIN, _T_MAX, _SCENE, _NEARBY = at("t_min"), at("t_max"), at("scene"), at("nearby")
+_INSIDE, _ROUGH, _ONE, _OTHER = at("inside"), at("rough"), at("one"), at("other")
+_ROUGH_32, _ONE_32, _OTHER_32 = at("rough_32"), at("one_32"), at("other_32")
+_T, _KEY, _SURE = at("t"), at("key"), at("sure")
+f64_1, f64_2, i32_1 = types.float64[::1], types.float64[:, ::1], types.int32[::1]
+_FIELDS = 22  # numbers of a ray of a packet
+_MESH_OF = memory.INSTANCE.fields["mesh"][1] // 8  # type: ignore[index]
+_FIRST_PLACE, _RECORD = _MESH_OF + 1, memory.INSTANCE.itemsize
+
+_intersect_4, _intersect_8, _intersect_16 = (
+    types.ExternalFunction(
+        f"rtcIntersect{width}", types.void(types.intp, types.intp, types.intp, types.intp)
+    )
+    for width in (4, 8, 16)
+)
+
+
+@inlined
+def _prepare(cast):  # type: ignore[no-untyped-def]
+    """Write to the scratch memory what all rays share."""
+    scratch, width = cast.scratch, cast.width
+    numbers, floats, rays = int64s(scratch), float64s(scratch), float32s(scratch)
+    whole = int32s(scratch)
+    numbers[0] = -1  # no instance
+    numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED] = cast.mesh, cast.instances, cast.masked
+    floats[_T_MIN], floats[_T_MAX], numbers[_LANE] = cast.t_min, cast.t_max, 0
+    numbers[_SCENE], numbers[_NEARBY] = cast.scene, cast.nearby
+    numbers[_ARGUMENTS] = np.int64(-1) << 32 | CALL_FILTER | COHERENT  # all features
+    numbers[_ARGUMENTS + 1] = scratch
+    numbers[_ARGUMENTS + 3] = numbers[_ARGUMENTS + 4] = 0
+    if width > 1:
+        for packet in range(0, LANES, width):
+            ray = _PACKET + _FIELDS * packet
+            for k in range(ray, ray + width):
+                rays[k + 3 * width] = np.float32(max(cast.t_min - MARGIN, 0.0))
+                rays[k + 7 * width] = np.float32(0)
+                whole[k + 9 * width], whole[k + 10 * width] = -1, 0
+                whole[k + 11 * width] = 0
+                for field in (18, 19, 20):
+                    whole[k + field * width] = -1
+
+
+@inlined
+def _apart(floats, coherence):  # type: ignore[no-untyped-def]
+    """Whether some rays of a group differ too much from the first."""
+    x, y, z = floats[_DX], floats[_DY], floats[_DZ]
+    for lane in (5, 10, LANES - 1):
+        if x * floats[_DX + lane] + y * floats[_DY + lane] + z * floats[_DZ + lane] < coherence:
+            return True
+    return False
+
+
+def _filler(width: int) -> Any:
+    """Make what gives packets of a size their rays: with a constant, in vector instructions."""
+
+    @stage
+    def starts(scratch, t_min):  # type: ignore[no-untyped-def]
+        rays, floats = float32s(scratch), float64s(scratch)
+        for lane in range(LANES):
+            k, entry = _PACKET + (_FIELDS - 1) * (lane & -width) + lane, floats[_ENTRY + lane]
+            rays[k] = begun(floats[_OX + lane], floats[_DX + lane], entry)
+            rays[k + width] = begun(floats[_OY + lane], floats[_DY + lane], entry)
+            rays[k + 2 * width] = begun(floats[_OZ + lane], floats[_DZ + lane], entry)
+            rays[k + 3 * width] = np.float32(max(t_min - entry - MARGIN, 0.0))
+
+    @stage
+    def ahead(scratch, t_max):  # type: ignore[no-untyped-def]
+        rays, floats = float32s(scratch), float64s(scratch)
+        for lane in range(LANES):
+            k = _PACKET + (_FIELDS - 1) * (lane & -width) + lane
+            rays[k + 4 * width] = np.float32(floats[_DX + lane])
+            rays[k + 5 * width] = np.float32(floats[_DY + lane])
+            rays[k + 6 * width] = np.float32(floats[_DZ + lane])
+            rays[k + 8 * width] = np.float32(min(t_max - floats[_ENTRY + lane] + MARGIN, FAR))
+
+    @inlined
+    def fill(scratch, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
+        if not fixed:
+            starts(scratch, t_min)
+        ahead(scratch, t_max)
+
+    return fill
+
+
+_fill_4, _fill_8, _fill_16 = map(_filler, (4, 8, 16))
+
+
+@inlined
+def _fill(scratch, width, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
+    """Give the packets of a group their rays; their starts only if those are not `fixed`."""
+    if width == 16:
+        _fill_16(scratch, t_min, t_max, fixed)
+    elif width == 8:
+        _fill_8(scratch, t_min, t_max, fixed)
+    else:
+        _fill_4(scratch, t_min, t_max, fixed)
+
+
+@stage
+def _whole(scratch, first):  # type: ignore[no-untyped-def]
+    """Take all rays of a group, of which the first has a number in the block."""
+    numbers = int64s(scratch)
+    for lane in range(LANES):
+        numbers[_RAY + lane] = first + numbers[_TILE + lane]
+
+
+@stage
+def _reals(scratch, first, wide, step, count):  # type: ignore[no-untyped-def]
+    """Take those rays of a group that there are, and copies of its first; returns their number."""
+    numbers, valid, real = int64s(scratch), int32s(scratch + _VALID_AT), np.int64(0)
+    for lane in range(LANES):
+        right, ray = first + (lane & (wide - 1)), first + numbers[_TILE + lane]
+        there = (right < step) & (ray < count)
+        numbers[_RAY + lane] = ray if there else first
+        numbers[_REAL + lane] = np.int64(there)
+        valid[lane] = np.int32(-1) if there else np.int32(0)
+        real += np.int64(there)
+    return real
+
+
+@stage
+def _reset(scratch, plain):  # type: ignore[no-untyped-def]
+    """Forget what filters have found."""
+    singles, integers = float32s(scratch), int32s(scratch)
+    for lane in range(LANES):
+        singles[_ROUGH_32 + lane] = np.float32(np.inf)
+        integers[_ONE_32 + lane] = integers[_OTHER_32 + lane] = np.int32(-1)
+    if not plain:
+        numbers, floats = int64s(scratch), float64s(scratch)
+        for lane in range(LANES):
+            floats[_ROUGH + lane], numbers[_INSIDE + lane] = np.inf, -1
+            numbers[_ONE + lane] = numbers[_OTHER + lane] = -1
+
+
+@stage
+def _found(scratch):  # type: ignore[no-untyped-def]
+    """How many rays of a group have a candidate in a plain scene, and how many go along an axis."""
+    floats, integers, found, straight = float64s(scratch), int32s(scratch), np.int64(0), np.int64(0)
+    for lane in range(LANES):
+        found += np.int64(integers[_ONE_32 + lane] >= 0)
+    for lane in range(LANES):
+        straight += np.int64(along(floats, lane))
+    return found, straight
+
+
+@stage
+def _unsure(scratch):  # type: ignore[no-untyped-def]
+    """How many rays of a group have to be cast again."""
+    numbers, sure = int64s(scratch), np.int64(0)
+    for lane in range(LANES):
+        sure += numbers[_SURE + lane]
+    return LANES - sure
+
+
+@stage
+def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def]
+    """Cast the rays of a group one by one."""
+    numbers, flags = int64s(scratch), int32s(scratch + _ARGUMENTS_AT)
+    flags[0], numbers[_FILTER] = CALL_FILTER, proposer
+    for lane in range(LANES):
+        if numbers[_REAL + lane]:
+            single(scene, scratch, lane, t_max)
+    flags[0] = CALL_FILTER | COHERENT
+
+
+@compiled(types.int64(CASTS, types.int64, types.int64))
+def trace(casts, start, stop):  # type: ignore[no-untyped-def]
+    """Cast rays `start` to `stop`, and write those that hit in their order; returns their number.
+
+    `casts` is one `CAST`.
+    """
+    cast = casts[0]
+    scene, scratch, width, coherence = cast.scene, cast.scratch, cast.width, cast.coherence
+    mesh, instances, masked = cast.mesh, cast.instances, cast.masked
+    filters, alone, decide = cast.packets, cast.single, cast.decide
+    t_min, t_max, still, near = cast.t_min, cast.t_max, cast.still != 0, cast.near != 0
+    step, high, wide, before = cast.step, cast.high, cast.wide, cast.before
+    shift = 0 if wide == 1 else (1 if wide == 2 else 2)
+    metre, index, indexed = 1.0 / cast.scale, int32s(cast.index), cast.index != 0
+    numbers, floats = int64s(scratch), float64s(scratch)
+    valid, plain = int32s(scratch + _VALID_AT), instances == 0 and not masked
+    table = float64s(int64s(mesh)[0])
+    span = step * high
+    distances, places = float64s(cast.room), int32s(cast.room + 8 * span)
+    numbered = int32s(cast.room + 12 * span)
+    out_ray, out_metres = uint32s(cast.ray), float64s(cast.distance)
+    out_triangle, out_instance = int32s(cast.triangle), int32s(cast.instance)
+    _prepare(cast)
+    fixed = still and near
+    if still:
+        stand(cast, floats)
+        if width > 1:
+            _fill(scratch, width, t_min, t_max, False)
+    if near:
+        for lane in range(LANES):
+            floats[_ENTRY + lane] = 0.0
+    for lane in range(LANES):
+        numbers[_TILE + lane] = (lane >> shift) * step + (lane & (wide - 1))
+        numbers[_REAL + lane], valid[lane] = 1, -1
+    kept, partial = 0, False
+    for block in range(start, stop, span):
+        count = min(span, stop - block)
+        begins = begin(cast, block)
+        for column in range(0, min(step, count), wide):
+            real = LANES
+            if count == span and column + wide <= step:
+                _whole(scratch, column)
+            else:
+                real, partial = _reals(scratch, column, wide, step, count), True
+            make(cast, scratch, begins)
+            _reset(scratch, plain)
+            if masked and instances == 0:  # `propose` looks at masks
+                shear_all(scratch)
+            if width == 1 or real == 1 or _apart(floats, coherence):
+                _one_by_one(scene, scratch, alone, t_max)
+            else:
+                _fill(scratch, width, t_min, t_max, fixed)
+                arguments = scratch + _ARGUMENTS_AT
+                numbers[_FILTER] = filters[0]
+                if width == 16:
+                    _intersect_16(scratch + _VALID_AT, scene, scratch + _PACKET_AT, arguments)
+                else:
+                    for part in range(LANES // width):
+                        numbers[_FILTER], numbers[_LANE] = filters[part], part * width
+                        asked = scratch + _VALID_AT + 4 * part * width
+                        rays = scratch + _PACKET_AT + 4 * _FIELDS * part * width
+                        if width == 8:
+                            _intersect_8(asked, scene, rays, arguments)
+                        else:
+                            _intersect_4(asked, scene, rays, arguments)
+                    numbers[_LANE] = 0
+            found, straight = _found(scratch)
+            if plain and found + straight == 0:
+                for lane in range(LANES):
+                    places[numbers[_RAY + lane]] = -1
+                continue
+            if plain:
+                verify_all(table, scratch, t_min)
+            else:
+                for lane in range(LANES):
+                    verify(mesh, instances, numbers, floats, lane)
+            if straight + _unsure(scratch):
+                numbers[_FILTER] = decide
+                for lane in range(LANES):
+                    if numbers[_REAL + lane] and (
+                        numbers[_SURE + lane] == 0 or along(floats, lane)
+                    ):
+                        decided(scene, scratch, lane, t_max)
+            for back in range(LANES):  # copies of the first come before it
+                lane = LANES - 1 - back
+                to, t, key = numbers[_RAY + lane], floats[_T + lane], numbers[_KEY + lane]
+                distances[to], places[to] = t, key if t <= t_max else -1
+                if instances != 0:
+                    numbered[to] = key // NUMBER
+            if partial:
+                for lane in range(LANES):
+                    numbers[_REAL + lane], valid[lane] = 1, -1
+                partial = False
+        for k in range(count):
+            place = np.int64(places[k])
+            if place < 0:
+                continue
+            if instances != 0:
+                record = int64s(instances + _RECORD * numbered[k])
+                place = (place & (NUMBER - 1)) + record[_FIRST_PLACE]
+                out_instance[kept] = numbered[k]
+            out_ray[kept], out_metres[kept] = block - before + k, distances[k] * metre
+            out_triangle[kept] = index[place] if indexed else place
+            kept += 1
+    return kept
+
+
+@compiled(types.void(CASTS, f64_2, f64_2, i32_1, i32_1, f64_1, f64_1))
+def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no-untyped-def]
+    """Write weights of the second and third corner for hits of rays (m, 3), local to the scene.
+
+    The hits' `place`, in all meshes' corners, and `instance` are those that `trace` wrote.
+    """
+    mesh, instances = casts[0].mesh, casts[0].instances
+    for k in range(len(place)):
+        o, to = origins[k if len(origins) > 1 else 0], directions[k]
+        ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], to[0], to[1], to[2]
+        at, mesh_at = np.int64(place[k]), mesh
+        if instances != 0:
+            address = instances + _RECORD * np.int64(instance[k])
+            record = int64s(address)
+            mesh_at, at = record[_MESH_OF], at - record[_FIRST_PLACE]
+            ox, oy, oz, dx, dy, dz, _ = entered(float64s(address), ox, oy, oz, dx, dy, dz)
+        axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
+        triangle = corners_of(float64s(int64s(mesh_at)[0]), at, axis)
+        a, b, c, det, _ = areas(triangle, (p, q, r, sx, sy, sz))
+        sign = -1.0 if det < 0 else 1.0  # outside by float32's rounding: at the edge
+        a, b, c = max(sign * a, 0.0), max(sign * b, 0.0), max(sign * c, 0.0)
+        total = (a + b) + c
+        u[k], v[k] = b / total, c / total
+
+
+# Whether this process compiled the loops; otherwise it loaded what an earlier one had kept.
+COMPILED = bool(trace.stats.cache_misses)
