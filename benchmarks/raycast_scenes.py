@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -97,6 +98,21 @@ def city_job(triangles: int, rays: int) -> Job:
     )
 
 
+def positions_job(triangles: int, rays: int, *, inside: bool) -> Job:
+    """Make a city, the sensor at places in streets, or in buildings, where all rays hit."""
+    scene, sensor = city(triangles), _lidar(rays)
+    low, high = scene.bounds
+    random = np.random.default_rng(0)
+    places = np.full((24, 3), low[2] + 2)
+    places[:, :2] = low[:2] + (high - low)[:2] * random.uniform(0.3, 0.7, (24, 2))
+    caster = RayCaster(scene.vertices, scene.faces)
+    few = sensor.directions(np.arange(36)).reshape(-1, 3)
+    share = np.array([caster.cast(place, few).hit.mean() for place in places])
+    chosen = places[(share > 0.97) == inside][:4]
+    name = f"{'inside' if inside else 'street'} {triangles:.0e}".replace("e+0", "e")
+    return _job(name, scene, chosen, sensor)
+
+
 def terrain_job(triangles: int, rays: int) -> Job:
     """Make a terrain, the sensor 30 m above its middle."""
     scene = terrain(triangles)
@@ -139,6 +155,8 @@ def jobs(
     for triangles in cities:
         name = f"city-{triangles:.0e}".replace("e+0", "e")
         out[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
+    for place in ("street", "inside"):
+        out[place] = partial(positions_job, cities[0], rays, inside=place == "inside")
     out[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
     for path in meshes:
         out[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]

@@ -117,7 +117,8 @@ class CudaBackend(Backend):
         cp, n = self._cupy, len(rays)
         with self._device:
             stride = np.int32(0 if len(rays.origins) == 1 else 3)
-            table = (cp.asarray(rays.origins), stride, cp.asarray(rays.directions))
+            origins, directions = map(np.ascontiguousarray, (rays.origins, rays.directions))
+            table = (cp.asarray(origins), stride, cp.asarray(directions))
             limits = (np.float64(t * self._scene.frame.scale) for t in (rays.t_min, rays.t_max))
             found = self._cast("cast_table", n, (*table, np.int64(n), *limits))
             groups = Groups(np.zeros(1, np.int64), 1)

@@ -172,13 +172,8 @@ class EmbreeBackend(Backend):
         sub_rays = pattern.sub_rays
         if sub_rays is not None:
             record = cast.record
-            table = np.zeros((5, len(sub_rays)))
-            table[:3] = sub_rays.shares()
-            if pattern.offsets is not None:  # shares differ by beam
-                table[1:3] = sub_rays.angles.T
-            if sub_rays.starts is not None:
-                table[3:] = sub_rays.starts.T
-            record["subrays"], record["shares"] = len(sub_rays), cast.keep(table)
+            record["subrays"] = len(sub_rays)
+            record["shares"] = cast.keep(sub_rays.table(pattern.offsets))
             record["begins"] = sub_rays.starts is not None
             record["offsets"] = cast.keep(pattern.offsets)
             if sub_rays.axis is not None:

@@ -262,6 +262,10 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
             real = LANES
             if count == span and column + wide <= step:
                 _whole(scratch, column)
+                if partial:
+                    for lane in range(LANES):
+                        numbers[_REAL + lane], valid[lane] = 1, -1
+                    partial = False
             else:
                 real, partial = _reals(scratch, column, wide, step, count), True
             make(cast, scratch, begins)
@@ -309,10 +313,6 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
                 distances[to], places[to] = t, key if t <= t_max else -1
                 if instances != 0:
                     numbered[to] = key // NUMBER
-            if partial:
-                for lane in range(LANES):
-                    numbers[_REAL + lane], valid[lane] = 1, -1
-                partial = False
         for k in range(count):
             place = np.int64(places[k])
             if place < 0:

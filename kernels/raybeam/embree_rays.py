@@ -10,6 +10,7 @@ import numpy as np
 from .compiled import inlined, stage
 from .embree_memory import LANES, at, float64s, int64s
 from .mesh import NEAR
+from .ray_loops import any_axes, axes_about
 
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _RAY, _ROW, _POSE, _WITHIN = map(at, ("ray", "row", "pose", "within"))
@@ -49,29 +50,6 @@ def _poses(scratch, pose, within, each):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _any_axes(x, y, z):  # type: ignore[no-untyped-def]
-    """As `sub_rays.any_axes`."""
-    sign = -1.0 if z < 0 else 1.0
-    a = -1.0 / (sign + z)
-    b = x * y * a
-    return 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
-
-
-@inlined
-def _axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
-    """As `sub_rays.axes_about`."""
-    a, b, c = axis
-    p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
-    length = np.sqrt((p * p + q * q) + r * r)
-    least = max(length, 1e-300)
-    p, q, r = p / least, q / least, r / least
-    u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
-    if length < 1e-6:
-        p, q, r, u, v, w = _any_axes(x, y, z)
-    return p, q, r, u, v, w
-
-
-@inlined
 def _divided(cast, numbers, floats):  # type: ignore[no-untyped-def]
     """Turn the directions of beams to those of sub-rays, and note where those start."""
     rows, subrays, shares, offsets = cast.rows, cast.subrays, float64s(cast.shares), cast.offsets
@@ -104,7 +82,7 @@ def _divided(cast, numbers, floats):  # type: ignore[no-untyped-def]
     ahead = axis[0], axis[1], axis[2]
     for lane in range(LANES):
         x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
-        a, b, c, d, e, f = _axes_about(x, y, z, ahead) if about else _any_axes(x, y, z)
+        a, b, c, d, e, f = axes_about(x, y, z, ahead) if about else any_axes(x, y, z)
         straight, across, up = floats[_STRAIGHT + lane], floats[_ACROSS + lane], floats[_UP + lane]
         floats[_DX + lane] = (straight * x + across * a) + up * d
         floats[_DY + lane] = (straight * y + across * b) + up * e

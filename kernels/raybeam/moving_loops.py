@@ -7,6 +7,7 @@ import numpy as np
 from .arrays import Floats, Indices, Ints
 from .compiled import compiled, inlined
 from .pattern import Pattern
+from .ray_loops import divided, drifted, turned
 from .scan import Scan, check_scan
 
 CELL = 64
@@ -34,44 +35,40 @@ def made(scan: Scan, start: int, count: int) -> tuple[Floats, Floats]:
     delays = np.zeros(0) if motion is None else np.array(motion.delays, np.float64)
     origins, directions = np.empty((2, 3, count))
     rays = scan.first + start, start % poses.rays, poses.rays
-    _make(pattern.directions.T, shifts, *copies, delays, *rays, origins, directions)
+    table, offsets, axis = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0)
+    if pattern.sub_rays is not None:
+        table = pattern.sub_rays.table(pattern.offsets)
+        offsets = offsets if pattern.offsets is None else pattern.offsets
+        axis = axis if pattern.sub_rays.axis is None else np.array(pattern.sub_rays.axis, float)
+    parts = table, offsets, axis
+    _make(pattern.directions.T, shifts, *parts, *copies, delays, *rays, origins, directions)
     return origins, directions
-
-
-@inlined
-def _turned(m, x, y, z):  # type: ignore[no-untyped-def]
-    return (
-        (x * m[0] + y * m[1]) + z * m[2],
-        (x * m[3] + y * m[4]) + z * m[5],
-        (x * m[6] + y * m[7]) + z * m[8],
-    )
-
-
-@inlined
-def _drifted(rate, delay, x, y, z):  # type: ignore[no-untyped-def]
-    a, b, c = rate[0], rate[1], rate[2]
-    return x + delay * (b * z - c * y), y + delay * (c * x - a * z), z + delay * (a * y - b * x)
 
 
 @compiled()
 def _make(  # type: ignore[no-untyped-def]
-    ahead, shifts, positions, rotations, velocities, rates, delays, first, start, each,
-    origins, directions,
+    ahead, shifts, shares, offsets, axis, positions, rotations, velocities, rates, delays,
+    first, start, each, origins, directions,
 ):  # fmt: skip
-    rows, delay = ahead.shape[1], 0.0
+    rows, delay, subrays = ahead.shape[1], 0.0, max(shares.shape[1], 1)
     for k in range(origins.shape[1]):
-        row, pose = (first + k) % rows, (start + k) // each
+        part, pose = (first + k) % (rows * subrays), (start + k) // each
+        row = part // subrays
         dx, dy, dz = ahead[0, row], ahead[1, row], ahead[2, row]
         x, y, z = 0.0, 0.0, 0.0
         if shifts.shape[1] == rows:
             x, y, z = shifts[0, row], shifts[1, row], shifts[2, row]
+        if shares.shape[1]:
+            part -= row * subrays
+            dx, dy, dz, u, v, w = divided(shares, offsets, axis, row, part, dx, dy, dz)
+            x, y, z = x + u, y + v, z + w
         if len(rotations):
-            dx, dy, dz = _turned(rotations[pose], dx, dy, dz)
-            x, y, z = _turned(rotations[pose], x, y, z)
+            dx, dy, dz = turned(rotations[pose], dx, dy, dz)
+            x, y, z = turned(rotations[pose], x, y, z)
         if len(delays):
             delay = delays[(start + k) % each]
-            dx, dy, dz = _drifted(rates[pose], delay, dx, dy, dz)
-            x, y, z = _drifted(rates[pose], delay, x, y, z)
+            dx, dy, dz = drifted(rates[pose], delay, dx, dy, dz)
+            x, y, z = drifted(rates[pose], delay, x, y, z)
         x, y, z = x + positions[pose, 0], y + positions[pose, 1], z + positions[pose, 2]
         if len(delays):
             x, y = x + delay * velocities[pose, 0], y + delay * velocities[pose, 1]

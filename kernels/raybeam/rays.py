@@ -95,7 +95,12 @@ def unit_directions(directions: ArrayLike) -> Floats:
     Their memory is in columns, so that the transposed array is contiguous.
     Each row's result depends only on that row, so that batches may be cut anywhere.
     """
-    table = _check_directions(directions)
+    table = real_rows("directions", directions)
+    columns = np.empty((3, len(table)))
+    columns[...] = table.T
+    if _are_units(columns):
+        return columns.T
+    _refuse_directions(table)
     out = np.empty((3, len(table))).T
     for start in range(0, len(table), _BLOCK):
         out[start : start + _BLOCK] = _normalised(_float64(table[start : start + _BLOCK]))
@@ -160,15 +165,30 @@ def refuse_rows(
         )
 
 
+def _are_units(columns: Floats) -> bool:
+    """Whether all vectors (3, n) are finite unit vectors: then there is no more to be checked."""
+    x, y, z = columns
+    with np.errstate(over="ignore", under="ignore", invalid="ignore"):
+        squared = x * x
+        squared += y * y
+        squared += z * z
+        squared -= 1
+        return bool((np.abs(squared, out=squared) <= _UNIT_SLACK).all())
+
+
 def _check_directions(directions: ArrayLike) -> AnyArray:
     table = real_rows("directions", directions)
+    _refuse_directions(table)
+    return table
+
+
+def _refuse_directions(table: AnyArray) -> None:
     refuse_rows(
         "Direction",
         table,
         lambda block: finite_rows(block) & block.any(axis=1),
         "a finite vector that is not zero",
     )
-    return table
 
 
 def _float64(table: AnyArray) -> Floats:

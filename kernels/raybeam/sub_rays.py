@@ -42,6 +42,16 @@ class SubRays:
         straight = 1 / np.sqrt((1 + across * across) + up * up)
         return straight, across * straight, up * straight
 
+    def table(self, offsets: Floats | None) -> Floats:
+        """Shares, or the angles if there are offsets, and starts: (5, k), as loops read them."""
+        out = np.zeros((5, len(self)))
+        out[:3] = self.shares()
+        if offsets is not None:  # shares differ by beam
+            out[1:3] = self.angles.T
+        if self.starts is not None:
+            out[3:] = self.starts.T
+        return out
+
     def axes(self, ahead: Floats) -> tuple[Floats, Floats]:
         """Directions across and up of beams (3, m): two of (3, m)."""
         return any_axes(ahead) if self.axis is None else axes_about(ahead, self.axis)

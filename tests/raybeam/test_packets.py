@@ -132,3 +132,32 @@ def test_forked_processes_cast_too():
         "assert cast().distance == 5; child or os._exit(0); "
         "sys.exit(os.waitpid(child, 0)[1])"
     )
+
+
+def test_which_rays_go_together_changes_nothing(mesh):
+    """Ways to group rays are tried in turn, until one is known to be the fastest."""
+    caster = RayCaster(*mesh, backend="embree", threads=1)
+    given, where = Pattern(lidar()), [0.05, 0.1, 0.4]
+    expected = RayCaster(*mesh, backend="numpy").scan(given, where)
+    for window in [(0, len(given))] * 5 + [(k, k + 700) for k in range(0, 13_000, 611)]:
+        returns = caster.scan(Pattern(lidar()), where, window=window)
+        begin, end = np.searchsorted(expected.ray, window)
+        assert np.array_equal(returns.ray + window[0], expected.ray[begin:end])
+        assert np.array_equal(returns.distance, expected.distance[begin:end])
+        assert np.array_equal(returns.triangle, expected.triangle[begin:end])
+
+
+def test_what_few_rays_hit_beside_many_that_miss():
+    """Groups at the end of a ring, or of a window, are not full."""
+    card = np.array([[5, -2, -2], [5, 2, -2], [5, 2, 2], [5, -2, 2.0]]), [[0, 1, 2], [0, 2, 3]]
+    azimuth, elevation = np.meshgrid(
+        np.radians(np.arange(360)), np.radians(np.linspace(-30, 30, 31))
+    )
+    flat = np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth)
+    given = Pattern(np.stack([*flat, np.sin(elevation)], axis=-1).swapaxes(0, 1).reshape(-1, 3))
+    casters = [RayCaster(*card, backend=backend, threads=1) for backend in ("numpy", "embree")]
+    for start in range(0, 600, 50):  # ahead, the card; at the end, the other half of it
+        window = (start, len(given) - 7)
+        expected, returns = (c.scan(given, [0, 0, 0], window=window) for c in casters)
+        assert np.array_equal(returns.ray, expected.ray) and len(returns) > 200
+        assert np.array_equal(returns.distance, expected.distance)
