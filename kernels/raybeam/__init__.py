@@ -1,6 +1,7 @@
 """Closest hits of rays with triangle meshes, on CUDA, Embree or NumPy."""
 
 from .backend import BackendUnavailable
+from .bending import Bending
 from .caster import RayCaster
 from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
@@ -15,6 +16,7 @@ from .sub_rays import SubRays, any_axes
 
 __all__ = [
     "BackendUnavailable",
+    "Bending",
     "DeviceHits",
     "Hits",
     "Instance",

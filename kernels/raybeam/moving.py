@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .arrays import Floats, Indices, Ints, Ints32
+from .bending import Bending
 from .caster import RayCaster
 from .rays import Rays
 from .scan import Scan
@@ -32,7 +33,7 @@ class Moving:
     Attributes
     ----------
     shapes
-        Casters of the shapes, each in its own axes.
+        Casters of the shapes, each in its own axes, and meshes whose vertices move.
     boxes
         float64 (s, 2, 3): low and high corners of the shapes.
     shape
@@ -44,7 +45,7 @@ class Moving:
         rotations (m, 3, 3) from the body's axes.
     """
 
-    shapes: tuple[RayCaster, ...]
+    shapes: tuple[RayCaster | Bending, ...]
     boxes: Floats
     shape: Indices
     there: Floats
@@ -207,7 +208,8 @@ class _Chunk:
         for one in np.unique(shape).tolist():
             own = np.flatnonzero(shape == one) if len(moving.shapes) > 1 else slice(None)
             rays = Rays(starts[own], ways[own], self._scan.t_min, self._scan.t_max)
-            on, distance, triangle, instance = moving.shapes[one].engine.nearest(rays)
+            given = rays, times[row[own]]
+            on, distance, triangle, instance = moving.shapes[one].nearest(*given)
             at = on if isinstance(own, slice) else own[on]
             # Directions of a sensor that turns during a pose are not quite of unit length.
             x, y, z = ways[at].T

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from raybeam import (
+    Bending,
     Instance,
     Mesh,
     Motion,
@@ -186,3 +187,30 @@ def test_no_loop_is_compiled_with_fast_mathematics():
     """Functions that such a loop calls would inherit that, and round otherwise."""
     sources = [path.read_text() for path in Path(module.__file__).parent.glob("*.py")]
     assert len(sources) > 20 and not any("fastmath" in source for source in sources)
+
+
+def test_a_quadrangle_flaps():
+    """Each ray meets it as it is then: its vertices move evenly from frame to frame."""
+    rng = np.random.default_rng(3)
+    beats = np.array([[0, 0, 1.0], [0, 0, 0], [0, 0, -1.0], [0, 0.1, 0]])
+    frames = np.stack([FLAT[0] + z * beats for z in (0, 0.8, -0.5)])
+    wing = Bending(frames, np.array([[0, 1, 2], [0, 2, 3]]), np.array([0.0, 0.4, 1.0]))
+
+    def flown(bodies, times):
+        across = np.stack([0.3 * times, 4.0 - times, np.full(len(times), 0.2)], axis=1)
+        return across, np.broadcast_to(np.diag([1.0, 1.0, 1.0]), (len(times), 3, 3))
+
+    moving = Moving((wing,), wing.box[None], np.zeros(1, int), np.array([[0.1, 1.3]]), flown)
+    directions = np.array([0.0, 3.6, 0.2]) + rng.uniform(-1.5, 1.5, (4_000, 3)) * [1, 1, 0.4]
+    scan, times = check_scan(Pattern(directions), [0, 0, 0]), np.linspace(0, 1.5, 4_000)
+    found = hits_on(moving, scan, lambda ray: times[ray])
+    hit = np.full(4_000, np.inf)
+    hit[found.ray] = found.distance
+    for ray in range(0, 4_000, 3):
+        expected = np.inf
+        if 0.1 <= times[ray] <= 1.3:
+            where, _ = flown([0], times[ray : ray + 1])
+            then = RayCaster(wing.at(times[ray : ray + 1])[0] + where, wing.faces, backend="numpy")
+            expected = then.cast([0, 0, 0], directions[ray]).distance[0]
+        assert hit[ray] == pytest.approx(expected, rel=1e-12)
+    assert len(found.ray) > 200 and {*found.triangle.tolist()} == {0, 1}
