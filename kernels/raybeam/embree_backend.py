@@ -267,7 +267,7 @@ class _Plan:
         self._spread = spreads[self._step]
         self.ways = [_IN_TURN]
         if self._spread > _COHERENCE:
-            ways = {_Way(self._step, high, wide) for high, wide in _SHAPES}
+            ways = {_Way(self._step, high, wide) for high, wide in _SHAPES if wide <= self._step}
             ways |= {_IN_TURN} if many > 1 else set()
             self.ways = [
                 way
