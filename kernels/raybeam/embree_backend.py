@@ -51,8 +51,8 @@ class EmbreeBackend(Backend):
 
     A triangle that Embree does not propose is not found. It decides in float32, and does not see
     surfaces that are nearer to the ray's start than about 1e-6 of the scene's size, nor some of
-    those whose rim a ray meets within that. Casting and
-    building the tree use the given number of threads.
+    those whose rim a ray meets within that. Casting and building the tree use the given number of
+    threads.
     """
 
     name: ClassVar[str] = "embree"
@@ -153,7 +153,8 @@ class EmbreeBackend(Backend):
                 since = time.thread_time()
                 ray, distance, triangle, instance = self._cast(cast, begin, end, way)
                 plan.took(way, end - begin, time.thread_time() - since)
-                collector.tally(self._scene.tally_rows(instance, triangle))
+                if scan.tally:
+                    collector.tally(self._scene.tally_rows(instance, triangle))
                 kept = collector.keep(ray, begin, end)
                 collector.add(begin, ray[kept], distance[kept], triangle[kept], instance[kept])
         return collector.result()
@@ -168,8 +169,11 @@ class EmbreeBackend(Backend):
     def _of_scan(self, scan: Scan) -> _Cast:
         """Prepare to cast a scan."""
         pattern, limits = scan.pattern, (scan.t_min, scan.t_max)
-        cast = self._made(pattern.directions, pattern.origins, scan.poses, scan.first, limits)
-        sub_rays = pattern.sub_rays
+        sub_rays, aside = pattern.sub_rays, 0.0
+        if sub_rays is not None and sub_rays.starts is not None:
+            aside = float(np.abs(sub_rays.starts).max())
+        given = pattern.directions, pattern.origins, scan.poses, scan.first, limits
+        cast = self._made(*given, aside)
         if sub_rays is not None:
             record = cast.record
             record["subrays"] = len(sub_rays)
@@ -178,11 +182,6 @@ class EmbreeBackend(Backend):
             record["offsets"] = cast.keep(pattern.offsets)
             if sub_rays.axis is not None:
                 record["about"], record["axis"] = 1, sub_rays.axis
-            if sub_rays.starts is not None:
-                record["still"] = 0
-                record["near"] &= (
-                    float(np.abs(sub_rays.starts).max()) * self._scene.frame.scale < 0.5
-                )
         return cast
 
     def _made(
@@ -192,7 +191,9 @@ class EmbreeBackend(Backend):
         poses: Poses,
         first: int,
         limits: tuple[float, float],
+        aside: float = 0.0,
     ) -> _Cast:
+        """Note what rays are made of; sub-rays start so far `aside`, metres, of their beam."""
         cast, motion, frame = _Cast(self._base), poses.motion, self._scene.frame
         record = cast.record
         record["directions"] = cast.keep(directions.T)
@@ -201,6 +202,7 @@ class EmbreeBackend(Backend):
         turns = poses.rotations
         record["rotations"] = cast.keep(None if turns is None else np.moveaxis(turns, 0, -1))
         reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
+        reach += 2 * aside * frame.scale
         if origins is not None:
             reach += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
         if motion is not None:
@@ -211,7 +213,7 @@ class EmbreeBackend(Backend):
             reach += 2 * float(way) * frame.scale
         record["rows"], record["poses"], record["each"] = len(directions), len(poses), poses.rays
         record["first"], record["subrays"] = first, 1
-        record["still"] = len(poses) == 1 and origins is None and motion is None
+        record["still"] = len(poses) == 1 and origins is None and motion is None and not aside
         record["near"] = reach < NEAR
         record["t_min"], record["t_max"] = (limit * frame.scale for limit in limits)
         return cast

@@ -46,12 +46,7 @@ from .embree_memory import (
 from .embree_rays import begin, make, stand
 
 _ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
-_VALID, _VALID_AT, _PACKET, _PACKET_AT = (
-    at("valid"),
-    offset("valid"),
-    at("packet"),
-    offset("packet"),
-)
+_VALID_AT, _PACKET, _PACKET_AT = offset("valid"), at("packet"), offset("packet")
 _TILE, _LANE, _RAY, _REAL, _ENTRY = at("tile"), at("lane"), at("ray"), at("real"), at("entry")
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _MESH, _INSTANCES, _MASKED = at("mesh"), at("instances"), at("masked")
@@ -112,6 +107,7 @@ def _filler(width: int) -> Any:
 
     @stage
     def starts(scratch, t_min):  # type: ignore[no-untyped-def]
+        """Origins, and distances from which hits count."""
         rays, floats = float32s(scratch), float64s(scratch)
         for lane in range(LANES):
             k, entry = _PACKET + (_FIELDS - 1) * (lane & -width) + lane, floats[_ENTRY + lane]
@@ -122,6 +118,7 @@ def _filler(width: int) -> Any:
 
     @stage
     def ahead(scratch, t_max):  # type: ignore[no-untyped-def]
+        """Directions, and distances up to which hits count."""
         rays, floats = float32s(scratch), float64s(scratch)
         for lane in range(LANES):
             k = _PACKET + (_FIELDS - 1) * (lane & -width) + lane
@@ -303,9 +300,8 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
             if straight + _unsure(scratch):
                 numbers[_FILTER] = decide
                 for lane in range(LANES):
-                    if numbers[_REAL + lane] and (
-                        numbers[_SURE + lane] == 0 or along(floats, lane)
-                    ):
+                    again = numbers[_SURE + lane] == 0 or along(floats, lane)
+                    if again and numbers[_REAL + lane]:
                         decided(scene, scratch, lane, t_max)
             for back in range(LANES):  # copies of the first come before it
                 lane = LANES - 1 - back

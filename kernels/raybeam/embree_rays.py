@@ -67,10 +67,8 @@ def _divided(cast, numbers, floats):  # type: ignore[no-untyped-def]
         table = float64s(offsets)
         for lane in range(LANES):
             beam = numbers[_ROW + lane]
-            across, up = (
-                floats[_ACROSS + lane] + table[beam],
-                floats[_UP + lane] + table[rows + beam],
-            )
+            across = floats[_ACROSS + lane] + table[beam]
+            up = floats[_UP + lane] + table[rows + beam]
             straight = 1 / np.sqrt((1 + across * across) + up * up)
             floats[_STRAIGHT + lane] = straight
             floats[_ACROSS + lane], floats[_UP + lane] = across * straight, up * straight

@@ -102,6 +102,15 @@ def ties(backend):
         hits = caster.cast(start, directions)
         for column in (hits.distance, hits.triangle, hits.instance):
             found.update(column.tobytes())
+    # Neighbours in packets, in a plain scene and among instances.
+    for caster in (
+        RayCaster(points, rng.permutation(thrice), backend),
+        RayCaster.of(stack, backend),
+    ):
+        for window in [(0, RINGS * FIRINGS)] * 4 + [(7, 5_000)]:
+            returns = caster.scan(Pattern(lidar()), [0.05, 0.1, 0.4], window=window)
+            for column in (returns.ray, returns.distance, returns.triangle, returns.instance):
+                found.update(column.tobytes())
     return found.hexdigest()
 
 

@@ -1,0 +1,50 @@
+"""Loops are compiled once, and again when any file of the package has changed."""
+
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from raybeam import compiled
+
+pytest.importorskip("numba")
+
+LOOP = """
+from .compiled import compiled
+from .numbers import MORE
+
+@compiled("f8(f8)")
+def more(x):
+    return x + MORE
+
+if __name__ == "__main__":
+    print(more(1.0), len(more.stats.cache_misses))
+"""
+
+
+@pytest.fixture
+def run(tmp_path):
+    """Run a loop of a package with another file that says a number: what it adds, and misses."""
+    package = tmp_path / "loops"
+    package.mkdir()
+    shutil.copy(Path(compiled.__file__), package)
+    (package / "__init__.py").touch()
+    (package / "more.py").write_text(LOOP)
+
+    def go(number=None):
+        if number is not None:
+            (package / "numbers.py").write_text(f"MORE = {number}\n")
+        command = [sys.executable, "-m", "loops.more"]
+        result = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+        return result.stdout.split()
+
+    return go
+
+
+def test_a_change_of_another_file_compiles_again(run):
+    """What a loop takes from there is a constant of its code, of which numba knows nothing."""
+    assert run("2.0") == ["3.0", "1"]
+    assert run() == ["3.0", "0"]
+    assert run("30.0") == ["31.0", "1"]
