@@ -14,7 +14,7 @@ except ImportError:
 
 
 def _keeps() -> bool:
-    """Whether numba has a folder for compiled code; else each process compiles it in 5 s."""
+    """Whether numba has a folder for compiled code; else each process compiles it in 25 s."""
     try:
         njit(cache=True)(_keeps)
     except (RuntimeError, TypeError):  # neither beside this file nor in the user's home; no numba

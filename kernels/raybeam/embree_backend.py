@@ -6,8 +6,9 @@ import importlib.util
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from typing import ClassVar, NamedTuple
 from weakref import ref
 
@@ -29,7 +30,7 @@ _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 _COHERENCE = 0.94
 _SHAPES = ((16, 1), (8, 2), (4, 4))  # rays along a ring and across, that go together
 _MOST = 1 << 15  # rays of a block
-_TRIED = 1 << 13  # rays that are cast in each way before the fastest is chosen
+_TRIALS, _TRIED = 5, 1 << 10  # parts that are cast in each way to choose the fastest, and rays
 _LIKE = 0.02  # between the cosines of patterns for which the same way is the fastest
 _PLANS = 16  # kept
 
@@ -56,7 +57,7 @@ class EmbreeBackend(Backend):
     """
 
     name: ClassVar[str] = "embree"
-    chunk: ClassVar[int] = 1 << 15  # distances and places fit a core's level 2 cache
+    chunk: ClassVar[int] = 1 << 17  # 20 bytes each; parts of a longer scan are copied together
 
     @classmethod
     def missing(cls) -> str:
@@ -149,10 +150,10 @@ class EmbreeBackend(Backend):
         collector = Collector(scan, self._scene.face_count)
         cast, plan = self._of_scan(scan), self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
-            for begin, end, way in plan.pieces(start, stop):
-                since = time.thread_time()
-                ray, distance, triangle, instance = self._cast(cast, begin, end, way)
-                plan.took(way, end - begin, time.thread_time() - since)
+            for begin, end, tried in plan.pieces(start, stop):
+                ray, distance, triangle, instance = self._cast(cast, begin, end, plan.ways[0])
+                if tried:
+                    plan.choose(partial(self._cast, cast, begin, end))
                 if scan.tally:
                     collector.tally(self._scene.tally_rows(instance, triangle))
                 kept = collector.keep(ray, begin, end)
@@ -257,7 +258,8 @@ class _Plan:
     """Ways to group the rays of a pattern, of which the fastest is found while they are cast.
 
     Rays of a group are those of a ring that differ least, or some of a ring and their neighbours,
-    or each is cast by itself: what is fastest depends on the scene. No way changes a result.
+    or each is cast by itself: what is fastest depends on the scene. All are tried on the same
+    blocks, of different places in the pattern. No way changes a result.
     """
 
     def __init__(self, scan: Scan, each: int) -> None:
@@ -277,8 +279,7 @@ class _Plan:
                 if way.step * way.high <= _MOST and _spread(scan, way) > _COHERENCE
             ] or self.ways
             self.ways.append(_Way(1, 16, 1, 2.0))
-        self._rays = dict.fromkeys(self.ways, 0)
-        self._seconds = dict.fromkeys(self.ways, 0.0)
+        self._trials: list[list[float]] = []  # times of each way, as shares of the shortest
 
     def fits(self, scan: Scan) -> bool:
         """Whether the rays of a scan are as close together as those for which this was made."""
@@ -286,23 +287,33 @@ class _Plan:
             return True
         return abs(_spread(scan, _Way(self._step, 16, 1)) - self._spread) < _LIKE
 
-    def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, _Way]]:
-        """Parts of rays `start` to `stop`, each with the way to cast it."""
+    def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int, bool]]:
+        """Parts of rays `start` to `stop`, and whether to try all ways there."""
+        part = -(-(stop - start) // _TRIALS)
         while start < stop:
-            way, end = self.ways[0], stop
             if len(self.ways) > 1:
-                way = min(self.ways, key=lambda way: self._rays[way])
-                end = min(start + max(other.step * other.high for other in self.ways), stop)
-            yield start, end, way
+                blocks = max(way.step * way.high for way in self.ways)
+                end = min(start + max(blocks, _TRIED), stop)
+                yield start, end, True
+                start, end = end, min(max(end, start + part), stop)
+            else:
+                end = stop
+            if start < end:
+                yield start, end, False
             start = end
 
-    def took(self, way: _Way, rays: int, seconds: float) -> None:
-        """Note how long a part took."""
-        if len(self.ways) > 1:
-            self._rays[way] += rays
-            self._seconds[way] += seconds
-            if min(self._rays[way] for way in self.ways) >= _TRIED:
-                self.ways = [min(self.ways, key=lambda way: self._seconds[way] / self._rays[way])]
+    def choose(self, cast: Callable[[_Way], object]) -> None:
+        """Cast a part, which is in the caches by now, in each way; the last time, choose one."""
+        ways, marks = self.ways, [time.perf_counter()]
+        if len(ways) == 1:  # another thread has chosen meanwhile
+            return
+        for way in ways:
+            cast(way)
+            marks.append(time.perf_counter())
+        times = np.diff(marks)
+        self._trials.append(list(times / times.min()))
+        if len(self._trials) >= _TRIALS:
+            self.ways = [ways[int(np.median(self._trials, axis=0).argmin())]]
 
 
 def _spread(scan: Scan, way: _Way) -> float:

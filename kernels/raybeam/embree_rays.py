@@ -10,19 +10,13 @@ import numpy as np
 from .compiled import inlined, stage
 from .embree_memory import LANES, at, float64s, int64s
 from .mesh import NEAR
-from .ray_loops import any_axes, axes_about
+from .ray_loops import any_axes, axes_about, whole_times
 
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _RAY, _ROW, _POSE, _WITHIN = map(at, ("ray", "row", "pose", "within"))
 _STRAIGHT, _ACROSS, _UP = at("straight"), at("across"), at("up")
 _ASIDE, _ABOVE, _ENTRY = at("aside"), at("above"), at("entry")
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
-
-
-@inlined
-def _times(number, other):  # type: ignore[no-untyped-def]
-    """How many times a whole number is in another, both below 2^52: faster than `//`, and exact."""
-    return np.int64(np.float64(number) / np.float64(other))
 
 
 @stage
@@ -45,51 +39,77 @@ def _poses(scratch, pose, within, each):  # type: ignore[no-untyped-def]
     numbers = int64s(scratch)
     for lane in range(LANES):
         inside = within + numbers[_RAY + lane]
-        later = _times(inside, each)
+        later = whole_times(inside, each)
         numbers[_POSE + lane], numbers[_WITHIN + lane] = pose + later, inside - later * each
 
 
-@inlined
-def _divided(cast, numbers, floats):  # type: ignore[no-untyped-def]
-    """Turn the directions of beams to those of sub-rays, and note where those start."""
-    rows, subrays, shares, offsets = cast.rows, cast.subrays, float64s(cast.shares), cast.offsets
-    about, begins, axis = cast.about, cast.begins, cast.axis
+@stage
+def _shares(scratch, shares, offsets, directions, rows, subrays):  # type: ignore[no-untyped-def]
+    """Look up the beams of a group's sub-rays, and what share each has of across and up."""
+    numbers, floats, table = int64s(scratch), float64s(scratch), float64s(shares)
+    ahead, more = float64s(directions), float64s(offsets)
     for lane in range(LANES):
         row = numbers[_ROW + lane]
-        beam = _times(row, subrays)
+        beam = whole_times(row, subrays)
         k = row - beam * subrays
         numbers[_ROW + lane] = beam
-        floats[_STRAIGHT + lane] = shares[k]
-        floats[_ACROSS + lane], floats[_UP + lane] = shares[subrays + k], shares[2 * subrays + k]
-        floats[_ASIDE + lane] = shares[3 * subrays + k]
-        floats[_ABOVE + lane] = shares[4 * subrays + k]
+        floats[_STRAIGHT + lane] = table[k]
+        floats[_ACROSS + lane], floats[_UP + lane] = table[subrays + k], table[2 * subrays + k]
+        floats[_ASIDE + lane] = table[3 * subrays + k]
+        floats[_ABOVE + lane] = table[4 * subrays + k]
+        floats[_DX + lane], floats[_DY + lane] = ahead[beam], ahead[rows + beam]
+        floats[_DZ + lane] = ahead[2 * rows + beam]
     if offsets:
-        table = float64s(offsets)
         for lane in range(LANES):
             beam = numbers[_ROW + lane]
-            across = floats[_ACROSS + lane] + table[beam]
-            up = floats[_UP + lane] + table[rows + beam]
+            across = floats[_ACROSS + lane] + more[beam]
+            up = floats[_UP + lane] + more[rows + beam]
             straight = 1 / np.sqrt((1 + across * across) + up * up)
             floats[_STRAIGHT + lane] = straight
             floats[_ACROSS + lane], floats[_UP + lane] = across * straight, up * straight
-    directions = float64s(cast.directions)
-    for lane in range(LANES):
-        beam = numbers[_ROW + lane]
-        floats[_DX + lane], floats[_DY + lane] = directions[beam], directions[rows + beam]
-        floats[_DZ + lane] = directions[2 * rows + beam]
-    ahead = axis[0], axis[1], axis[2]
+
+
+@inlined
+def _spread(floats, lane, begins, axes):  # type: ignore[no-untyped-def]
+    """Turn the direction of a beam to that of its sub-ray, and note where that starts."""
+    x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+    a, b, c, d, e, f = axes
+    straight, across, up = floats[_STRAIGHT + lane], floats[_ACROSS + lane], floats[_UP + lane]
+    floats[_DX + lane] = (straight * x + across * a) + up * d
+    floats[_DY + lane] = (straight * y + across * b) + up * e
+    floats[_DZ + lane] = (straight * z + across * c) + up * f
+    if begins:
+        aside, above = floats[_ASIDE + lane], floats[_ABOVE + lane]
+        floats[_OX + lane] = aside * a + above * d
+        floats[_OY + lane] = aside * b + above * e
+        floats[_OZ + lane] = aside * c + above * f
+
+
+@stage
+def _spread_any(scratch, begins):  # type: ignore[no-untyped-def]
+    floats = float64s(scratch)
     for lane in range(LANES):
         x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
-        a, b, c, d, e, f = axes_about(x, y, z, ahead) if about else any_axes(x, y, z)
-        straight, across, up = floats[_STRAIGHT + lane], floats[_ACROSS + lane], floats[_UP + lane]
-        floats[_DX + lane] = (straight * x + across * a) + up * d
-        floats[_DY + lane] = (straight * y + across * b) + up * e
-        floats[_DZ + lane] = (straight * z + across * c) + up * f
-        if begins:
-            aside, above = floats[_ASIDE + lane], floats[_ABOVE + lane]
-            floats[_OX + lane] = aside * a + above * d
-            floats[_OY + lane] = aside * b + above * e
-            floats[_OZ + lane] = aside * c + above * f
+        _spread(floats, lane, begins, any_axes(x, y, z))
+
+
+@stage
+def _spread_about(scratch, begins, a, b, c):  # type: ignore[no-untyped-def]
+    floats = float64s(scratch)
+    for lane in range(LANES):
+        x, y, z = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
+        _spread(floats, lane, begins, axes_about(x, y, z, (a, b, c)))
+
+
+@inlined
+def _divided(cast, scratch):  # type: ignore[no-untyped-def]
+    """Make the directions of sub-rays, and note where they start, off their beams' starts."""
+    given = cast.shares, cast.offsets, cast.directions, cast.rows, cast.subrays
+    _shares(scratch, *given)
+    if cast.about:
+        _spread_about(scratch, cast.begins, cast.axis[0], cast.axis[1], cast.axis[2])
+    else:
+        _spread_any(scratch, cast.begins)
 
 
 @stage
@@ -147,19 +167,15 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
 
     `block` is the row, the pose and the number within it of the block's first ray.
     """
-    numbers, floats = int64s(scratch), float64s(scratch)
-    rows, each, subrays, directions = cast.rows, cast.each, cast.subrays, float64s(cast.directions)
-    _rows(scratch, block[0], rows * subrays)
+    floats = float64s(scratch)
+    _rows(scratch, block[0], cast.rows * cast.subrays)
     if cast.poses > 1 or cast.delays != 0:
-        _poses(scratch, block[1], block[2], each)
+        _poses(scratch, block[1], block[2], cast.each)
     begins = cast.shares != 0 and cast.begins != 0
     if cast.shares != 0:
-        _divided(cast, numbers, floats)
+        _divided(cast, scratch)
     else:
-        for lane in range(LANES):
-            row = numbers[_ROW + lane]
-            floats[_DX + lane], floats[_DY + lane] = directions[row], directions[rows + row]
-            floats[_DZ + lane] = directions[2 * rows + row]
+        _look_up(scratch, cast.directions, cast.rows, _DX, _DY, _DZ)
     if cast.rotations != 0:
         _turn(cast, scratch, _DX, _DY, _DZ)
     if cast.delays != 0:
@@ -182,49 +198,94 @@ def begin(cast, block):  # type: ignore[no-untyped-def]
     return (cast.first + block) % total, pose, block - pose * each
 
 
+@stage
+def _look_up(scratch, table, rows, x, y, z):  # type: ignore[no-untyped-def]
+    """Copy vectors of the rows of a group to columns that begin at x, y and z."""
+    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(table)
+    for lane in range(LANES):
+        row = numbers[_ROW + lane]
+        floats[x + lane], floats[y + lane] = given[row], given[rows + row]
+        floats[z + lane] = given[2 * rows + row]
+
+
+@stage
+def _add_rows(scratch, table, rows):  # type: ignore[no-untyped-def]
+    """Add the starts of beams to those of their sub-rays."""
+    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(table)
+    for lane in range(LANES):
+        row = numbers[_ROW + lane]
+        floats[_OX + lane] = given[row] + floats[_OX + lane]
+        floats[_OY + lane] = given[rows + row] + floats[_OY + lane]
+        floats[_OZ + lane] = given[2 * rows + row] + floats[_OZ + lane]
+
+
+@stage
+def _add_one(scratch, positions):  # type: ignore[no-untyped-def]
+    """Add the position of the only pose to the starts of rays."""
+    floats, given = float64s(scratch), float64s(positions)
+    x, y, z = given[0], given[1], given[2]
+    for lane in range(LANES):
+        floats[_OX + lane], floats[_OY + lane] = floats[_OX + lane] + x, floats[_OY + lane] + y
+        floats[_OZ + lane] += z
+
+
+@stage
+def _add_each(scratch, positions, poses):  # type: ignore[no-untyped-def]
+    """Add the positions of poses to the starts of rays."""
+    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(positions)
+    for lane in range(LANES):
+        k = numbers[_POSE + lane]
+        floats[_OX + lane] += given[k]
+        floats[_OY + lane] += given[k + poses]
+        floats[_OZ + lane] += given[k + 2 * poses]
+
+
+@stage
+def _move(scratch, delays, velocities, poses):  # type: ignore[no-untyped-def]
+    """Move the starts of rays by the motion of their poses."""
+    numbers, floats = int64s(scratch), float64s(scratch)
+    after, speed = float64s(delays), float64s(velocities)
+    for lane in range(LANES):
+        k, delay = numbers[_POSE + lane], after[numbers[_WITHIN + lane]]
+        floats[_OX + lane] += delay * speed[k]
+        floats[_OY + lane] += delay * speed[k + poses]
+        floats[_OZ + lane] += delay * speed[k + 2 * poses]
+
+
+@stage
+def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
+    """Take the starts of rays to local coordinates."""
+    floats = float64s(scratch)
+    for lane in range(LANES):
+        floats[_OX + lane] = (floats[_OX + lane] - x) * scale
+        floats[_OY + lane] = (floats[_OY + lane] - y) * scale
+        floats[_OZ + lane] = (floats[_OZ + lane] - z) * scale
+
+
 @inlined
 def _place(cast, scratch, begins):  # type: ignore[no-untyped-def]
     """Write the local origins of a group's rays; sub-rays have starts already if it `begins`."""
-    numbers, floats = int64s(scratch), float64s(scratch)
-    if cast.poses == 1 and cast.delays == 0:  # all of one pose, which was not looked up
+    floats = float64s(scratch)
+    if begins:
+        if cast.origins != 0:
+            _add_rows(scratch, cast.origins, cast.rows)
+    elif cast.origins != 0:
+        _look_up(scratch, cast.origins, cast.rows, _OX, _OY, _OZ)
+    else:
         for lane in range(LANES):
-            numbers[_POSE + lane] = 0
-    rows, poses, positions = cast.rows, cast.poses, float64s(cast.positions)
-    if cast.origins != 0:
-        origins = float64s(cast.origins)
-        for lane in range(LANES):
-            row = numbers[_ROW + lane]
-            x, y, z = origins[row], origins[rows + row], origins[2 * rows + row]
-            if begins:
-                x, y, z = x + floats[_OX + lane], y + floats[_OY + lane], z + floats[_OZ + lane]
-            floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane] = x, y, z
+            floats[_OX + lane] = floats[_OY + lane] = floats[_OZ + lane] = 0.0
     if cast.origins != 0 or begins:
         if cast.rotations != 0:
             _turn(cast, scratch, _OX, _OY, _OZ)
         if cast.delays != 0:
             _drift(scratch, cast.poses, cast.delays, cast.rates, _OX, _OY, _OZ)
-        for lane in range(LANES):
-            k = numbers[_POSE + lane]
-            floats[_OX + lane] += positions[k]
-            floats[_OY + lane] += positions[k + poses]
-            floats[_OZ + lane] += positions[k + 2 * poses]
+    if cast.poses == 1:
+        _add_one(scratch, cast.positions)
     else:
-        for lane in range(LANES):
-            k = numbers[_POSE + lane]
-            floats[_OX + lane], floats[_OY + lane] = positions[k], positions[k + poses]
-            floats[_OZ + lane] = positions[k + 2 * poses]
+        _add_each(scratch, cast.positions, cast.poses)
     if cast.delays != 0:
-        delays, velocities = float64s(cast.delays), float64s(cast.velocities)
-        for lane in range(LANES):
-            k, delay = numbers[_POSE + lane], delays[numbers[_WITHIN + lane]]
-            floats[_OX + lane] += delay * velocities[k]
-            floats[_OY + lane] += delay * velocities[k + poses]
-            floats[_OZ + lane] += delay * velocities[k + 2 * poses]
-    cx, cy, cz, scale = cast.centre[0], cast.centre[1], cast.centre[2], cast.scale
-    for lane in range(LANES):
-        floats[_OX + lane] = (floats[_OX + lane] - cx) * scale
-        floats[_OY + lane] = (floats[_OY + lane] - cy) * scale
-        floats[_OZ + lane] = (floats[_OZ + lane] - cz) * scale
+        _move(scratch, cast.delays, cast.velocities, cast.poses)
+    _localise(scratch, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
 
 
 @inlined

@@ -136,7 +136,10 @@ class _Chunk:
     ) -> None:
         self._loops, self._moving, self._scan = loops, moving, scan
         self._times, self._ends = times, ends
-        self._rays = loops.made(scan, start, len(times))
+        ray = np.arange(start, start + len(times), dtype=np.int64)
+        origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
+        starts = np.broadcast_to(origins, directions.shape).T
+        self._rays = np.ascontiguousarray(starts), np.ascontiguousarray(directions.T)
 
     def hits(self) -> MovingHits:
         """Hits on all bodies, of which a ray may have several."""
@@ -208,8 +211,8 @@ class _Chunk:
         for one in np.unique(shape).tolist():
             own = np.flatnonzero(shape == one) if len(moving.shapes) > 1 else slice(None)
             rays = Rays(starts[own], ways[own], self._scan.t_min, self._scan.t_max)
-            given = rays, times[row[own]]
-            on, distance, triangle, instance = moving.shapes[one].nearest(*given)
+            met = moving.shapes[one].nearest(rays, times[row[own]])
+            on, distance, triangle, instance = met
             at = on if isinstance(own, slice) else own[on]
             # Directions of a sensor that turns during a pose are not quite of unit length.
             x, y, z = ways[at].T

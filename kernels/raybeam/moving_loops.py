@@ -1,4 +1,4 @@
-"""Loops of moving.py: they make rays, and compare them with bodies."""
+"""Loops of moving.py, which compare rays with bodies."""
 
 from __future__ import annotations
 
@@ -6,9 +6,6 @@ import numpy as np
 
 from .arrays import Floats, Indices, Ints
 from .compiled import compiled, inlined
-from .pattern import Pattern
-from .ray_loops import divided, drifted, turned
-from .scan import Scan, check_scan
 
 CELL = 64
 PADS_M = 1e-3  # around a box, and 2e-6 of how far away it is: far more than rounding
@@ -16,65 +13,6 @@ PADS_M = 1e-3  # around a box, and 2e-6 of how far away it is: far more than rou
 # normal of the plane that the rays lie near, and the sine of the greatest angle to it.
 AXIS, COSINE, SINE, MIDDLE, SPREAD, BEGIN, END, NORMAL, OFF = 0, 3, 4, 5, 8, 9, 10, 11, 14
 _TINY = 1e-300
-
-
-def made(scan: Scan, start: int, count: int) -> tuple[Floats, Floats]:
-    """Make rays with the bits of `Pattern.made`: origins and directions, (3, n) each."""
-    pattern, poses, motion = scan.pattern, scan.poses, scan.poses.motion
-    none = np.zeros((0, 3))
-    shifts = none if pattern.origins is None else pattern.origins.T
-    shifts.flags.writeable = False  # as those of patterns: they are of one type then
-    rotations = none if poses.rotations is None else poses.rotations
-    velocities, rates = (none, none) if motion is None else (motion.velocities, motion.rates)
-    own = slice(start // poses.rays, (start + count - 1) // poses.rays + 1)
-    tables = (poses.positions, rotations, velocities, rates)
-    copies = (
-        np.array(table[own], np.float64, order="C").reshape(-1, 9 if table is rotations else 3)
-        for table in tables
-    )
-    delays = np.zeros(0) if motion is None else np.array(motion.delays, np.float64)
-    origins, directions = np.empty((2, 3, count))
-    rays = scan.first + start, start % poses.rays, poses.rays
-    table, offsets, axis = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0)
-    if pattern.sub_rays is not None:
-        table = pattern.sub_rays.table(pattern.offsets)
-        offsets = offsets if pattern.offsets is None else pattern.offsets
-        axis = axis if pattern.sub_rays.axis is None else np.array(pattern.sub_rays.axis, float)
-    parts = table, offsets, axis
-    _make(pattern.directions.T, shifts, *parts, *copies, delays, *rays, origins, directions)
-    return origins, directions
-
-
-@compiled()
-def _make(  # type: ignore[no-untyped-def]
-    ahead, shifts, shares, offsets, axis, positions, rotations, velocities, rates, delays,
-    first, start, each, origins, directions,
-):  # fmt: skip
-    rows, delay, subrays = ahead.shape[1], 0.0, max(shares.shape[1], 1)
-    for k in range(origins.shape[1]):
-        part, pose = (first + k) % (rows * subrays), (start + k) // each
-        row = part // subrays
-        dx, dy, dz = ahead[0, row], ahead[1, row], ahead[2, row]
-        x, y, z = 0.0, 0.0, 0.0
-        if shifts.shape[1] == rows:
-            x, y, z = shifts[0, row], shifts[1, row], shifts[2, row]
-        if shares.shape[1]:
-            part -= row * subrays
-            dx, dy, dz, u, v, w = divided(shares, offsets, axis, row, part, dx, dy, dz)
-            x, y, z = x + u, y + v, z + w
-        if len(rotations):
-            dx, dy, dz = turned(rotations[pose], dx, dy, dz)
-            x, y, z = turned(rotations[pose], x, y, z)
-        if len(delays):
-            delay = delays[(start + k) % each]
-            dx, dy, dz = drifted(rates[pose], delay, dx, dy, dz)
-            x, y, z = drifted(rates[pose], delay, x, y, z)
-        x, y, z = x + positions[pose, 0], y + positions[pose, 1], z + positions[pose, 2]
-        if len(delays):
-            x, y = x + delay * velocities[pose, 0], y + delay * velocities[pose, 1]
-            z = z + delay * velocities[pose, 2]
-        origins[0, k], origins[1, k], origins[2, k] = x, y, z
-        directions[0, k], directions[1, k], directions[2, k] = dx, dy, dz
 
 
 @compiled("f8[:, ::1](f8[:, ::1], f8[:, ::1], f8[::1])")
@@ -304,7 +242,3 @@ def nearest(row: Ints, distance: Floats, body: Ints, count: int) -> Indices:
     """Hits that are the nearest of their rays, in ray order; of equal ones the first body's."""
     found: Indices = _nearest(*map(np.ascontiguousarray, (row, distance, body)), count)
     return found
-
-
-# Compiled or loaded with the others: read-only arrays have no place in a signature.
-made(check_scan(Pattern([[1, 0, 0]]), [0, 0, 0]), 0, 1)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from functools import cached_property
+from functools import cache, cached_property
+from importlib.util import find_spec
 from operator import index
 
 import numpy as np
@@ -155,37 +156,55 @@ class Pattern:
         return self.made(first, ray, poses)
 
     def made(self, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
-        """Make checked rays; see `rays`, of which `first` is the start.
+        """Make checked rays, in compiled loops if numba is installed; see `plain_rays`."""
+        if not (_compiles() and len(ray)):
+            return plain_rays(self, first, ray, poses)
+        from . import ray_loops  # not before: numba takes half a second to import
 
-        Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
-        lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
-        """
-        sub_rays = self.sub_rays
-        one = len(poses) == 1 and self._origins is None and poses.motion is None
-        one &= sub_rays is None or sub_rays.starts is None
-        places, directions = np.empty((2, 3, len(ray)))
-        room = np.empty((18, min(len(ray), _BLOCK)))
-        for start in range(0, len(ray), _BLOCK):
-            block = slice(start, start + _BLOCK)
-            some = ray[block]
-            row, these = first + some, poses.of(some, room[:, : len(some)])
-            row -= row // len(self) * len(self)  # takes half as long as the remainder
-            beam = row if sub_rays is None else row // len(sub_rays)
-            ahead, begun = _columns(self._directions, beam), None
-            if sub_rays is not None:
-                own = None if self.offsets is None else self.offsets[:, beam]
-                ahead, begun = spread(sub_rays, ahead, row - beam * len(sub_rays), own)
-            directions[:, block] = these.turned(ahead)
-            if one:
-                continue
-            at = these.positions
-            if self._origins is not None:
-                here = _columns(self._origins, beam)
-                begun = here if begun is None else here + begun
-            if begun is not None:
-                at = these.turned(begun) + at
-            places[:, block] = these.moved(at)
-        return (poses.positions if one else places.T), directions.T
+        origins, directions = ray_loops.made(self, first, ray, poses)
+        return (poses.positions if self.starts_at_once(poses) else origins.T), directions.T
+
+    def starts_at_once(self, poses: Poses) -> bool:
+        """Whether all rays start at one position."""
+        aside = self._origins is not None or (self.sub_rays and self.sub_rays.starts is not None)
+        return len(poses) == 1 and poses.motion is None and not aside
+
+
+def plain_rays(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
+    """Make checked rays; see `Pattern.rays`, of which `first` is the start.
+
+    Vectors are rotated to the mesh's axes, then translated: ``((x a + y b) + z c) + p``; if the
+    lidar moves within a pose, ``v + t (w x v)`` and ``p + t u`` follow each step.
+    """
+    sub_rays, one = pattern.sub_rays, pattern.starts_at_once(poses)
+    places, directions = np.empty((2, 3, len(ray)))
+    room = np.empty((18, min(len(ray), _BLOCK)))
+    for start in range(0, len(ray), _BLOCK):
+        block = slice(start, start + _BLOCK)
+        some = ray[block]
+        row, these = first + some, poses.of(some, room[:, : len(some)])
+        row -= row // len(pattern) * len(pattern)  # takes half as long as the remainder
+        beam = row // pattern.each
+        ahead, begun = _columns(pattern.directions.T, beam), None
+        if sub_rays is not None:
+            own = None if pattern.offsets is None else pattern.offsets[:, beam]
+            ahead, begun = spread(sub_rays, ahead, row - beam * len(sub_rays), own)
+        directions[:, block] = these.turned(ahead)
+        if one:
+            continue
+        at = these.positions
+        if pattern.origins is not None:
+            here = _columns(pattern.origins.T, beam)
+            begun = here if begun is None else here + begun
+        if begun is not None:
+            at = these.turned(begun) + at
+        places[:, block] = these.moved(at)
+    return (poses.positions if one else places.T), directions.T
+
+
+@cache
+def _compiles() -> bool:
+    return find_spec("numba") is not None
 
 
 def _columns(table: Floats, row: Ints) -> Floats:

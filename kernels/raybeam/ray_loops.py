@@ -1,10 +1,20 @@
-"""What rays are made of, one by one, in compiled loops; with the operations of `Pattern.made`."""
+"""The rays of a pattern, made one by one in compiled loops, with the operations of `plain_rays`."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
-from .compiled import inlined
+from .arrays import Floats, Ints
+from .compiled import compiled, inlined
+from .poses import Poses
+
+
+@inlined
+def whole_times(number, other):  # type: ignore[no-untyped-def]
+    """How many times a whole number is in another, both below 2^52: faster than `//`, and exact."""
+    return np.int64(np.float64(number) / np.float64(other))
 
 
 @inlined
@@ -66,3 +76,78 @@ def divided(shares, offsets, axis, beam, k, x, y, z):  # type: ignore[no-untyped
     z = (straight * z + across * c) + up * f
     p, q = shares[3, k], shares[4, k]
     return x, y, z, p * a + q * d, p * b + q * e, p * c + q * f
+
+
+def made(pattern: Any, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Floats]:
+    """Make rays of a pattern, see `Pattern.made`: origins and directions, (3, n) each."""
+    motion, sub_rays, none = poses.motion, pattern.sub_rays, np.zeros((0, 3))
+    shifts = none if pattern.origins is None else pattern.origins.T
+    shifts.flags.writeable = False  # as those of patterns: they are of one type then
+    rotations = none if poses.rotations is None else poses.rotations
+    velocities, rates = (none, none) if motion is None else (motion.velocities, motion.rates)
+    start = int(ray.min()) // poses.rays
+    own = slice(start, int(ray.max()) // poses.rays + 1)
+    copies = (
+        np.array(table[own], np.float64, order="C").reshape(-1, 9 if table is rotations else 3)
+        for table in (poses.positions, rotations, velocities, rates)
+    )
+    delays = np.zeros(0) if motion is None else np.array(motion.delays, np.float64)
+    shares, offsets, axis = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0)
+    if sub_rays is not None:
+        shares = sub_rays.table(pattern.offsets)
+        offsets = offsets if pattern.offsets is None else pattern.offsets
+        axis = axis if sub_rays.axis is None else np.array(sub_rays.axis, np.float64)
+    origins, directions = np.empty((2, 3, len(ray)))
+    numbers = np.array(ray, np.int64) - start * poses.rays
+    given = pattern.directions.T, shifts, shares, offsets, axis, *copies, delays
+    _make(*given, first + start * poses.rays, numbers, poses.rays, origins, directions)
+    return origins, directions
+
+
+@compiled()
+def _make(  # type: ignore[no-untyped-def]
+    ahead, shifts, shares, offsets, axis, positions, rotations, velocities, rates, delays,
+    first, rays, each, origins, directions,
+):  # fmt: skip
+    rows, delay, subrays = ahead.shape[1], 0.0, max(shares.shape[1], 1)
+    total = rows * subrays
+    for k in range(len(rays)):
+        part, pose = first + rays[k], 0
+        if part >= total:
+            part %= total
+        row = part if subrays == 1 else whole_times(part, subrays)
+        if len(positions) > 1:
+            pose = whole_times(rays[k], each)
+        dx, dy, dz = ahead[0, row], ahead[1, row], ahead[2, row]
+        x, y, z = 0.0, 0.0, 0.0
+        if shifts.shape[1] == rows:
+            x, y, z = shifts[0, row], shifts[1, row], shifts[2, row]
+        if shares.shape[1]:
+            part -= row * subrays
+            dx, dy, dz, u, v, w = divided(shares, offsets, axis, row, part, dx, dy, dz)
+            x, y, z = x + u, y + v, z + w
+        if len(rotations):
+            dx, dy, dz = turned(rotations[pose], dx, dy, dz)
+            x, y, z = turned(rotations[pose], x, y, z)
+        if len(delays):
+            delay = delays[rays[k] - pose * each]
+            dx, dy, dz = drifted(rates[pose], delay, dx, dy, dz)
+            x, y, z = drifted(rates[pose], delay, x, y, z)
+        x, y, z = x + positions[pose, 0], y + positions[pose, 1], z + positions[pose, 2]
+        if len(delays):
+            x, y = x + delay * velocities[pose, 0], y + delay * velocities[pose, 1]
+            z = z + delay * velocities[pose, 2]
+        origins[0, k], origins[1, k], origins[2, k] = x, y, z
+        directions[0, k], directions[1, k], directions[2, k] = dx, dy, dz
+
+
+def _load() -> None:
+    """Compile the loop, or load it, with the others: a signature has no read-only arrays."""
+    fixed, none = np.zeros((3, 1)), np.zeros((0, 3))
+    fixed.flags.writeable = none.flags.writeable = False
+    tables = (np.zeros((1, 3)), np.zeros((1, 9)), np.zeros((1, 3)), np.zeros((1, 3)))
+    parts = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0), *tables, np.zeros(1)
+    _make(fixed, none, *parts, 0, np.zeros(0, np.int64), 1, np.zeros((3, 0)), np.zeros((3, 0)))
+
+
+_load()

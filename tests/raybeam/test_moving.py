@@ -145,7 +145,7 @@ def test_loops_that_are_not_compiled_give_the_same(monkeypatch):
     scan, times, _ = scans("moving")
     moving = Bodies(20, 1).moving("numpy")
     compiled = listed(hits_on(moving, scan, lambda ray: times[ray]))
-    for name in ("_make", "cells_of", "_meet", "_through", "_local", "_nearest"):
+    for name in ("cells_of", "_meet", "_through", "_local", "_nearest"):
         loop = getattr(moving_loops, name)
         monkeypatch.setattr(moving_loops, name, getattr(loop, "py_func", loop))
     assert listed(hits_on(moving, scan, lambda ray: times[ray])) == compiled != []

@@ -13,6 +13,8 @@ from raybeam import (
     check_scan,
     hits_on,
 )
+from raybeam.pattern import plain_rays
+from raybeam.poses import check_poses
 
 RINGS, FIRINGS = 7, 45
 
@@ -62,6 +64,22 @@ def test_a_scan_has_the_bits_of_rays_made_one_by_one(backend, shapes, place, kin
         assert np.array_equal(returns.ray, np.flatnonzero(hits.hit))
         assert np.array_equal(returns.distance, hits.distance[hits.hit])
         assert np.array_equal(returns.triangle, hits.triangle[hits.hit])
+
+
+@pytest.mark.parametrize("place", ["stands", "turns", "moves", "far away"])
+@pytest.mark.parametrize("kind", ["none", "origins", "", "axis starts offsets", "starts origins"])
+def test_loops_make_the_rays_of_numpy(place, kind):
+    rng = np.random.default_rng(9)
+    given = pattern(rng, 7, kind)
+    if kind in ("none", "origins"):
+        given = Pattern(given.directions, given.origins)
+    where = {"rotations": None, "rays_per_pose": None, **poses(rng, place, len(given))}
+    ray = rng.permutation(len(given))[: len(given) // 2]
+    made = given.rays(ray, **where, start=4)
+    asked = where["positions"], where["rotations"], where["rays_per_pose"], len(given)
+    plain = plain_rays(given, 4, ray, check_poses(*asked, where.get("motion")))
+    for one, other in zip(made, plain, strict=True):
+        assert np.array_equal(one, other)
 
 
 def test_angles_and_starts_of_sub_rays_are_those_given():
