@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import ClassVar
 
@@ -114,14 +114,20 @@ class Backend(ABC):
     def scan(self, scan: Scan) -> ScanReturns:
         """Closest hits of a scan's rays: the kept ones, and counts of all."""
         collector = Collector(scan, self._scene.face_count)
+        for start, stop, (ray, distance, triangle, instance) in self.parts(scan):
+            if scan.tally:
+                collector.tally(self._scene.tally_rows(instance, triangle))
+            kept = collector.keep(ray, start, stop)
+            collector.add(start, ray[kept], distance[kept], triangle[kept], instance[kept])
+        return collector.result()
+
+    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
+        """Rays of a scan, from one to another in ray order, and their hits, numbered from these."""
         for start, stop in scan.chunks(self.chunk):
             found = self.closest(scan.rays(start, stop))
-            collector.tally(self._scene.tally_rows(found.instance, found.triangle))
-            kept = collector.keep(found.ray, start, stop)
-            distance = found.t[kept] / self._scene.frame.scale
-            hits = found.triangle[kept], found.instance[kept]
-            collector.add(start, found.ray[kept], distance, *hits)
-        return collector.result()
+            distance = found.t / self._scene.frame.scale
+            ray = found.ray.astype(np.uint32, copy=False)
+            yield start, stop, (ray, distance, found.triangle, found.instance)
 
     def visit(
         self,

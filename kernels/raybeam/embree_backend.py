@@ -17,12 +17,12 @@ import numpy as np
 from . import embree_library
 from .arrays import AnyArray, Floats
 from .backend import Backend, Found
-from .hits import Part, ScanReturns, joined
+from .hits import Part, joined
 from .instances import Scene
 from .mesh import NEAR
 from .poses import Poses
 from .rays import Rays
-from .scan import Collector, Scan
+from .scan import Scan
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 # Cosine of 20 degrees. Packets of 16 rays within that are cast four to six times as fast as single
@@ -145,20 +145,14 @@ class EmbreeBackend(Backend):
         """See `Backend.nearest`."""
         return self._cast(self._of_rays(rays.part(0, len(rays))), 0, len(rays))
 
-    def scan(self, scan: Scan) -> ScanReturns:
-        """See `Backend.scan`."""
-        collector = Collector(scan, self._scene.face_count)
+    def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
+        """See `Backend.parts`."""
         cast, plan = self._of_scan(scan), self._plan(scan)
         for start, stop in scan.chunks(self.chunk):
             for begin, end, tried in plan.pieces(start, stop):
-                ray, distance, triangle, instance = self._cast(cast, begin, end, plan.ways[0])
+                yield begin, end, self._cast(cast, begin, end, plan.ways[0])
                 if tried:
                     plan.choose(partial(self._cast, cast, begin, end))
-                if scan.tally:
-                    collector.tally(self._scene.tally_rows(instance, triangle))
-                kept = collector.keep(ray, begin, end)
-                collector.add(begin, ray[kept], distance[kept], triangle[kept], instance[kept])
-        return collector.result()
 
     def _of_rays(self, rays: Rays) -> _Cast:
         """Prepare to cast rays that are not of a pattern."""
@@ -240,8 +234,8 @@ class EmbreeBackend(Backend):
             own["step"], own["high"], own["wide"] = way.step, way.high, way.wide
             own["coherence"], own["before"] = way.coherence, start
             own["scratch"], own["room"] = _own.memory(way.step * way.high)
-            own["ray"], own["distance"] = _address(ray[at:]), _address(distance[at:])
-            own["triangle"], own["instance"] = _address(triangle[at:]), _address(instance[at:])
+            own["ray"], own["distance"] = ray[at:].ctypes.data, distance[at:].ctypes.data
+            own["triangle"], own["instance"] = triangle[at:].ctypes.data, instance[at:].ctypes.data
             count = self._loops.trace(own, begin, min(begin + share, stop))
             here = slice(at, at + count)
             return ray[here], distance[here], triangle[here], instance[here]
@@ -327,10 +321,6 @@ def _spread(scan: Scan, way: _Way) -> float:
     _, directions = scan.pattern.made(scan.first, ray.reshape(-1), scan.poses)
     packets = directions.reshape(-1, len(lags), 3)
     return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())
-
-
-def _address(array: AnyArray) -> int:
-    return int(array.ctypes.data)
 
 
 class _Cast:

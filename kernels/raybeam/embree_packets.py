@@ -12,38 +12,11 @@ from typing import Any
 import numpy as np
 from numba import types
 
+from . import embree_exact as exact
 from . import embree_memory as memory
 from .compiled import compiled, inlined, stage
-from .embree_exact import (
-    CALL_FILTER,
-    COHERENT,
-    FAR,
-    MARGIN,
-    along,
-    areas,
-    begun,
-    corners_of,
-    decided,
-    entered,
-    shear,
-    shear_all,
-    single,
-    verify,
-    verify_all,
-)
-from .embree_memory import (
-    CASTS,
-    LANES,
-    NUMBER,
-    at,
-    float32s,
-    float64s,
-    int32s,
-    int64s,
-    offset,
-    uint32s,
-)
-from .embree_rays import begin, make, stand
+from .embree_memory import LANES, NUMBER, at, float32s, float64s, int32s, int64s, offset
+from .embree_rays import begin, make, set_out
 
 _ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
 _VALID_AT, _PACKET, _PACKET_AT = offset("valid"), at("packet"), offset("packet")
@@ -53,7 +26,7 @@ _MESH, _INSTANCES, _MASKED = at("mesh"), at("instances"), at("masked")
 _T_MIN, _T_MAX, _SCENE, _NEARBY = at("t_min"), at("t_max"), at("scene"), at("nearby")
 _INSIDE, _ROUGH, _ONE, _OTHER = at("inside"), at("rough"), at("one"), at("other")
 _ROUGH_32, _ONE_32, _OTHER_32 = at("rough_32"), at("one_32"), at("other_32")
-_T, _KEY, _SURE = at("t"), at("key"), at("sure")
+_T, _KEY, _SURE, _POSE = at("t"), at("key"), at("sure"), at("pose")
 f64_1, f64_2, i32_1 = types.float64[::1], types.float64[:, ::1], types.int32[::1]
 _FIELDS = 22  # numbers of a ray of a packet
 _MESH_OF = memory.INSTANCE.fields["mesh"][1] // 8  # type: ignore[index]
@@ -77,14 +50,14 @@ def _prepare(cast):  # type: ignore[no-untyped-def]
     numbers[_MESH], numbers[_INSTANCES], numbers[_MASKED] = cast.mesh, cast.instances, cast.masked
     floats[_T_MIN], floats[_T_MAX], numbers[_LANE] = cast.t_min, cast.t_max, 0
     numbers[_SCENE], numbers[_NEARBY] = cast.scene, cast.nearby
-    numbers[_ARGUMENTS] = np.int64(-1) << 32 | CALL_FILTER | COHERENT  # all features
+    numbers[_ARGUMENTS] = np.int64(-1) << 32 | exact.CALL_FILTER | exact.COHERENT  # all features
     numbers[_ARGUMENTS + 1] = scratch
     numbers[_ARGUMENTS + 3] = numbers[_ARGUMENTS + 4] = 0
     if width > 1:
         for packet in range(0, LANES, width):
             ray = _PACKET + _FIELDS * packet
             for k in range(ray, ray + width):
-                rays[k + 3 * width] = np.float32(max(cast.t_min - MARGIN, 0.0))
+                rays[k + 3 * width] = np.float32(max(cast.t_min - exact.MARGIN, 0.0))
                 rays[k + 7 * width] = np.float32(0)
                 whole[k + 9 * width], whole[k + 10 * width] = -1, 0
                 whole[k + 11 * width] = 0
@@ -106,32 +79,23 @@ def _filler(width: int) -> Any:
     """Make what gives packets of a size their rays: with a constant, in vector instructions."""
 
     @stage
-    def starts(scratch, t_min):  # type: ignore[no-untyped-def]
-        """Origins, and distances from which hits count."""
+    def fill(scratch, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
+        """Origins and distances from which hits count, if not `fixed`; directions and reaches."""
         rays, floats = float32s(scratch), float64s(scratch)
-        for lane in range(LANES):
-            k, entry = _PACKET + (_FIELDS - 1) * (lane & -width) + lane, floats[_ENTRY + lane]
-            rays[k] = begun(floats[_OX + lane], floats[_DX + lane], entry)
-            rays[k + width] = begun(floats[_OY + lane], floats[_DY + lane], entry)
-            rays[k + 2 * width] = begun(floats[_OZ + lane], floats[_DZ + lane], entry)
-            rays[k + 3 * width] = np.float32(max(t_min - entry - MARGIN, 0.0))
-
-    @stage
-    def ahead(scratch, t_max):  # type: ignore[no-untyped-def]
-        """Directions, and distances up to which hits count."""
-        rays, floats = float32s(scratch), float64s(scratch)
+        if not fixed:
+            for lane in range(LANES):
+                k, entry = _PACKET + (_FIELDS - 1) * (lane & -width) + lane, floats[_ENTRY + lane]
+                rays[k] = exact.begun(floats[_OX + lane], floats[_DX + lane], entry)
+                rays[k + width] = exact.begun(floats[_OY + lane], floats[_DY + lane], entry)
+                rays[k + 2 * width] = exact.begun(floats[_OZ + lane], floats[_DZ + lane], entry)
+                rays[k + 3 * width] = np.float32(max(t_min - entry - exact.MARGIN, 0.0))
         for lane in range(LANES):
             k = _PACKET + (_FIELDS - 1) * (lane & -width) + lane
+            far = min(t_max - floats[_ENTRY + lane] + exact.MARGIN, exact.FAR)
             rays[k + 4 * width] = np.float32(floats[_DX + lane])
             rays[k + 5 * width] = np.float32(floats[_DY + lane])
             rays[k + 6 * width] = np.float32(floats[_DZ + lane])
-            rays[k + 8 * width] = np.float32(min(t_max - floats[_ENTRY + lane] + MARGIN, FAR))
-
-    @inlined
-    def fill(scratch, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
-        if not fixed:
-            starts(scratch, t_min)
-        ahead(scratch, t_max)
+            rays[k + 8 * width] = np.float32(far)
 
     return fill
 
@@ -148,14 +112,6 @@ def _fill(scratch, width, t_min, t_max, fixed):  # type: ignore[no-untyped-def]
         _fill_8(scratch, t_min, t_max, fixed)
     else:
         _fill_4(scratch, t_min, t_max, fixed)
-
-
-@stage
-def _whole(scratch, first):  # type: ignore[no-untyped-def]
-    """Take all rays of a group, of which the first has a number in the block."""
-    numbers = int64s(scratch)
-    for lane in range(LANES):
-        numbers[_RAY + lane] = first + numbers[_TILE + lane]
 
 
 @stage
@@ -193,31 +149,22 @@ def _found(scratch):  # type: ignore[no-untyped-def]
     for lane in range(LANES):
         found += np.int64(integers[_ONE_32 + lane] >= 0)
     for lane in range(LANES):
-        straight += np.int64(along(floats, lane))
+        straight += np.int64(exact.along(floats, lane))
     return found, straight
-
-
-@stage
-def _unsure(scratch):  # type: ignore[no-untyped-def]
-    """How many rays of a group have to be cast again."""
-    numbers, sure = int64s(scratch), np.int64(0)
-    for lane in range(LANES):
-        sure += numbers[_SURE + lane]
-    return LANES - sure
 
 
 @stage
 def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def]
     """Cast the rays of a group one by one."""
     numbers, flags = int64s(scratch), int32s(scratch + _ARGUMENTS_AT)
-    flags[0], numbers[_FILTER] = CALL_FILTER, proposer
+    flags[0], numbers[_FILTER] = exact.CALL_FILTER, proposer
     for lane in range(LANES):
         if numbers[_REAL + lane]:
-            single(scene, scratch, lane, t_max)
-    flags[0] = CALL_FILTER | COHERENT
+            exact.single(scene, scratch, lane, t_max)
+    flags[0] = exact.CALL_FILTER | exact.COHERENT
 
 
-@compiled(types.int64(CASTS, types.int64, types.int64))
+@compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     """Cast rays `start` to `stop`, and write those that hit in their order; returns their number.
 
@@ -232,43 +179,32 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     shift = 0 if wide == 1 else (1 if wide == 2 else 2)
     metre, index, indexed = 1.0 / cast.scale, int32s(cast.index), cast.index != 0
     numbers, floats = int64s(scratch), float64s(scratch)
-    valid, plain = int32s(scratch + _VALID_AT), instances == 0 and not masked
+    plain = instances == 0 and not masked
     table = float64s(int64s(mesh)[0])
     span = step * high
     distances, places = float64s(cast.room), int32s(cast.room + 8 * span)
     numbered = int32s(cast.room + 12 * span)
-    out_ray, out_metres = uint32s(cast.ray), float64s(cast.distance)
+    out_ray, out_metres = memory.uint32s(cast.ray), float64s(cast.distance)
     out_triangle, out_instance = int32s(cast.triangle), int32s(cast.instance)
     _prepare(cast)
     fixed = still and near
-    if still:
-        stand(cast, floats)
-        if width > 1:
-            _fill(scratch, width, t_min, t_max, False)
-    if near:
-        for lane in range(LANES):
-            floats[_ENTRY + lane] = 0.0
     for lane in range(LANES):
         numbers[_TILE + lane] = (lane >> shift) * step + (lane & (wide - 1))
-        numbers[_REAL + lane], valid[lane] = 1, -1
-    kept, partial = 0, False
+        numbers[_POSE + lane], floats[_ENTRY + lane] = 0, 0.0
+    if still:
+        set_out(cast, scratch, False)
+        if width > 1:
+            _fill(scratch, width, t_min, t_max, False)
+    kept = 0
     for block in range(start, stop, span):
         count = min(span, stop - block)
         begins = begin(cast, block)
         for column in range(0, min(step, count), wide):
-            real = LANES
-            if count == span and column + wide <= step:
-                _whole(scratch, column)
-                if partial:
-                    for lane in range(LANES):
-                        numbers[_REAL + lane], valid[lane] = 1, -1
-                    partial = False
-            else:
-                real, partial = _reals(scratch, column, wide, step, count), True
+            real = _reals(scratch, column, wide, step, count)
             make(cast, scratch, begins)
             _reset(scratch, plain)
             if masked and instances == 0:  # `propose` looks at masks
-                shear_all(scratch)
+                exact.shear_all(scratch)
             if width == 1 or real == 1 or _apart(floats, coherence):
                 _one_by_one(scene, scratch, alone, t_max)
             else:
@@ -293,16 +229,15 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
                     places[numbers[_RAY + lane]] = -1
                 continue
             if plain:
-                verify_all(table, scratch, t_min)
+                exact.verify_all(table, scratch, t_min)
             else:
                 for lane in range(LANES):
-                    verify(mesh, instances, numbers, floats, lane)
-            if straight + _unsure(scratch):
-                numbers[_FILTER] = decide
-                for lane in range(LANES):
-                    again = numbers[_SURE + lane] == 0 or along(floats, lane)
-                    if again and numbers[_REAL + lane]:
-                        decided(scene, scratch, lane, t_max)
+                    exact.verify(mesh, instances, numbers, floats, lane)
+            for lane in range(LANES):
+                again = numbers[_SURE + lane] == 0 or (straight and exact.along(floats, lane))
+                if again and numbers[_REAL + lane]:
+                    numbers[_FILTER] = decide
+                    exact.decided(scene, scratch, lane, t_max)
             for back in range(LANES):  # copies of the first come before it
                 lane = LANES - 1 - back
                 to, t, key = numbers[_RAY + lane], floats[_T + lane], numbers[_KEY + lane]
@@ -323,7 +258,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     return kept
 
 
-@compiled(types.void(CASTS, f64_2, f64_2, i32_1, i32_1, f64_1, f64_1))
+@compiled(types.void(memory.CASTS, f64_2, f64_2, i32_1, i32_1, f64_1, f64_1))
 def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no-untyped-def]
     """Write weights of the second and third corner for hits of rays (m, 3), local to the scene.
 
@@ -338,10 +273,10 @@ def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no
             address = instances + _RECORD * np.int64(instance[k])
             record = int64s(address)
             mesh_at, at = record[_MESH_OF], at - record[_FIRST_PLACE]
-            ox, oy, oz, dx, dy, dz, _ = entered(float64s(address), ox, oy, oz, dx, dy, dz)
-        axis, p, q, r, sx, sy, sz = shear(ox, oy, oz, dx, dy, dz)
-        triangle = corners_of(float64s(int64s(mesh_at)[0]), at, axis)
-        a, b, c, det, _ = areas(triangle, (p, q, r, sx, sy, sz))
+            ox, oy, oz, dx, dy, dz, _ = exact.entered(float64s(address), ox, oy, oz, dx, dy, dz)
+        axis, p, q, r, sx, sy, sz = exact.shear(ox, oy, oz, dx, dy, dz)
+        triangle = exact.corners_of(float64s(int64s(mesh_at)[0]), at, axis)
+        a, b, c, det, _ = exact.areas(triangle, (p, q, r, sx, sy, sz))
         sign = -1.0 if det < 0 else 1.0  # outside by float32's rounding: at the edge
         a, b, c = max(sign * a, 0.0), max(sign * b, 0.0), max(sign * c, 0.0)
         total = (a + b) + c

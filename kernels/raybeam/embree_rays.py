@@ -169,19 +169,19 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
     """
     floats = float64s(scratch)
     _rows(scratch, block[0], cast.rows * cast.subrays)
-    if cast.poses > 1 or cast.delays != 0:
+    if cast.still == 0:
         _poses(scratch, block[1], block[2], cast.each)
     begins = cast.shares != 0 and cast.begins != 0
     if cast.shares != 0:
         _divided(cast, scratch)
     else:
-        _look_up(scratch, cast.directions, cast.rows, _DX, _DY, _DZ)
+        _look_up(scratch, cast.directions, cast.rows)
     if cast.rotations != 0:
         _turn(cast, scratch, _DX, _DY, _DZ)
     if cast.delays != 0:
         _drift(scratch, cast.poses, cast.delays, cast.rates, _DX, _DY, _DZ)
     if cast.still == 0:
-        _place(cast, scratch, begins)
+        set_out(cast, scratch, begins)
     if cast.near == 0:
         low, high = cast.low, cast.upper
         for lane in range(LANES):
@@ -199,45 +199,24 @@ def begin(cast, block):  # type: ignore[no-untyped-def]
 
 
 @stage
-def _look_up(scratch, table, rows, x, y, z):  # type: ignore[no-untyped-def]
-    """Copy vectors of the rows of a group to columns that begin at x, y and z."""
-    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(table)
+def _look_up(scratch, directions, rows):  # type: ignore[no-untyped-def]
+    """Look up the directions of a group."""
+    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(directions)
     for lane in range(LANES):
         row = numbers[_ROW + lane]
-        floats[x + lane], floats[y + lane] = given[row], given[rows + row]
-        floats[z + lane] = given[2 * rows + row]
+        floats[_DX + lane], floats[_DY + lane] = given[row], given[rows + row]
+        floats[_DZ + lane] = given[2 * rows + row]
 
 
 @stage
-def _add_rows(scratch, table, rows):  # type: ignore[no-untyped-def]
-    """Add the starts of beams to those of their sub-rays."""
+def _add(scratch, table, count, number):  # type: ignore[no-untyped-def]
+    """Add vectors of a table, of `count` of them those with the `number` of each ray, to starts."""
     numbers, floats, given = int64s(scratch), float64s(scratch), float64s(table)
     for lane in range(LANES):
-        row = numbers[_ROW + lane]
-        floats[_OX + lane] = given[row] + floats[_OX + lane]
-        floats[_OY + lane] = given[rows + row] + floats[_OY + lane]
-        floats[_OZ + lane] = given[2 * rows + row] + floats[_OZ + lane]
-
-
-@stage
-def _add_one(scratch, positions):  # type: ignore[no-untyped-def]
-    """Add the position of the only pose to the starts of rays."""
-    floats, given = float64s(scratch), float64s(positions)
-    x, y, z = given[0], given[1], given[2]
-    for lane in range(LANES):
-        floats[_OX + lane], floats[_OY + lane] = floats[_OX + lane] + x, floats[_OY + lane] + y
-        floats[_OZ + lane] += z
-
-
-@stage
-def _add_each(scratch, positions, poses):  # type: ignore[no-untyped-def]
-    """Add the positions of poses to the starts of rays."""
-    numbers, floats, given = int64s(scratch), float64s(scratch), float64s(positions)
-    for lane in range(LANES):
-        k = numbers[_POSE + lane]
+        k = numbers[number + lane]
         floats[_OX + lane] += given[k]
-        floats[_OY + lane] += given[k + poses]
-        floats[_OZ + lane] += given[k + 2 * poses]
+        floats[_OY + lane] += given[k + count]
+        floats[_OZ + lane] += given[k + 2 * count]
 
 
 @stage
@@ -263,41 +242,23 @@ def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _place(cast, scratch, begins):  # type: ignore[no-untyped-def]
+def set_out(cast, scratch, begins):  # type: ignore[no-untyped-def]
     """Write the local origins of a group's rays; sub-rays have starts already if it `begins`."""
     floats = float64s(scratch)
-    if begins:
-        if cast.origins != 0:
-            _add_rows(scratch, cast.origins, cast.rows)
-    elif cast.origins != 0:
-        _look_up(scratch, cast.origins, cast.rows, _OX, _OY, _OZ)
-    else:
+    if not begins:
         for lane in range(LANES):
             floats[_OX + lane] = floats[_OY + lane] = floats[_OZ + lane] = 0.0
+    if cast.origins != 0:
+        _add(scratch, cast.origins, cast.rows, _ROW)
     if cast.origins != 0 or begins:
         if cast.rotations != 0:
             _turn(cast, scratch, _OX, _OY, _OZ)
         if cast.delays != 0:
             _drift(scratch, cast.poses, cast.delays, cast.rates, _OX, _OY, _OZ)
-    if cast.poses == 1:
-        _add_one(scratch, cast.positions)
-    else:
-        _add_each(scratch, cast.positions, cast.poses)
+    _add(scratch, cast.positions, cast.poses, _POSE)
     if cast.delays != 0:
         _move(scratch, cast.delays, cast.velocities, cast.poses)
     _localise(scratch, cast.centre[0], cast.centre[1], cast.centre[2], cast.scale)
-
-
-@inlined
-def stand(cast, floats):  # type: ignore[no-untyped-def]
-    """Write the local origins of rays that all start at one position."""
-    positions, centre, scale = float64s(cast.positions), cast.centre, cast.scale
-    cx, cy, cz = centre[0], centre[1], centre[2]
-    for lane in range(LANES):
-        floats[_OX + lane] = (positions[0] - cx) * scale
-        floats[_OY + lane] = (positions[1] - cy) * scale
-        floats[_OZ + lane] = (positions[2] - cz) * scale
-        floats[_ENTRY + lane] = 0.0
 
 
 @inlined

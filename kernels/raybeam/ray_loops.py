@@ -141,13 +141,8 @@ def _make(  # type: ignore[no-untyped-def]
         directions[0, k], directions[1, k], directions[2, k] = dx, dy, dz
 
 
-def _load() -> None:
-    """Compile the loop, or load it, with the others: a signature has no read-only arrays."""
-    fixed, none = np.zeros((3, 1)), np.zeros((0, 3))
-    fixed.flags.writeable = none.flags.writeable = False
-    tables = (np.zeros((1, 3)), np.zeros((1, 9)), np.zeros((1, 3)), np.zeros((1, 3)))
-    parts = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0), *tables, np.zeros(1)
-    _make(fixed, none, *parts, 0, np.zeros(0, np.int64), 1, np.zeros((3, 0)), np.zeros((3, 0)))
-
-
-_load()
+# Compiled or loaded with the others: a signature has no read-only arrays.
+_FIXED, _NONE = np.zeros((3, 1)), np.zeros((0, 3))
+_FIXED.flags.writeable = _NONE.flags.writeable = False
+_TABLES = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0), *np.zeros((4, 1, 9)), np.zeros(1)
+_make(_FIXED, _NONE, *_TABLES, 0, np.zeros(0, np.int64), 1, np.zeros((3, 0)), np.zeros((3, 0)))

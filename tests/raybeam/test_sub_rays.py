@@ -9,7 +9,6 @@ from raybeam import (
     Pattern,
     RayCaster,
     SubRays,
-    any_axes,
     check_scan,
     hits_on,
 )
@@ -102,14 +101,6 @@ def test_offsets_add_to_the_angles_of_each_beam():
     expected = Pattern(beams(), None, SubRays(np.array([[0.001 + 0.003, 0.002 - 0.001]])))
     ray = np.arange(len(beams()))
     assert np.array_equal(moved.rays(ray, [0, 0, 0])[1], expected.rays(ray, [0, 0, 0])[1])
-
-
-def test_two_axes_are_across_any_direction():
-    directions = np.concatenate([beams(), [[0, 0, -1.0], [0, 0, 1.0]]]).T
-    one, other = any_axes(directions)
-    frames = np.stack([directions, one, other])
-    products = np.einsum("aik,bik->kab", frames, frames)
-    np.testing.assert_allclose(products, np.broadcast_to(np.eye(3), products.shape), atol=1e-14)
 
 
 @pytest.mark.parametrize("kind", ["", "axis starts offsets", "starts origins", "offsets"])
