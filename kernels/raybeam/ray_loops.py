@@ -10,6 +10,8 @@ from .arrays import Floats, Ints
 from .compiled import compiled, inlined
 from .poses import Poses
 
+_BLOCK = 1 << 14  # rays at a time: copies of their poses stay in a core's cache
+
 
 @inlined
 def whole_times(number, other):  # type: ignore[no-untyped-def]
@@ -85,22 +87,27 @@ def made(pattern: Any, first: int, ray: Ints, poses: Poses) -> tuple[Floats, Flo
     shifts.flags.writeable = False  # as those of patterns: they are of one type then
     rotations = none if poses.rotations is None else poses.rotations
     velocities, rates = (none, none) if motion is None else (motion.velocities, motion.rates)
-    start = int(ray.min()) // poses.rays
-    own = slice(start, int(ray.max()) // poses.rays + 1)
-    copies = (
-        np.array(table[own], np.float64, order="C").reshape(-1, 9 if table is rotations else 3)
-        for table in (poses.positions, rotations, velocities, rates)
-    )
     delays = np.zeros(0) if motion is None else np.array(motion.delays, np.float64)
     shares, offsets, axis = np.zeros((5, 0)), np.zeros((2, 0)), np.zeros(0)
     if sub_rays is not None:
         shares = sub_rays.table(pattern.offsets)
         offsets = offsets if pattern.offsets is None else pattern.offsets
         axis = axis if sub_rays.axis is None else np.array(sub_rays.axis, np.float64)
+    parts = pattern.directions.T, shifts, shares, offsets, axis
     origins, directions = np.empty((2, 3, len(ray)))
-    numbers = np.array(ray, np.int64) - start * poses.rays
-    given = pattern.directions.T, shifts, shares, offsets, axis, *copies, delays
-    _make(*given, first + start * poses.rays, numbers, poses.rays, origins, directions)
+    for begin in range(0, len(ray), _BLOCK):
+        block = slice(begin, begin + _BLOCK)
+        numbers = np.array(ray[block], np.int64)
+        start = int(numbers.min()) // poses.rays
+        own = slice(start, int(numbers.max()) // poses.rays + 1)
+        copies = (
+            np.array(table[own], np.float64, order="C").reshape(-1, 9 if table is rotations else 3)
+            for table in (poses.positions, rotations, velocities, rates)
+        )
+        numbers -= start * poses.rays
+        given = *copies, delays, first + start * poses.rays, numbers, poses.rays
+        _make(*parts, *given, *(made := np.empty((2, 3, len(numbers)))))
+        origins[:, block], directions[:, block] = made
     return origins, directions
 
 
@@ -120,7 +127,7 @@ def _make(  # type: ignore[no-untyped-def]
             pose = whole_times(rays[k], each)
         dx, dy, dz = ahead[0, row], ahead[1, row], ahead[2, row]
         x, y, z = 0.0, 0.0, 0.0
-        if shifts.shape[1] == rows:
+        if len(shifts):
             x, y, z = shifts[0, row], shifts[1, row], shifts[2, row]
         if shares.shape[1]:
             part -= row * subrays

@@ -52,10 +52,6 @@ class SubRays:
             out[3:] = self.starts.T
         return out
 
-    def axes(self, ahead: Floats) -> tuple[Floats, Floats]:
-        """Directions across and up of beams (3, m): two of (3, m)."""
-        return any_axes(ahead) if self.axis is None else axes_about(ahead, self.axis)
-
 
 def spread(
     sub_rays: SubRays, ahead: Floats, subray: Indices, offsets: Floats | None
@@ -65,7 +61,8 @@ def spread(
     `offsets` (2, m) are added to the angles of each.
     """
     straight, one, other = sub_rays.shares(subray, offsets)
-    first, second = sub_rays.axes(ahead)
+    axis = sub_rays.axis
+    first, second = any_axes(ahead) if axis is None else axes_about(ahead, axis)
     out = (straight * ahead + one * first) + other * second
     if sub_rays.starts is None:
         return out, None

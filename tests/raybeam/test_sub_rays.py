@@ -71,11 +71,11 @@ def test_loops_make_the_rays_of_numpy(place, kind):
     rng = np.random.default_rng(9)
     given = pattern(rng, 7, kind)
     if kind in ("none", "origins"):
-        given = Pattern(given.directions, given.origins)
-    where = {"rotations": None, "rays_per_pose": None, **poses(rng, place, len(given))}
-    ray = rng.permutation(len(given))[: len(given) // 2]
+        given = Pattern(given.directions[:3], None if kind == "none" else given.origins[:3])
+    where = {"rotations": None, "rays_per_pose": None, **poses(rng, place, 2_000)}
+    ray = rng.permutation(2_000)[:1_100]
     made = given.rays(ray, **where, start=4)
-    asked = where["positions"], where["rotations"], where["rays_per_pose"], len(given)
+    asked = where["positions"], where["rotations"], where["rays_per_pose"], 2_000
     plain = plain_rays(given, 4, ray, check_poses(*asked, where.get("motion")))
     for one, other in zip(made, plain, strict=True):
         assert np.array_equal(one, other)
