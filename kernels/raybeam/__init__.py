@@ -6,7 +6,7 @@ from .caster import RayCaster
 from .device import DeviceHits, OtherHits, Outbox
 from .hits import Hits, ScanReturns
 from .instances import Instance, Mesh
-from .moving import Moving, MovingHits, hits_on
+from .moving import Moving, hits_on
 from .opacity import Opacity
 from .pattern import Pattern
 from .poses import Motion
@@ -23,7 +23,6 @@ __all__ = [
     "Mesh",
     "Motion",
     "Moving",
-    "MovingHits",
     "Opacity",
     "OtherHits",
     "Outbox",

@@ -10,6 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
+from .crossing import Crossing, Nearest, strike
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, Part, ScanReturns, joined
 from .instances import Scene
@@ -93,6 +94,10 @@ class Backend(ABC):
             distance = found.t / self._scene.frame.scale
             parts.append((ray, distance, found.triangle, found.instance))
         return joined(parts)
+
+    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+        """Note where rays hit bodies of this shape, if that is nearer."""
+        strike(lambda rays, times: self.nearest(rays), crossing, nearest)
 
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""

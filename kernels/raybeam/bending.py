@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .arrays import Floats, Ints
+from .crossing import Crossing, Nearest, strike
 from .hits import Part, joined
 from .rays import Rays
 from .triangle import inside, intersect, shear
@@ -48,8 +49,11 @@ class Bending:
         share = ((times - begin) / (end - begin)).clip(0, 1)[:, None, None]
         return np.asarray((1 - share) * self.vertices[frame] + share * self.vertices[frame + 1])
 
-    def nearest(self, rays: Rays, times: Floats) -> Part:
-        """See `RayCaster.nearest`; of equally close triangles the lowest is hit."""
+    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+        """See `RayCaster.strike`; of equally close triangles the lowest is hit."""
+        strike(self._cast, crossing, nearest)
+
+    def _cast(self, rays: Rays, times: Floats) -> Part:
         count = len(self.faces)
         parts: list[Part] = []
         step = max(1, _PAIRS // count)

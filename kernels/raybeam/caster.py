@@ -9,14 +9,15 @@ from operator import index
 import numpy as np
 from numpy.typing import ArrayLike
 
-from .arrays import Floats, Ints
+from .arrays import Ints
 from .backend import Backend
+from .crossing import Crossing, Nearest
 from .device import DeviceHits, OtherHits
-from .hits import Counted, Hits, Part, ScanReturns
+from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
 from .pattern import Pattern
 from .poses import Motion, Poses
-from .rays import Rays, check_rays
+from .rays import check_rays
 from .registry import choose
 from .scan import Scan, check_scan
 
@@ -147,9 +148,9 @@ class RayCaster:
         """Number of instances."""
         return len(self._scene.mesh)
 
-    def nearest(self, rays: Rays, times: Floats) -> Part:
-        """Find the closest hits of checked rays, misses left out; at all times the same."""
-        return self.engine.nearest(rays)
+    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+        """See `Backend.strike`."""
+        self.engine.strike(crossing, nearest)
 
     def move(self, number: int, transform: ArrayLike) -> None:
         """Give an instance another transform; casts that begin after this see it there.

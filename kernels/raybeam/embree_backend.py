@@ -17,6 +17,7 @@ import numpy as np
 from . import embree_library
 from .arrays import AnyArray, Floats
 from .backend import Backend, Found
+from .crossing import Crossing, Nearest
 from .hits import Part, joined
 from .instances import Scene
 from .mesh import NEAR
@@ -31,6 +32,7 @@ _COHERENCE = 0.94
 _SHAPES = ((16, 1), (8, 2), (4, 4))  # rays along a ring and across, that go together
 _MOST = 1 << 15  # rays of a block
 _TRIALS, _TRIED = 5, 1 << 10  # parts that are cast in each way to choose the fastest, and rays
+_STRIKES = 10  # calls of `strike` that cast packets and single rays in turn, to choose
 _LIKE = 0.02  # between the cosines of patterns for which the same way is the fastest
 _PLANS = 16  # kept
 
@@ -86,6 +88,7 @@ class EmbreeBackend(Backend):
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
         self._plans: dict[tuple[int, int], _Plan] = {}
+        self._trials: list[float] = []  # seconds a ray of the first calls of `strike`
         self._loops, self._memory = embree_packets, embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
         self._meshes = np.zeros(len(scene.meshes), embree_memory.MESH)
@@ -141,9 +144,22 @@ class EmbreeBackend(Backend):
         t = distance * self._scene.frame.scale  # a power of two
         return Found(ray, t, self._index[place], u, v, instance)
 
-    def nearest(self, rays: Rays) -> Part:
-        """See `Backend.nearest`."""
-        return self._cast(self._of_rays(rays.part(0, len(rays))), 0, len(rays))
+    def strike(self, crossing: Crossing, nearest: Nearest) -> None:
+        """See `Backend.strike`."""
+        from .embree_bodies import strike
+
+        own, limits = self._base.copy(), crossing.limits
+        own["t_min"], own["t_max"] = (limit * self._scene.frame.scale for limit in limits)
+        own["scratch"], _ = _own.memory(0)
+        given = crossing.row, crossing.body, crossing.number
+        row, body, number = map(np.ascontiguousarray, given)
+        start, way = time.perf_counter(), len(self._trials) % 2
+        if len(self._trials) == _STRIKES:
+            way = int(np.argmin(np.median(np.reshape(self._trials, (-1, 2)), axis=0)))
+        own["coherence"] = (_COHERENCE, 2.0)[way]
+        strike(own, crossing.rays, row, body, number, crossing.poses, crossing.box, *nearest)
+        if len(self._trials) < _STRIKES and len(row) >= _TRIED:
+            self._trials.append((time.perf_counter() - start) / len(row))
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
         """See `Backend.parts`."""

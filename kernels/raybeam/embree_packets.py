@@ -30,7 +30,7 @@ _T, _KEY, _SURE, _POSE = at("t"), at("key"), at("sure"), at("pose")
 f64_1, f64_2, i32_1 = types.float64[::1], types.float64[:, ::1], types.int32[::1]
 _FIELDS = 22  # numbers of a ray of a packet
 _MESH_OF = memory.INSTANCE.fields["mesh"][1] // 8  # type: ignore[index]
-_FIRST_PLACE, _RECORD = _MESH_OF + 1, memory.INSTANCE.itemsize
+FIRST_PLACE, RECORD = _MESH_OF + 1, memory.INSTANCE.itemsize
 
 _intersect_4, _intersect_8, _intersect_16 = (
     types.ExternalFunction(
@@ -41,7 +41,7 @@ _intersect_4, _intersect_8, _intersect_16 = (
 
 
 @inlined
-def _prepare(cast):  # type: ignore[no-untyped-def]
+def prepare(cast):  # type: ignore[no-untyped-def]
     """Write to the scratch memory what all rays share."""
     scratch, width = cast.scratch, cast.width
     numbers, floats, rays = int64s(scratch), float64s(scratch), float32s(scratch)
@@ -164,6 +164,53 @@ def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def
     flags[0] = exact.CALL_FILTER | exact.COHERENT
 
 
+@inlined
+def cast_group(cast, scratch, filters, real, fixed):  # type: ignore[no-untyped-def]
+    """Write to `t` and `key` what the rays of a group hit; False if none hits anything.
+
+    `real` of them are no copies. Starts of packets stay as they are if `fixed`.
+    """
+    scene, width, mesh, instances = cast.scene, cast.width, cast.mesh, cast.instances
+    t_min, t_max, masked = cast.t_min, cast.t_max, cast.masked
+    numbers, floats = int64s(scratch), float64s(scratch)
+    plain = instances == 0 and not masked
+    _reset(scratch, plain)
+    if masked and instances == 0:  # `propose` looks at masks
+        exact.shear_all(scratch)
+    if width == 1 or real == 1 or _apart(floats, cast.coherence):
+        _one_by_one(scene, scratch, cast.single, t_max)
+    else:
+        _fill(scratch, width, t_min, t_max, fixed)
+        arguments = scratch + _ARGUMENTS_AT
+        numbers[_FILTER] = filters[0]
+        if width == 16:
+            _intersect_16(scratch + _VALID_AT, scene, scratch + _PACKET_AT, arguments)
+        else:
+            for part in range(LANES // width):
+                numbers[_FILTER], numbers[_LANE] = filters[part], part * width
+                asked = scratch + _VALID_AT + 4 * part * width
+                rays = scratch + _PACKET_AT + 4 * _FIELDS * part * width
+                if width == 8:
+                    _intersect_8(asked, scene, rays, arguments)
+                else:
+                    _intersect_4(asked, scene, rays, arguments)
+            numbers[_LANE] = 0
+    found, straight = _found(scratch)
+    if plain and found + straight == 0:
+        return False
+    if plain:
+        exact.verify_all(float64s(int64s(mesh)[0]), scratch, t_min)
+    else:
+        for lane in range(LANES):
+            exact.verify(mesh, instances, numbers, floats, lane)
+    for lane in range(LANES):
+        again = numbers[_SURE + lane] == 0 or (straight and exact.along(floats, lane))
+        if again and numbers[_REAL + lane]:
+            numbers[_FILTER] = cast.decide
+            exact.decided(scene, scratch, lane, t_max)
+    return True
+
+
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     """Cast rays `start` to `stop`, and write those that hit in their order; returns their number.
@@ -171,30 +218,26 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     `casts` is one `CAST`.
     """
     cast = casts[0]
-    scene, scratch, width, coherence = cast.scene, cast.scratch, cast.width, cast.coherence
-    mesh, instances, masked = cast.mesh, cast.instances, cast.masked
-    filters, alone, decide = cast.packets, cast.single, cast.decide
-    t_min, t_max, still, near = cast.t_min, cast.t_max, cast.still != 0, cast.near != 0
+    scratch, instances, filters = cast.scratch, cast.instances, cast.packets
+    t_max, still, near = cast.t_max, cast.still != 0, cast.near != 0
     step, high, wide, before = cast.step, cast.high, cast.wide, cast.before
     shift = 0 if wide == 1 else (1 if wide == 2 else 2)
     metre, index, indexed = 1.0 / cast.scale, int32s(cast.index), cast.index != 0
     numbers, floats = int64s(scratch), float64s(scratch)
-    plain = instances == 0 and not masked
-    table = float64s(int64s(mesh)[0])
     span = step * high
     distances, places = float64s(cast.room), int32s(cast.room + 8 * span)
     numbered = int32s(cast.room + 12 * span)
     out_ray, out_metres = memory.uint32s(cast.ray), float64s(cast.distance)
     out_triangle, out_instance = int32s(cast.triangle), int32s(cast.instance)
-    _prepare(cast)
+    prepare(cast)
     fixed = still and near
     for lane in range(LANES):
         numbers[_TILE + lane] = (lane >> shift) * step + (lane & (wide - 1))
         numbers[_POSE + lane], floats[_ENTRY + lane] = 0, 0.0
     if still:
         set_out(cast, scratch, False)
-        if width > 1:
-            _fill(scratch, width, t_min, t_max, False)
+        if cast.width > 1:
+            _fill(scratch, cast.width, cast.t_min, t_max, False)
     kept = 0
     for block in range(start, stop, span):
         count = min(span, stop - block)
@@ -202,42 +245,10 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
         for column in range(0, min(step, count), wide):
             real = _reals(scratch, column, wide, step, count)
             make(cast, scratch, begins)
-            _reset(scratch, plain)
-            if masked and instances == 0:  # `propose` looks at masks
-                exact.shear_all(scratch)
-            if width == 1 or real == 1 or _apart(floats, coherence):
-                _one_by_one(scene, scratch, alone, t_max)
-            else:
-                _fill(scratch, width, t_min, t_max, fixed)
-                arguments = scratch + _ARGUMENTS_AT
-                numbers[_FILTER] = filters[0]
-                if width == 16:
-                    _intersect_16(scratch + _VALID_AT, scene, scratch + _PACKET_AT, arguments)
-                else:
-                    for part in range(LANES // width):
-                        numbers[_FILTER], numbers[_LANE] = filters[part], part * width
-                        asked = scratch + _VALID_AT + 4 * part * width
-                        rays = scratch + _PACKET_AT + 4 * _FIELDS * part * width
-                        if width == 8:
-                            _intersect_8(asked, scene, rays, arguments)
-                        else:
-                            _intersect_4(asked, scene, rays, arguments)
-                    numbers[_LANE] = 0
-            found, straight = _found(scratch)
-            if plain and found + straight == 0:
+            if not cast_group(cast, scratch, filters, real, fixed):
                 for lane in range(LANES):
                     places[numbers[_RAY + lane]] = -1
                 continue
-            if plain:
-                exact.verify_all(table, scratch, t_min)
-            else:
-                for lane in range(LANES):
-                    exact.verify(mesh, instances, numbers, floats, lane)
-            for lane in range(LANES):
-                again = numbers[_SURE + lane] == 0 or (straight and exact.along(floats, lane))
-                if again and numbers[_REAL + lane]:
-                    numbers[_FILTER] = decide
-                    exact.decided(scene, scratch, lane, t_max)
             for back in range(LANES):  # copies of the first come before it
                 lane = LANES - 1 - back
                 to, t, key = numbers[_RAY + lane], floats[_T + lane], numbers[_KEY + lane]
@@ -249,8 +260,8 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
             if place < 0:
                 continue
             if instances != 0:
-                record = int64s(instances + _RECORD * numbered[k])
-                place = (place & (NUMBER - 1)) + record[_FIRST_PLACE]
+                record = int64s(instances + RECORD * numbered[k])
+                place = (place & (NUMBER - 1)) + record[FIRST_PLACE]
                 out_instance[kept] = numbered[k]
             out_ray[kept], out_metres[kept] = block - before + k, distances[k] * metre
             out_triangle[kept] = index[place] if indexed else place
@@ -270,9 +281,9 @@ def weigh(casts, origins, directions, place, instance, u, v):  # type: ignore[no
         ox, oy, oz, dx, dy, dz = o[0], o[1], o[2], to[0], to[1], to[2]
         at, mesh_at = np.int64(place[k]), mesh
         if instances != 0:
-            address = instances + _RECORD * np.int64(instance[k])
+            address = instances + RECORD * np.int64(instance[k])
             record = int64s(address)
-            mesh_at, at = record[_MESH_OF], at - record[_FIRST_PLACE]
+            mesh_at, at = record[_MESH_OF], at - record[FIRST_PLACE]
             ox, oy, oz, dx, dy, dz, _ = exact.entered(float64s(address), ox, oy, oz, dx, dy, dz)
         axis, p, q, r, sx, sy, sz = exact.shear(ox, oy, oz, dx, dy, dz)
         triangle = exact.corners_of(float64s(int64s(mesh_at)[0]), at, axis)

@@ -187,7 +187,7 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
         for lane in range(LANES):
             o = floats[_OX + lane], floats[_OY + lane], floats[_OZ + lane]
             d = floats[_DX + lane], floats[_DY + lane], floats[_DZ + lane]
-            floats[_ENTRY + lane] = _entry(low, high, o, d)
+            floats[_ENTRY + lane] = entered_at(low, high, o, d)
 
 
 @inlined
@@ -270,7 +270,7 @@ def _clip(low, high, o, d, entry):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _entry(low, high, o, d):  # type: ignore[no-untyped-def]
+def entered_at(low, high, o, d):  # type: ignore[no-untyped-def]
     """Distance at which a ray from far away comes near the scene's box; 0 from near."""
     entry = 0.0
     if max(max(abs(o[0]), abs(o[1])), abs(o[2])) > NEAR:

@@ -1,10 +1,10 @@
 """Bodies that move while rays are cast: which rays come near one, and where they hit it.
 
 No tree is ever built again. Rays that follow each other are fired nearly together: the cone around
-each `CELL` of them, and the plane of a fan, is compared with the ball around each body, on its way
+each cell of them, and the plane of a fan, is compared with the ball around each body, on its way
 while rays are fired; where they meet, each ray is compared with the body's box, as it is when the
-cell is fired. The few rays that pass are taken to the body's axes at their own time, and cast
-there. The comparisons are loops of moving_loops.py, and decide no hit.
+cell is fired. The rays that pass are taken to the body's axes at their own time, and cast there, at
+near bodies first. The comparisons are loops of moving_loops.py, and decide no hit.
 """
 
 from __future__ import annotations
@@ -12,18 +12,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
-from .arrays import Floats, Indices, Ints, Ints32
+from .arrays import Floats, Indices, Ints
 from .bending import Bending
 from .caster import RayCaster
-from .rays import Rays
+from .crossing import Crossing, Nearest
 from .scan import Scan
 
 _CHUNK = 1 << 15  # rays at a time
 _PAIRS = 1 << 11  # of cells and bodies at a time
+_LOOKS = 128  # cells for each look at the bodies
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,44 +68,10 @@ class Moving:
         return np.asarray(np.sqrt((self.half**2).sum(axis=1)))
 
 
-class MovingHits(NamedTuple):
-    """Hits on bodies that move, nearest first for each ray, of equal distances the first body.
-
-    ray int64 (k,), distance float64 (k,) metres, instance and triangle of its shape int32 (k,),
-    body int64 (k,).
-    """
-
-    ray: Ints
-    distance: Floats
-    instance: Ints32
-    triangle: Ints32
-    body: Ints
-
-    def of(self, rows: Indices) -> MovingHits:
-        """Select some."""
-        columns: list[Any] = [column[rows] for column in self]
-        return MovingHits(*columns)
-
-    @classmethod
-    def joined(cls, parts: list[MovingHits]) -> MovingHits:
-        """Join hits."""
-        columns: list[Any] = [*zip(*parts, strict=True)]
-        return cls(*map(np.concatenate, columns))
-
-
-_NONE = MovingHits(
-    np.zeros(0, np.int64),
-    np.zeros(0),
-    np.zeros(0, np.int32),
-    np.zeros(0, np.int32),
-    np.zeros(0, np.int64),
-)
-
-
 def hits_on(
     moving: Moving, scan: Scan, times: Callable[[Ints], Floats], before: Floats | None = None
-) -> MovingHits:
-    """Find the nearest hit of each ray on a body.
+) -> Nearest:
+    """Find the nearest hit of each ray of a scan on a body; its distance is some other without.
 
     Parameters
     ----------
@@ -113,63 +80,61 @@ def hits_on(
     times
         Gives the times of rays (m,).
     before
-        float64 (n,): distances at which rays end; None if none does. Hits behind are left out, as
-        far as that saves time.
+        float64 (n,): distances before which hits count; None for all within the scan's.
     """
     from . import moving_loops as loops  # not before: numba takes half a second to import
 
-    found = [_NONE]
+    found = Nearest.of(np.full(len(scan), np.nextafter(scan.t_max, np.inf)))  # which counts
+    if before is not None:
+        np.minimum(found.distance, before, out=found.distance)
     for start, stop in scan.chunks(_CHUNK):
-        ends = np.full(stop - start, scan.t_max) if before is None else before[start:stop]
         at = times(np.arange(start, stop, dtype=np.int64))
-        hits = _Chunk(loops, moving, scan, start, at, np.minimum(ends, scan.t_max)).hits()
-        hits = hits.of(loops.nearest(hits.ray, hits.distance, hits.body, len(at)))
-        found.append(hits._replace(ray=hits.ray + start))
-    return MovingHits.joined(found)
+        _Chunk(loops, moving, scan, start, at, found.part(start, stop)).cast()
+    return found
 
 
 class _Chunk:
-    """Some rays of a scan, their times, and the distances at which they end."""
+    """Some rays of a scan, their times, and what they hit."""
 
     def __init__(
-        self, loops: Any, moving: Moving, scan: Scan, start: int, times: Floats, ends: Floats
+        self, loops: Any, moving: Moving, scan: Scan, start: int, times: Floats, nearest: Nearest
     ) -> None:
         self._loops, self._moving, self._scan = loops, moving, scan
-        self._times, self._ends = times, ends
+        self._times, self._nearest = times, nearest
         ray = np.arange(start, start + len(times), dtype=np.int64)
         origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
-        starts = np.broadcast_to(origins, directions.shape).T
-        self._rays = np.ascontiguousarray(starts), np.ascontiguousarray(directions.T)
+        room = -(-len(times) // loops.CELL) * loops.CELL  # the loops read whole cells
+        self._rays = np.zeros((6, room))
+        self._rays[:3, : len(times)], self._rays[3:, : len(times)] = origins.T, directions.T
 
-    def hits(self) -> MovingHits:
-        """Hits on all bodies, of which a ray may have several."""
-        loops, moving, times, found = self._loops, self._moving, self._times, [_NONE]
-        there = (moving.there[:, 0] <= times.max()) & (moving.there[:, 1] >= times.min())
-        bodies = np.flatnonzero(there)
-        if len(bodies):
-            cells = loops.cells_of(*self._rays, times)
-            number, looks, sizes = self._looks(bodies, cells)
-            # Near bodies come first, and rays end at them.
-            way = looks[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
-            order = np.argsort((way**2).sum(axis=1), kind="stable")
-            reach = float(self._ends.max())
-            cell, which = loops.meet(cells, number, looks[order], sizes[order], reach)
-            body = bodies[order][which]
-            for start in range(0, len(cell), _PAIRS):
-                some = slice(start, start + _PAIRS)
-                hits = self._cast(cell[some], cells[cell[some]], body[some])
-                best = loops.nearest(hits.ray, hits.distance, hits.body, len(times))
-                found.append(hits := hits.of(best))
-                self._ends[hits.ray] = np.minimum(self._ends[hits.ray], hits.distance)
-        return MovingHits.joined(found)
+    def cast(self) -> None:
+        """Note the nearest hits on all bodies."""
+        loops, moving, times = self._loops, self._moving, self._times
+        first, last = moving.there.T
+        bodies = np.flatnonzero((first <= times.max()) & (last >= times.min()))
+        if not len(bodies):
+            return
+        cells = loops.cells_of(self._rays, times, loops.CELL)
+        wide = loops.cells_of(self._rays, times, loops.CELL * loops.WIDE)
+        number, looks, sizes = self._looks(bodies, cells)
+        # Near bodies come first, and rays end at them.
+        way = looks[:, 0, :3] - cells[0, loops.MIDDLE : loops.MIDDLE + 3]
+        order = np.argsort((way**2).sum(axis=1), kind="stable")
+        reach = float(self._nearest.distance.max())
+        cell, which = loops.meet(wide, cells, number, looks[order], sizes[order], reach)
+        body = bodies[order][which]
+        for start in range(0, len(cell), _PAIRS):
+            some = slice(start, start + _PAIRS)
+            self._cast_at(cell[some], cells[cell[some]], body[some])
 
     def _looks(self, bodies: Ints, cells: Floats) -> tuple[Ints, Floats, Floats]:
         """Bodies, looked at a few times, see `meet`."""
         loops, moving, shape = self._loops, self._moving, self._moving.shape[bodies]
         first, last = cells[:, loops.BEGIN].min(), cells[:, loops.END].max()
-        steps = max(1, len(cells) // loops.CELL)
+        steps = max(1, len(cells) // _LOOKS)
         step = (last - first) / steps
-        number = ((cells[:, loops.BEGIN] - first) / (step or 1)).astype(np.int64).clip(0, steps)
+        spans = (cells[:, [loops.BEGIN, loops.END]] - first) / (step or 1)
+        number = spans.astype(np.int64).clip(0, steps)
         at = np.clip(np.linspace(first, last, steps + 1), *moving.there[bodies].T[:, :, None])
         many = np.repeat(bodies, steps + 1)
         positions, rotations = moving.poses(many, at.ravel())
@@ -183,42 +148,30 @@ class _Chunk:
         sizes = np.column_stack([moving.radius[shape], slack, moving.there[bodies]])
         return number, looks, sizes
 
-    def _cast(self, cell: Indices, cells: Floats, body: Ints) -> MovingHits:
-        """Hits of the rays of cells on bodies, one each."""
-        loops, moving, times = self._loops, self._moving, self._times
-        shape = moving.shape[body]
+    def _cast_at(self, cell: Indices, cells: Floats, body: Ints) -> None:
+        """Cast the rays of cells on bodies, one each."""
+        loops, moving, times, rays = self._loops, self._moving, self._times, self._rays
+        shape, boxes = moving.shape[body], moving.boxes.reshape(-1, 6)
         begins, ends = np.clip(cells[:, [loops.BEGIN, loops.END]].T, *moving.there[body].T)
         poses = _table(*moving.poses(body, begins))
         pads, late = np.full(len(cell), loops.PADS_M), np.flatnonzero(ends > begins)
         if len(late):  # the box is larger by what happens until the cell's end
-            change = np.abs(_table(*moving.poses(body[late], ends[late])) - poses[late])
+            change = np.abs(_table(*moving.poses(body[late], ends[late])) - poses[:, late])
             size = np.abs(moving.boxes).max(axis=(1, 2))[shape[late]]
-            pads[late] += 2 * (change[:, :3].sum(axis=1) + size * change[:, 3:].sum(axis=1))
-        boxes = moving.boxes[shape].reshape(-1, 6)
-        row, pair = loops.through(*self._rays, self._ends, cell, poses, boxes, pads)
+            pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
+        row, pair = loops.through(rays, self._nearest.distance, cell, poses, boxes, shape, pads)
         body, number = body[pair], pair
         if len(late):  # each ray at its own time
             first, last = moving.there[body].T
-            there = np.flatnonzero((first <= times[row]) & (times[row] <= last))
-            row, body, pair = row[there], body[there], pair[there]
+            there = (first <= times[row]) & (times[row] <= last)
+            row, body = row[there], body[there]
             poses, number = _table(*moving.poses(body, times[row])), np.arange(len(row))
-        if not len(row):
-            return _NONE
-        given = (*self._rays, self._ends, row, poses, number, boxes, pair)
-        kept, starts, ways = loops.local(*given)
-        row, body, found = row[kept], body[kept], [_NONE]
-        shape = moving.shape[body]
-        for one in np.unique(shape).tolist():
-            own = np.flatnonzero(shape == one) if len(moving.shapes) > 1 else slice(None)
-            rays = Rays(starts[own], ways[own], self._scan.t_min, self._scan.t_max)
-            met = moving.shapes[one].nearest(rays, times[row[own]])
-            on, distance, triangle, instance = met
-            at = on if isinstance(own, slice) else own[on]
-            # Directions of a sensor that turns during a pose are not quite of unit length.
-            x, y, z = ways[at].T
-            distance = distance / np.sqrt((x * x + y * y) + z * z)
-            found.append(MovingHits(row[at], distance, instance, triangle, body[at]))
-        return MovingHits.joined(found)
+        limits, shape, every = (self._scan.t_min, self._scan.t_max), moving.shape[body], slice(None)
+        for one in np.unique(shape).tolist() if len(moving.shapes) > 1 else [0]:
+            own = shape == one if len(moving.shapes) > 1 else every
+            which = row[own], body[own], number[own]
+            crossing = Crossing(rays, times, *which, poses, boxes[one], limits)
+            moving.shapes[one].strike(crossing, self._nearest)
 
 
 def _turned(rotations: Floats, vectors: Floats) -> Floats:
@@ -226,6 +179,6 @@ def _turned(rotations: Floats, vectors: Floats) -> Floats:
 
 
 def _table(positions: Floats, rotations: Floats) -> Floats:
-    table = np.empty((len(positions), 12))
-    table[:, :3], table[:, 3:] = positions, rotations.reshape(-1, 9)
+    table = np.empty((12, len(positions)))
+    table[:3], table[3:] = positions.T, rotations.transpose(1, 2, 0).reshape(9, -1)
     return table

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from .arrays import Floats, Indices, Ints
-from .compiled import compiled, inlined
+from .compiled import compiled, inlined, stage
+from .embree_memory import float64s
 
-CELL = 64
+CELL, WIDE = 64, 16  # rays, and cells of a wide one
 PADS_M = 1e-3  # around a box, and 2e-6 of how far away it is: far more than rounding
 # Columns of cells: axis and half angle of the cone, ball around the origins, first and last time,
 # normal of the plane that the rays lie near, and the sine of the greatest angle to it.
@@ -15,13 +16,14 @@ AXIS, COSINE, SINE, MIDDLE, SPREAD, BEGIN, END, NORMAL, OFF = 0, 3, 4, 5, 8, 9, 
 _TINY = 1e-300
 
 
-@compiled("f8[:, ::1](f8[:, ::1], f8[:, ::1], f8[::1])")
-def cells_of(origins, directions, times):  # type: ignore[no-untyped-def]
-    """Cells of rays (3, n) at times (n,): (c, 15)."""
-    count = -(-len(times) // CELL)
+@compiled("f8[:, ::1](f8[:, ::1], f8[::1], i8)")
+def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
+    """Cells of so many rays (6, n) at times (n,): (c, 15)."""
+    origins, directions = rays[:3], rays[3:]
+    count = -(-len(times) // size)
     out = np.empty((count, 15))
     for c in range(count):
-        begin, end = c * CELL, min((c + 1) * CELL, len(times))
+        begin, end = c * size, min((c + 1) * size, len(times))
         ax = ay = az = px = py = pz = 0.0
         first = last = times[begin]
         for k in range(begin, end):
@@ -61,52 +63,73 @@ def _larger(table, rows):  # type: ignore[no-untyped-def]
     return more
 
 
-@compiled("i8[:, ::1](f8[:, ::1], i8[::1], f8[:, :, ::1], f8[:, ::1], f8)")
-def _meet(cells, number, looks, sizes, reach):  # type: ignore[no-untyped-def]
+@inlined
+def _may_meet(cell, look, size, reach):  # type: ignore[no-untyped-def]
+    """Whether rays of a cell may meet a body."""
+    radius, slack, first, last = size[0], size[1], size[2], size[3]
+    x, y, z = look[0] - cell[5], look[1] - cell[6], look[2] - cell[7]
+    nx, ny, nz = cell[11], cell[12], cell[13]
+    off, wide = abs(x * nx + y * ny + z * nz), abs(x) + abs(y) + abs(z)
+    most = radius + slack + cell[8] + 1e-6 * wide
+    if off > most + (wide + most) * cell[14]:  # which needs no root
+        return False
+    far = np.sqrt(x * x + y * y + z * z)
+    more = slack + cell[8] + 1e-6 * far
+    size = radius + more
+    if far - size > reach or cell[10] < first or cell[9] > last:
+        return False
+    side = 0.0
+    for k in range(3, 12, 3):
+        side += abs(look[k] * nx + look[k + 1] * ny + look[k + 2] * nz)
+    if off - (far + size) * cell[14] > side + more:
+        return False
+    if far > size:
+        sine = size / far
+        cosine = np.sqrt(1 - sine * sine)
+        if cell[4] * cosine + cell[3] * sine >= 0:  # within a half turn
+            edge = far * (cell[3] * cosine - cell[4] * sine)
+            return x * cell[0] + y * cell[1] + z * cell[2] >= edge - 1e-6 * far
+    return True
+
+
+@compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8)")
+def _meet(wide, cells, number, looks, sizes, reach):  # type: ignore[no-untyped-def]
     out, found = np.empty((1024, 2), np.int64), 0
+    # Pointers: views of arrays would be counted, which takes longer than the comparisons.
+    cell, broad, look = cells.ctypes.data, wide.ctypes.data, looks.ctypes.data
     for b in range(len(sizes)):
-        radius, slack, first, last = sizes[b, 0], sizes[b, 1], sizes[b, 2], sizes[b, 3]
-        for c in range(len(cells)):
-            cell, look = cells[c], looks[b, number[c]]
-            x, y, z = look[0] - cell[5], look[1] - cell[6], look[2] - cell[7]
-            nx, ny, nz = cell[11], cell[12], cell[13]
-            off, wide = abs(x * nx + y * ny + z * nz), abs(x) + abs(y) + abs(z)
-            most = radius + slack + cell[8] + 1e-6 * wide
-            if off > most + (wide + most) * cell[14]:  # which needs no root
-                continue
-            far = np.sqrt(x * x + y * y + z * z)
-            more = slack + cell[8] + 1e-6 * far
-            size = radius + more
-            if far - size > reach or cell[10] < first or cell[9] > last:
-                continue
-            side = 0.0
-            for k in range(3, 12, 3):
-                side += abs(look[k] * nx + look[k + 1] * ny + look[k + 2] * nz)
-            if off - (far + size) * cell[14] > side + more:
-                continue
-            if far > size:
-                sine = size / far
-                cosine = np.sqrt(1 - sine * sine)
-                if cell[4] * cosine + cell[3] * sine >= 0:  # within a half turn
-                    edge = far * (cell[3] * cosine - cell[4] * sine)
-                    if x * cell[0] + y * cell[1] + z * cell[2] < edge - 1e-6 * far:
+        size, own = float64s(sizes.ctypes.data + 32 * b), look + 96 * looks.shape[1] * b
+        for w in range(len(wide)):
+            begin, end = w * WIDE, min((w + 1) * WIDE, len(cells))
+            first = number[begin, 0]
+            if number[end - 1, 1] - first <= 1:  # which sizes allow for
+                at = float64s(own + 96 * first)
+                if not _may_meet(float64s(broad + 120 * w), at, size, reach):
+                    continue
+            for c in range(begin, end):
+                first = number[c, 0]
+                if number[c, 1] - first <= 1:
+                    at = float64s(own + 96 * first)
+                    if not _may_meet(float64s(cell + 120 * c), at, size, reach):
                         continue
-            if found == len(out):
-                out = _larger(out, found)
-            out[found, 0], out[found, 1] = c, b
-            found += 1
+                if found == len(out):
+                    out = _larger(out, found)
+                out[found, 0], out[found, 1] = c, b
+                found += 1
     return out[:found].copy()
 
 
 def meet(
-    cells: Floats, number: Ints, looks: Floats, sizes: Floats, reach: float
+    wide: Floats, cells: Floats, number: Ints, looks: Floats, sizes: Floats, reach: float
 ) -> tuple[Indices, Indices]:
     """Cells whose rays may meet bodies, and these; by body, then by cell.
 
     Parameters
     ----------
+    wide, cells
+        Cells `WIDE` times as wide, of which many need no closer look, and cells.
     number
-        int64 (c,): look at the bodies that a cell takes.
+        int64 (c, 2): looks at the bodies when a cell begins and ends.
     looks
         (b, looks, 12): middles of the bodies' boxes, and halves of their sides as vectors.
     sizes
@@ -115,130 +138,106 @@ def meet(
     reach
         Rays end before.
     """
-    pairs = _meet(cells, number, looks, sizes, reach)
+    pairs = _meet(wide, cells, number, looks, sizes, reach)
     return pairs[:, 0], pairs[:, 1]
 
 
 @inlined
-def _taken(p, x, y, z, axis):  # type: ignore[no-untyped-def]
-    """One number of a vector in the axes of a pose."""
-    return (x * p[3 + axis] + y * p[6 + axis]) + z * p[9 + axis]
+def turn_of(poses, p):  # type: ignore[no-untyped-def]
+    """Rotation of a pose, by rows."""
+    return (
+        (poses[3, p], poses[4, p], poses[5, p]),
+        (poses[6, p], poses[7, p], poses[8, p]),
+        (poses[9, p], poses[10, p], poses[11, p]),
+    )
 
 
 @inlined
-def _passes(box, pad, end, x, y, z, dx, dy, dz):  # type: ignore[no-untyped-def]
+def taken(turn, x, y, z):  # type: ignore[no-untyped-def]
+    """Take a vector to the axes of a pose."""
+    (a, b, c), (d, e, f), (g, h, i) = turn
+    return (x * a + y * d) + z * g, (x * b + y * e) + z * h, (x * c + y * f) + z * i
+
+
+@inlined
+def sides_of(box):  # type: ignore[no-untyped-def]
+    """Low and high corner of a box at a pointer."""
+    return (box[0], box[1], box[2]), (box[3], box[4], box[5])
+
+
+@inlined
+def _between(low, high, o, d, enters, leaves):  # type: ignore[no-untyped-def]
+    inverse = 1 / (d if abs(d) >= _TINY else _TINY)
+    low, high = (low - o) * inverse, (high - o) * inverse
+    return max(enters, min(low, high)), min(leaves, max(low, high))
+
+
+@inlined
+def passes(sides, pad, end, x, y, z, dx, dy, dz):  # type: ignore[no-untyped-def]
     """Whether a ray passes through a box before its end."""
-    enters, leaves = -np.inf, np.inf
+    (a, b, c), (d, e, f) = sides
     pad += 2e-6 * (abs(x) + abs(y) + abs(z))
-    for axis in range(3):
-        o, d = (x, dx) if axis == 0 else ((y, dy) if axis == 1 else (z, dz))
-        if abs(d) < _TINY:
-            d = _TINY
-        low, high = (box[axis] - pad - o) / d, (box[3 + axis] + pad - o) / d
-        enters, leaves = max(enters, min(low, high)), min(leaves, max(low, high))
-    return enters <= leaves and leaves >= 0 and enters * (1 - 1e-6) <= end
+    enters, leaves = _between(a - pad, d + pad, x, dx, -np.inf, np.inf)
+    enters, leaves = _between(b - pad, e + pad, y, dy, enters, leaves)
+    enters, leaves = _between(c - pad, f + pad, z, dz, enters, leaves)
+    return (enters <= leaves) & (leaves >= 0) & (enters * (1 - 1e-6) <= end)
 
 
-@compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1], f8[::1])")
-def _through(origins, directions, ends, cell, poses, boxes, pads):  # type: ignore[no-untyped-def]
+@stage
+def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
+    """Write what is not positive for rays that come near a ball, of that squared radius.
+
+    `rays` is the address of a cell of (6, n), `near` that of float64 (`CELL`,).
+    """
+    ray, out = float64s(rays), float64s(near)
+    for k in range(CELL):
+        u, v, w = x - ray[k], y - ray[n + k], z - ray[2 * n + k]
+        far = u * u + v * v + w * w
+        along = u * ray[3 * n + k] + v * ray[4 * n + k] + w * ray[5 * n + k]
+        out[k] = far - along * along - radius * (1 + 1e-6) - 1e-5 * far
+
+
+@compiled("i8[:, ::1](f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1])")
+def _through(rays, ends, cell, poses, boxes, shape, pads):  # type: ignore[no-untyped-def]
     out, found = np.empty((4096, 2), np.int64), 0
-    near = np.empty(CELL, np.bool_)
+    near, count = np.empty(CELL), rays.shape[1]
     for pair in range(len(cell)):
-        begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, directions.shape[1])
-        p, box, pad = poses[pair], boxes[pair], pads[pair]
-        # A ball around the box first.
-        x, y, z = (box[0] + box[3]) / 2, (box[1] + box[4]) / 2, (box[2] + box[5]) / 2
-        ball = (box[3] - x + pad) ** 2 + (box[4] - y + pad) ** 2 + (box[5] - z + pad) ** 2
-        mx = p[0] + (p[3] * x + p[4] * y + p[5] * z)
-        my = p[1] + (p[6] * x + p[7] * y + p[8] * z)
-        mz = p[2] + (p[9] * x + p[10] * y + p[11] * z)
-        for k in range(begin, end):
-            x, y, z = mx - origins[0, k], my - origins[1, k], mz - origins[2, k]
-            far = x * x + y * y + z * z
-            along = x * directions[0, k] + y * directions[1, k] + z * directions[2, k]
-            near[k - begin] = far - along * along <= ball * (1 + 1e-6) + 1e-5 * far
+        begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
+        sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
+        (a, b, c), (d, e, f) = sides
+        pad, turn = pads[pair], turn_of(poses, pair)
+        x, y, z = (a + d) / 2, (b + e) / 2, (c + f) / 2
+        ball = (d - x + pad) ** 2 + (e - y + pad) ** 2 + (f - z + pad) ** 2
+        px, py, pz = poses[0, pair], poses[1, pair], poses[2, pair]
+        (a, b, c), (d, e, f), (g, h, i) = turn
+        x, y, z = (
+            px + (a * x + b * y + c * z),
+            py + (d * x + e * y + f * z),
+            pz + (g * x + h * y + i * z),
+        )
+        _near(rays.ctypes.data + 8 * begin, count, x, y, z, ball, near.ctypes.data)
         if found + CELL > len(out):
             out = _larger(out, found)
         for k in range(begin, end):
-            if not near[k - begin]:
+            if near[k - begin] > 0:
                 continue
-            ox, oy, oz = origins[0, k] - p[0], origins[1, k] - p[1], origins[2, k] - p[2]
-            dx, dy, dz = directions[0, k], directions[1, k], directions[2, k]
-            x, y, z = _taken(p, ox, oy, oz, 0), _taken(p, ox, oy, oz, 1), _taken(p, ox, oy, oz, 2)
-            u, v, w = _taken(p, dx, dy, dz, 0), _taken(p, dx, dy, dz, 1), _taken(p, dx, dy, dz, 2)
-            if _passes(box, pad, ends[k], x, y, z, u, v, w):
+            x, y, z = taken(turn, rays[0, k] - px, rays[1, k] - py, rays[2, k] - pz)
+            u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])
+            if passes(sides, pad, ends[k], x, y, z, u, v, w):
                 out[found, 0], out[found, 1] = k, pair
                 found += 1
     return out[:found].copy()
 
 
 def through(
-    origins: Floats, directions: Floats, ends: Floats, cell: Indices, poses: Floats,
-    boxes: Floats, pads: Floats,
+    rays: Floats, ends: Floats, cell: Indices, poses: Floats, boxes: Floats, shape: Ints,
+    pads: Floats,
 ) -> tuple[Indices, Indices]:  # fmt: skip
-    """Rays of cells that pass through boxes, and their numbers of cell and box.
+    """Rays of cells (m,) that pass through boxes, and their numbers of cell and box.
 
-    Boxes (m, 6) have poses (m, 12) and are larger by `pads`; rays (3, n) end at `ends`.
+    Boxes (s, 6), `shape` of which (m,), have poses (12, m) and are larger by `pads` (m,); rays
+    (6, n) end at `ends`.
     """
-    pairs = _through(origins, directions, ends, np.ascontiguousarray(cell), poses, boxes, pads)
+    cell, shape = np.ascontiguousarray(cell), np.ascontiguousarray(shape)
+    pairs = _through(rays, ends, cell, poses, boxes, shape, pads)
     return pairs[:, 0], pairs[:, 1]
-
-
-@compiled(
-    "i8(f8[:, ::1], f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], i8[::1], f8[:, ::1], i8[::1], f8, "
-    "i8[::1], f8[:, ::1], f8[:, ::1])"
-)
-def _local(  # type: ignore[no-untyped-def]
-    origins, directions, ends, row, poses, number, boxes, pair, pad, kept, starts, ways
-):
-    found = 0
-    for n in range(len(row)):
-        k, p = row[n], poses[number[n]]
-        ox, oy, oz = origins[0, k] - p[0], origins[1, k] - p[1], origins[2, k] - p[2]
-        dx, dy, dz = directions[0, k], directions[1, k], directions[2, k]
-        x, y, z = _taken(p, ox, oy, oz, 0), _taken(p, ox, oy, oz, 1), _taken(p, ox, oy, oz, 2)
-        u, v, w = _taken(p, dx, dy, dz, 0), _taken(p, dx, dy, dz, 1), _taken(p, dx, dy, dz, 2)
-        if _passes(boxes[pair[n]], pad, ends[k], x, y, z, u, v, w):
-            kept[found] = n
-            starts[found, 0], starts[found, 1], starts[found, 2] = x, y, z
-            ways[found, 0], ways[found, 1], ways[found, 2] = u, v, w
-            found += 1
-    return found
-
-
-def local(
-    origins: Floats, directions: Floats, ends: Floats, row: Indices, poses: Floats,
-    number: Indices, boxes: Floats, pair: Indices,
-) -> tuple[Indices, Floats, Floats]:  # fmt: skip
-    """Take rays `row` (n,) to the axes of poses `number`, to boxes `pair`, (n,) each.
-
-    Returns the numbers of those that pass through the boxes (k,), and their origins and
-    directions (k, 3).
-    """
-    row, number, pair = map(np.ascontiguousarray, (row, number, pair))
-    kept, (starts, ways) = np.empty(len(row), np.int64), np.empty((2, len(row), 3))
-    given = origins, directions, ends, row, poses, number, boxes, pair, PADS_M
-    found = _local(*given, kept, starts, ways)
-    return kept[:found], starts[:found], ways[:found]
-
-
-@compiled("i8[::1](i8[::1], f8[::1], i8[::1], i8)")
-def _nearest(row, distance, body, count):  # type: ignore[no-untyped-def]
-    best, found = np.full(count, -1), 0
-    for n in range(len(row)):
-        at = best[row[n]]
-        found += at < 0
-        if at < 0 or (distance[n], body[n]) < (distance[at], body[at]):
-            best[row[n]] = n
-    out, k = np.empty(found, np.int64), 0
-    for at in best:
-        if at >= 0:
-            out[k] = at
-            k += 1
-    return out
-
-
-def nearest(row: Ints, distance: Floats, body: Ints, count: int) -> Indices:
-    """Hits that are the nearest of their rays, in ray order; of equal ones the first body's."""
-    found: Indices = _nearest(*map(np.ascontiguousarray, (row, distance, body)), count)
-    return found

@@ -12,7 +12,7 @@ from .arrays import AnyArray, Bools, Floats
 
 # A vector with a squared length this close to 1 is a unit vector up to rounding, and is left as it
 # is, so that the last bits of normalised directions do not change.
-_UNIT_SLACK = 1e-14
+UNIT_SLACK = 1e-14
 
 # Rows that are checked at a time, so that extra memory does not grow with the rays.
 _BLOCK = 1 << 18
@@ -114,7 +114,7 @@ def _normalised(table: Floats) -> Floats:
     # machine.
     with np.errstate(over="ignore", under="ignore"):
         squared = (x * x + y * y) + z * z
-    off = np.abs(squared - 1) > _UNIT_SLACK
+    off = np.abs(squared - 1) > UNIT_SLACK
     if not off.any():
         return table
     rows = table[off]
@@ -173,7 +173,7 @@ def _are_units(columns: Floats) -> bool:
         squared += y * y
         squared += z * z
         squared -= 1
-        return bool((np.abs(squared, out=squared) <= _UNIT_SLACK).all())
+        return bool((np.abs(squared, out=squared) <= UNIT_SLACK).all())
 
 
 def _check_directions(directions: ArrayLike) -> AnyArray:

@@ -188,14 +188,14 @@ def test_no_ray_meets_an_actor_that_is_not_asked_about_it(street, monkeypatch, n
     found = made(survey, scene)
     asked = []
 
-    def every_ray(origins, directions, ends, cell, *_):
+    def every_ray(rays, ends, cell, *_):
         asked.append(1)
         row = (cell[:, None] * moving_loops.CELL + np.arange(moving_loops.CELL)).ravel()
         pair = np.repeat(np.arange(len(cell)), moving_loops.CELL)
         return row[row < len(ends)], pair[row < len(ends)]
 
-    def every_cell(cells, number, middles, *_):
-        bodies = len(middles)
+    def every_cell(wide, cells, number, looks, *_):
+        bodies = len(looks)
         return np.tile(np.arange(len(cells)), bodies), np.repeat(np.arange(bodies), len(cells))
 
     monkeypatch.setattr(moving_loops, "through", every_ray)

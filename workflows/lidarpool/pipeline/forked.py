@@ -17,7 +17,7 @@ keep_freed_memory()
 # nannies, and would call what it does not find an error.
 logging.getLogger("distributed.diskutils").setLevel(logging.CRITICAL)
 with suppress(ImportError):  # if it cannot be loaded, a check says why
-    from raybeam import embree_packets, moving_loops  # noqa: F401
+    from raybeam import embree_bodies, embree_packets, moving_loops  # noqa: F401
 
     if embree_packets.COMPILED:
         print("note: compiled the ray caster for this processor, once", file=sys.stderr)  # noqa: T201

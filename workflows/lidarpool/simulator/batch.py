@@ -18,17 +18,18 @@ def columns_of(found: Sequence[BatchReturns | DeviceReturns]) -> PartColumns:
         column.name: _joined([returns.column(column) for returns in found])
         for column in found[0].survey.stored_columns
     }
-    hits = np.zeros(found[0].scene.counters, np.int64)
-    for returns in found:
-        triangles, counts = returns.tally
-        hits[triangles] += counts
-    triangles = np.flatnonzero(hits)
+    triangles, hits = found[0].tally
+    if len(found) > 1:
+        every, counts = map(np.concatenate, zip(*(returns.tally for returns in found), strict=True))
+        triangles, row = np.unique(every, return_inverse=True)
+        hits = np.zeros(len(triangles), np.int64)
+        np.add.at(hits, row, counts)
     return PartColumns(
         found[0].specs[0].scan,
         _joined([returns.counts for returns in found]),
         columns,
         triangles.astype(np.int32),
-        hits[triangles],
+        hits,
     )
 
 

@@ -177,11 +177,17 @@ class Rig:
             yield self.returns(run, self.survey.path)
 
     def returns(
-        self, specs: list[ScanSpec], path: Trajectory, late_ns: float = 0.0
+        self,
+        specs: list[ScanSpec],
+        path: Trajectory,
+        late_ns: float = 0.0,
+        *,
+        tally: bool = True,
     ) -> BatchReturns | DeviceReturns:
         """Cast scans of one station, the firings of each following those of the one before.
 
-        The carrier is `late_ns` further on its path than the firings' own times say.
+        The carrier is `late_ns` further on its path than the firings' own times say. Hits of each
+        triangle are counted if `tally`.
         """
         number, survey = specs[0].sensor, self.survey
         whole, subrays, by_head = self._repeated(number, path.moves)
@@ -209,7 +215,7 @@ class Rig:
             return self._device.returns(specs, pattern, poses, window, groups)
         echoes = self._echoes[number]
         scan = specs[0].scan + specs[0].ahead
-        found = echoes.scan(scan, pattern, subrays, poses, window, groups)
+        found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=tally)
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:

@@ -201,7 +201,7 @@ class Scanner:
                     "(start_s), or take a longer one."
                 )
             check_trajectory(path)
-            returns = rig.returns(specs, path, late_ns)
+            returns = rig.returns(specs, path, late_ns, tally=False)
         survey = rig.survey
         origin = rig.scene.origin if survey.coordinates == "world" else np.zeros(3)
         table = (SCAN, *(column for column in survey.stored_columns if column not in AXES))

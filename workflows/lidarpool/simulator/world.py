@@ -172,23 +172,21 @@ class World:
         distance, triangle = np.full(len(scan), np.inf), np.full(len(scan), -1, np.int32)
         distance[found.ray], triangle[found.ray] = found.distance, found.triangle
         on = self.on_actors(scan, poses, distance)
-        nearer = on.distance < distance[on.ray]
-        there = on.ray[nearer]
-        distance[there], triangle[there] = on.distance[nearer], on.triangle[nearer]
+        distance[on.ray], triangle[on.ray] = on.distance, on.triangle
         ray = np.flatnonzero(triangle >= 0)
         return ray, distance[ray], triangle[ray]
 
     def on_actors(self, scan: Scan, poses: Poses, before: Floats | None = None) -> OtherHits:
-        """Find the nearest hits of rays on actors; some behind distances `before` may lack."""
+        """Find the nearest hits of rays on actors, at less than distances `before` (n,)."""
         assert self._shapes is not None
         casters, boxes, parts, shape = self._shapes
         ways = poses.ways
         moving = Moving(casters, boxes, shape, ways.presence_ns, ways.poses)
         hits = hits_on(moving, scan, poses.times, before)
-        triangle = hits.triangle + parts[shape[hits.body], hits.instance]
-        return OtherHits(
-            hits.ray.astype(np.uint32), hits.distance, triangle + self._firsts[hits.body]
-        )
+        ray = np.flatnonzero(hits.body >= 0)
+        body, triangle = hits.body[ray], hits.triangle[ray]
+        triangle = triangle + parts[shape[body], hits.instance[ray]] + self._firsts[body]
+        return OtherHits(ray.astype(np.uint32), hits.distance[ray], triangle)
 
 
 def _caster_of(scene: Scene, vertices: Floats, options: dict[str, Any]) -> RayCaster:
