@@ -32,7 +32,6 @@ _COHERENCE = 0.94
 _SHAPES = ((16, 1), (8, 2), (4, 4))  # rays along a ring and across, that go together
 _MOST = 1 << 15  # rays of a block
 _TRIALS, _TRIED = 5, 1 << 10  # parts that are cast in each way to choose the fastest, and rays
-_STRIKES = 10  # calls of `strike` that cast packets and single rays in turn, to choose
 _LIKE = 0.02  # between the cosines of patterns for which the same way is the fastest
 _PLANS = 16  # kept
 
@@ -88,7 +87,7 @@ class EmbreeBackend(Backend):
             embree_library.EmbreeInstances(scene, trees, threads) if scene.nested else None
         )
         self._plans: dict[tuple[int, int], _Plan] = {}
-        self._trials: list[float] = []  # seconds a ray of the first calls of `strike`
+        self._strikes: tuple[list[float], list[float]] = [], []  # seconds a ray, see `strike`
         self._loops, self._memory = embree_packets, embree_memory
         self._corners = [np.ascontiguousarray(mesh.corners) for mesh in scene.meshes]
         self._meshes = np.zeros(len(scene.meshes), embree_memory.MESH)
@@ -153,13 +152,14 @@ class EmbreeBackend(Backend):
         own["scratch"], _ = _own.memory(0)
         given = crossing.row, crossing.body, crossing.number
         row, body, number = map(np.ascontiguousarray, given)
-        start, way = time.perf_counter(), len(self._trials) % 2
-        if len(self._trials) == _STRIKES:
-            way = int(np.argmin(np.median(np.reshape(self._trials, (-1, 2)), axis=0)))
-        own["coherence"] = (_COHERENCE, 2.0)[way]
+        # Threads may time calls at the same time: each list has enough, whatever the order.
+        packets, single = self._strikes
+        tried = min(len(packets), len(single)) >= _TRIALS
+        alone = np.median(single) < np.median(packets) if tried else len(single) < len(packets)
+        own["coherence"], start = 2.0 if alone else _COHERENCE, time.perf_counter()
         strike(own, crossing.rays, row, body, number, crossing.poses, crossing.box, *nearest)
-        if len(self._trials) < _STRIKES and len(row) >= _TRIED:
-            self._trials.append((time.perf_counter() - start) / len(row))
+        if not tried and len(row) >= _TRIED:
+            self._strikes[bool(alone)].append((time.perf_counter() - start) / len(row))
 
     def parts(self, scan: Scan) -> Iterator[tuple[int, int, Part]]:
         """See `Backend.parts`."""

@@ -71,7 +71,7 @@ class Moving:
 def hits_on(
     moving: Moving, scan: Scan, times: Callable[[Ints], Floats], before: Floats | None = None
 ) -> Nearest:
-    """Find the nearest hit of each ray of a scan on a body; its distance is some other without.
+    """Find the nearest hit of each ray of a scan on a body.
 
     Parameters
     ----------
@@ -166,9 +166,9 @@ class _Chunk:
             there = (first <= times[row]) & (times[row] <= last)
             row, body = row[there], body[there]
             poses, number = _table(*moving.poses(body, times[row])), np.arange(len(row))
-        limits, shape, every = (self._scan.t_min, self._scan.t_max), moving.shape[body], slice(None)
-        for one in np.unique(shape).tolist() if len(moving.shapes) > 1 else [0]:
-            own = shape == one if len(moving.shapes) > 1 else every
+        limits, shape = (self._scan.t_min, self._scan.t_max), moving.shape[body]
+        for one in np.unique(shape).tolist():  # none without rays
+            own = shape == one if len(moving.shapes) > 1 else slice(None)
             which = row[own], body[own], number[own]
             crossing = Crossing(rays, times, *which, poses, boxes[one], limits)
             moving.shapes[one].strike(crossing, self._nearest)
