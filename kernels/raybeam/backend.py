@@ -10,7 +10,7 @@ from typing import ClassVar
 import numpy as np
 
 from .arrays import Floats, Integers, Ints, Ints32
-from .crossing import Crossing, Nearest, strike
+from .crossing import Crossing, Nearest, Swept, strike
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, Part, ScanReturns, joined
 from .instances import Scene
@@ -98,6 +98,10 @@ class Backend(ABC):
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
         """Note where rays hit bodies of this shape, if that is nearer."""
         strike(lambda rays, times: self.nearest(rays), crossing, nearest)
+
+    def sweep(self, sweep: Swept, nearest: Nearest) -> None:
+        """Note where rays hit bodies of this shape, if that is nearer, on the device."""
+        raise BackendUnavailable(f"Backend {self.name!r} has no device: use strike.")
 
     def cast(self, rays: Rays) -> Hits:
         """Closest hit of every ray."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
@@ -35,6 +36,7 @@ class Bending:
     vertices: Floats
     faces: Ints
     times: Floats
+    on_device: ClassVar[bool] = False  # as of `RayCaster`
 
     @property
     def box(self) -> Floats:

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Ints
 from .backend import Backend
-from .crossing import Crossing, Nearest
+from .crossing import Crossing, Nearest, Swept
 from .device import DeviceHits, OtherHits
 from .hits import Counted, Hits, ScanReturns
 from .instances import Instance, Mesh, check_instances, check_transform, place
@@ -151,6 +151,10 @@ class RayCaster:
     def strike(self, crossing: Crossing, nearest: Nearest) -> None:
         """See `Backend.strike`."""
         self.engine.strike(crossing, nearest)
+
+    def sweep(self, sweep: Swept, nearest: Nearest) -> None:
+        """See `Backend.sweep`."""
+        self.engine.sweep(sweep, nearest)
 
     def move(self, number: int, transform: ArrayLike) -> None:
         """Give an instance another transform; casts that begin after this see it there.

@@ -25,6 +25,20 @@ class Crossing(NamedTuple):
     limits: tuple[float, float]  # t_min and t_max
 
 
+class Swept(NamedTuple):
+    """Rays and bodies of one shape, with their poses at all times of the rays."""
+
+    rays: Floats  # (6, n): as of `Crossing`
+    when: Ints32  # (n,): number of each ray's time; one beyond the `t` times meets no body
+    body: Ints  # (b,)
+    poses: Floats  # (t, b, 12): as of `Crossing`; NaN where a body is not there
+    boxes: Floats  # (t / SPAN, b, 6): corners of what holds them during that many times
+    limits: tuple[float, float]
+
+
+SPAN = 32  # as in intersect.cu
+
+
 class Nearest(NamedTuple):
     """What rays (n,) hit nearest on bodies that move; of equal distances, the first body.
 

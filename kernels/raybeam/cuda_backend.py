@@ -6,13 +6,14 @@ import importlib.resources
 import importlib.util
 from collections.abc import Callable, Iterator
 from functools import lru_cache, partial
-from typing import Any, ClassVar
+from typing import Any, ClassVar, cast
 from weakref import WeakKeyDictionary
 
 import numpy as np
 
-from .arrays import Ints
+from .arrays import AnyArray, Ints
 from .backend import Backend, Found
+from .crossing import Nearest, Swept
 from .device import DeviceHits, OtherHits, to_device
 from .hits import Counted, Part, ScanReturns, joined
 from .instances import Scene
@@ -163,6 +164,19 @@ class CudaBackend(Backend):
                 kept = self._packed(found, start, groups, scene.frame.scale, counting, replaced)
                 use(DeviceHits(*kept, cp, partial(self._rays, start, rays)))
             return groups.hits, self._counted(counting[2]) if scan.tally else None
+
+    def sweep(self, sweep: Swept, nearest: Nearest) -> None:
+        """See `Backend.sweep`."""
+        cp, n, kept = self._cupy, len(sweep.when), cast(tuple[AnyArray, ...], nearest)
+        limits = (np.float64(t * self._scene.frame.scale) for t in sweep.limits)
+        with self._device:
+            rays, when, body, poses, boxes = map(cp.asarray, sweep[:5])
+            found = [cp.asarray(column) for column in kept]
+            numbers = body, np.int32(len(body)), poses, boxes, np.int32(len(poses))
+            given = rays, when, np.int64(n), *numbers, *limits
+            self._run("cast_bodies", n, *self._meshes, *self._places, *given, *found)
+            for column, out in zip(found, kept, strict=True):
+                out[:] = column.get()
 
     def _counted(self, tally: Any) -> Counted:
         """Copy to the host what was counted: most rows of a tally are 0."""

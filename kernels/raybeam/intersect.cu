@@ -42,9 +42,10 @@
 
 typedef long long Count;
 
-// Five blocks of 128 threads to a multiprocessor, four with instances: aiming at more, nvcc spills
-// registers for sm_90.
-#define KERNEL extern "C" __global__ void __launch_bounds__(128, NESTED ? 4 : 5)
+// Five blocks of 128 threads to a multiprocessor, four with instances, one less for bodies: aiming
+// at more, nvcc spills registers for sm_90 or sm_120.
+#define BLOCKS (NESTED ? 4 : 5)
+#define KERNEL extern "C" __global__ void __launch_bounds__(128, BLOCKS)
 
 // Counters for runs on the CPU; on a device, nothing.
 #ifndef SEEN
@@ -57,6 +58,8 @@ typedef long long Count;
 #define SLACK 9.5367431640625e-07f  // 2^-20: on limits in float, far more than their rounding
 #define ACROSS 4.0                  // more than the diagonal of any scene
 #define RECORD 20                   // doubles of an instance
+#define SPAN 32                     // times for each box of a body on its way
+#define UNIT_SLACK 1e-14            // see rays.py
 
 struct Scene {
     const float4* nodes;
@@ -191,6 +194,56 @@ struct PatternRays {
         out.dx = to[0];
         out.dy = to[1];
         out.dz = to[2];
+        return out;
+    }
+};
+
+// Rays in the axes of a body that moves, where that is at the ray's time: `pose` is its position, and
+// its rotation from its axes, by rows.
+struct BodyRays {
+    const double* rays;  // 6 rows of `count`: origins in metres, and directions
+    Count count;
+    const double* pose;
+
+    __device__ __forceinline__ static void take(
+        const double* r, double x, double y, double z, double& a, double& b, double& c)
+    {
+        a = (x * r[0] + y * r[3]) + z * r[6];
+        b = (x * r[1] + y * r[4]) + z * r[7];
+        c = (x * r[2] + y * r[5]) + z * r[8];
+    }
+
+    // Make a ray; returns the length that its direction had, as `strike` of crossing.py.
+    __device__ __forceinline__ double make(const Scene& scene, Count i, Ray& ray) const
+    {
+        double at[3];
+        const double x = rays[i] - pose[0], y = rays[count + i] - pose[1];
+        const double z = rays[2 * count + i] - pose[2];
+        take(pose + 3, x, y, z, at[0], at[1], at[2]);
+        place_origin(scene, at, ray);
+        double u, v, w;
+        take(pose + 3, rays[3 * count + i], rays[4 * count + i], rays[5 * count + i], u, v, w);
+        const double squared = (u * u + v * v) + w * w;
+        if (fabs(squared - 1.0) > UNIT_SLACK) {
+            const double most = fmax(fabs(u), fmax(fabs(v), fabs(w)));
+            u = u / most;
+            v = v / most;
+            w = w / most;
+            const double rest = sqrt((u * u + v * v) + w * w);
+            u = u / rest;
+            v = v / rest;
+            w = w / rest;
+        }
+        ray.dx = u;
+        ray.dy = v;
+        ray.dz = w;
+        return sqrt(squared);
+    }
+
+    __device__ __forceinline__ Ray load(const Scene& scene, Count i) const
+    {
+        Ray out;
+        make(scene, i, out);
         return out;
     }
 };
@@ -650,6 +703,59 @@ KERNEL cast_pattern(
     if (best.place >= 0) distance[i] = best.t;
     if (NESTED && best.place >= 0) instance[i] = best.instance;
 }
+
+// Nearer hits of rays on bodies of the scene's shape, which move, as `strike` of crossing.py. Ray i
+// meets them at time when[i], if that is one of `times`: the pose of body k at time t, 12 doubles, is
+// at t * body_count + k, and begins with NaN where the body is not there. `boxes` are what holds it
+// during SPAN times, low and high corner. `nearest_...` are read and written.
+#undef BLOCKS
+#define BLOCKS (NESTED ? 3 : 4)
+KERNEL cast_bodies(
+    const float4* __restrict__ nodes, const float4* __restrict__ triangles,
+    const double* __restrict__ corners, const int* __restrict__ faces,
+    const float* __restrict__ uvs, const unsigned char* __restrict__ masks,
+    const Count* __restrict__ opacity,
+    const double* __restrict__ frame, const float4* __restrict__ top,
+    const double* __restrict__ instances,
+    const double* __restrict__ rays, const int* __restrict__ when, Count count,
+    const Count* __restrict__ bodies, int body_count,
+    const double* __restrict__ poses, const double* __restrict__ boxes, int times,
+    double t_min, double t_max,
+    double* __restrict__ nearest_metres, Count* __restrict__ nearest_body,
+    int* __restrict__ nearest_instance, int* __restrict__ nearest_triangle)
+{
+    const Count i = blockIdx.x * (Count)blockDim.x + threadIdx.x;
+    if (i >= count || when[i] < 0 || when[i] >= times) return;
+    const Scene scene = {nodes, triangles, corners, faces, uvs,
+                         masks, opacity,   frame,   top,   instances};
+#pragma unroll 1
+    for (int k = 0; k < body_count; ++k) {
+        const double* low = boxes + 6 * ((Count)(when[i] / SPAN) * body_count + k);
+        double enters = 0.0, leaves = nearest_metres[i] * (1.0 + SLACK);
+        for (int axis = 0; axis < 3; ++axis) {
+            const double o = rays[axis * count + i], d = rays[(3 + axis) * count + i];
+            clip(low[axis], low[3 + axis], o, d, enters, leaves);
+        }
+        const double* pose = poses + 12 * ((Count)when[i] * body_count + k);
+        if (!(enters <= leaves) || pose[0] != pose[0]) continue;
+        const BodyRays own = {rays, count, pose};
+        Ray ray;
+        const double reach = nearest_metres[i] * frame[3] * (1.0 + SLACK);
+        Closest best(fmin(t_max, reach * own.make(scene, i, ray)));
+        walk(scene, own, i, t_min, best);
+        if (best.place < 0) continue;
+        const double metres = best.t / frame[3] / own.make(scene, i, ray);
+        const bool first = metres == nearest_metres[i] && bodies[k] < nearest_body[i];
+        if (!(metres < nearest_metres[i] || first)) continue;
+        nearest_metres[i] = metres;
+        nearest_body[i] = bodies[k];
+        nearest_instance[i] = NESTED ? best.instance : 0;
+        nearest_triangle[i] = faces[best.place];
+    }
+}
+
+#undef BLOCKS
+#define BLOCKS (NESTED ? 4 : 5)
 
 // Weights of the second and third corner for hits of cast_table, one a ray that is listed.
 KERNEL weigh_table(

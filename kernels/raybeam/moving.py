@@ -5,6 +5,9 @@ each cell of them, and the plane of a fan, is compared with the ball around each
 while rays are fired; where they meet, each ray is compared with the body's box, as it is when the
 cell is fired. The rays that pass are taken to the body's axes at their own time, and cast there, at
 near bodies first. The comparisons are loops of moving_loops.py, and decide no hit.
+
+A CUDA device compares each ray with a box around each body's way, and has the body's poses at all
+times of the rays.
 """
 
 from __future__ import annotations
@@ -16,14 +19,15 @@ from typing import Any
 
 import numpy as np
 
-from .arrays import Floats, Indices, Ints
+from .arrays import Bools, Floats, Indices, Ints
 from .bending import Bending
 from .caster import RayCaster
-from .crossing import Crossing, Nearest
+from .crossing import SPAN, Crossing, Nearest, Swept
 from .scan import Scan
 
 _CHUNK = 1 << 15  # rays at a time
 _PAIRS = 1 << 11  # of cells and bodies at a time
+_POSES = 1 << 18  # on a device: 25 MB
 _LOOKS = 128  # cells for each look at the bodies
 
 
@@ -112,6 +116,9 @@ class _Chunk:
         loops, moving, times = self._loops, self._moving, self._times
         first, last = moving.there.T
         bodies = np.flatnonzero((first <= times.max()) & (last >= times.min()))
+        swept = self._on_device()[moving.shape[bodies]]
+        self._sweep(bodies[swept])
+        bodies = bodies[~swept]
         if not len(bodies):
             return
         cells = loops.cells_of(self._rays, times, loops.CELL)
@@ -126,6 +133,46 @@ class _Chunk:
         for start in range(0, len(cell), _PAIRS):
             some = slice(start, start + _PAIRS)
             self._cast_at(cell[some], cells[cell[some]], body[some])
+
+    def _on_device(self) -> Bools:
+        return np.array([shape.on_device for shape in self._moving.shapes])
+
+    def _sweep(self, bodies: Ints) -> None:
+        """Note the nearest hits on bodies whose shapes are on a device."""
+        moving, scan = self._moving, self._scan
+        at, when = np.unique(self._times, return_inverse=True)
+        step = max(1, _POSES // (SPAN * max(1, len(bodies)))) * SPAN
+        for one in np.unique(moving.shape[bodies]).tolist():
+            shape, own = moving.shapes[one], bodies[moving.shape[bodies] == one]
+            assert isinstance(shape, RayCaster)
+            for start in range(0, len(at), step):
+                rows = np.flatnonzero((when >= start) & (when < start + step))
+                first, last = int(rows[0]), int(rows[-1]) + 1
+                poses, boxes = self._swept(one, own, at[start : start + step])
+                rays = np.ascontiguousarray(self._rays[:, first:last])
+                number = (when[first:last] - start).astype(np.int32)
+                given = Swept(rays, number, own, poses, boxes, (scan.t_min, scan.t_max))
+                shape.sweep(given, self._nearest.part(first, last))
+
+    def _swept(self, shape: int, bodies: Ints, times: Floats) -> tuple[Floats, Floats]:
+        """Poses and boxes of bodies of one shape at times, see `Swept`."""
+        from .moving_loops import PADS_M
+
+        moving, many = self._moving, len(bodies)
+        body, time = np.tile(bodies, len(times)), np.repeat(times, many)
+        first, last = moving.there[body].T
+        there = (first <= time) & (time <= last)
+        poses, corners = np.full((len(body), 12), np.nan), np.full((2, len(body), 3), np.nan)
+        if there.any():
+            positions, turns = moving.poses(body[there], time[there])
+            poses[there] = _table(positions, turns).T
+            middle = positions + _turned(turns, moving.middle[[shape]])
+            half = _turned(np.abs(turns), moving.half[[shape]]) + PADS_M
+            corners[:, there] = middle - half, middle + half
+        low, high = corners.reshape(2, -1, many, 3)
+        spans = np.arange(0, len(times), SPAN)
+        boxes = np.fmin.reduceat(low, spans), np.fmax.reduceat(high, spans)
+        return poses.reshape(-1, many, 12), np.concatenate(boxes, axis=2)
 
     def _looks(self, bodies: Ints, cells: Floats) -> tuple[Ints, Floats, Floats]:
         """Bodies, looked at a few times, see `meet`."""

@@ -11,5 +11,6 @@ extern "C" const long long* what_was_seen() { return seen; }
 
 RUN(cast_table)
 RUN(cast_pattern)
+RUN(cast_bodies)
 RUN(weigh_table)
 RUN(pack)
