@@ -704,12 +704,13 @@ KERNEL cast_pattern(
     if (NESTED && best.place >= 0) instance[i] = best.instance;
 }
 
+#undef BLOCKS
+#define BLOCKS (NESTED ? 3 : 4)
+
 // Nearer hits of rays on bodies of the scene's shape, which move, as `strike` of crossing.py. Ray i
 // meets them at time when[i], if that is one of `times`: the pose of body k at time t, 12 doubles, is
 // at t * body_count + k, and begins with NaN where the body is not there. `boxes` are what holds it
 // during SPAN times, low and high corner. `nearest_...` are read and written.
-#undef BLOCKS
-#define BLOCKS (NESTED ? 3 : 4)
 KERNEL cast_bodies(
     const float4* __restrict__ nodes, const float4* __restrict__ triangles,
     const double* __restrict__ corners, const int* __restrict__ faces,

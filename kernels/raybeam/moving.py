@@ -19,7 +19,7 @@ from typing import Any
 
 import numpy as np
 
-from .arrays import Bools, Floats, Indices, Ints
+from .arrays import Floats, Indices, Ints
 from .bending import Bending
 from .caster import RayCaster
 from .crossing import SPAN, Crossing, Nearest, Swept
@@ -116,9 +116,10 @@ class _Chunk:
         loops, moving, times = self._loops, self._moving, self._times
         first, last = moving.there.T
         bodies = np.flatnonzero((first <= times.max()) & (last >= times.min()))
-        swept = self._on_device()[moving.shape[bodies]]
-        self._sweep(bodies[swept])
-        bodies = bodies[~swept]
+        swept = np.array([shape.on_device for shape in moving.shapes])[moving.shape[bodies]]
+        if swept.any():
+            self._sweep(bodies[swept])
+            bodies = bodies[~swept]
         if not len(bodies):
             return
         cells = loops.cells_of(self._rays, times, loops.CELL)
@@ -134,14 +135,11 @@ class _Chunk:
             some = slice(start, start + _PAIRS)
             self._cast_at(cell[some], cells[cell[some]], body[some])
 
-    def _on_device(self) -> Bools:
-        return np.array([shape.on_device for shape in self._moving.shapes])
-
     def _sweep(self, bodies: Ints) -> None:
         """Note the nearest hits on bodies whose shapes are on a device."""
         moving, scan = self._moving, self._scan
         at, when = np.unique(self._times, return_inverse=True)
-        step = max(1, _POSES // (SPAN * max(1, len(bodies)))) * SPAN
+        step = max(1, _POSES // (SPAN * len(bodies))) * SPAN
         for one in np.unique(moving.shape[bodies]).tolist():
             shape, own = moving.shapes[one], bodies[moving.shape[bodies] == one]
             assert isinstance(shape, RayCaster)
