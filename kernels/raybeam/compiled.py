@@ -7,14 +7,16 @@ from pathlib import Path
 from typing import Any
 
 try:
+    from llvmlite.binding import add_symbol
     from numba import njit
     from numba.core.ccallback import CFunc
+    from numba.types import ExternalFunction
 except ImportError:
     njit = None
 
 
 def _keeps() -> bool:
-    """Whether numba has a folder for compiled code; else each process compiles it in 25 s."""
+    """Whether numba has a folder for compiled code; else each process compiles it in 20 s."""
     try:
         njit(cache=True)(_keeps)
     except (RuntimeError, TypeError):  # neither beside this file nor in the user's home; no numba
@@ -66,6 +68,12 @@ def callback(signature: Any) -> Callable[[Any], Any]:
         return made
 
     return make
+
+
+def external(name: str, made: Any) -> Any:
+    """Let compiled functions call a callback by its address, under a name."""
+    add_symbol(name, made.address)
+    return ExternalFunction(name, made._sig)
 
 
 def inlined(function: Any) -> Any:

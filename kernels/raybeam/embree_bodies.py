@@ -60,7 +60,7 @@ def strike(  # type: ignore[no-untyped-def]
 ):
     """Cast the rays of a `Crossing` with one `CAST`, and note in a `Nearest` what they hit."""
     cast = casts[0]
-    scratch, filters, t_max, metre = cast.scratch, cast.packets, cast.t_max, 1.0 / cast.scale
+    scratch, t_max, metre = cast.scratch, cast.t_max, 1.0 / cast.scale
     numbers, floats, index = int64s(scratch), float64s(scratch), int32s(cast.index)
     which, lengths = np.empty(LANES, np.int64), np.empty(LANES)
     sides = sides_of(float64s(box.ctypes.data))
@@ -80,7 +80,7 @@ def strike(  # type: ignore[no-untyped-def]
                 filled += 1
             done += 1
         _fill_up(scratch, filled)
-        if filled == 0 or not cast_group(cast, scratch, filters, filled, False):
+        if filled == 0 or not cast_group(casts.ctypes.data, filled, 0):
             continue
         for lane in range(filled):
             t, key, n = floats[_T + lane], numbers[_KEY + lane], which[lane]

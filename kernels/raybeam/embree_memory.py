@@ -150,3 +150,4 @@ float32s, float64s = pointer(types.float32), pointer(types.float64)
 uint8s, uint32s = pointer(types.uint8), pointer(types.uint32)
 
 CASTS = types.Array(numba.from_dtype(CAST), 1, "C")  # of one cast
+casts_at = pointer(CASTS.dtype)

@@ -10,12 +10,12 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import types
+from numba import carray, types
 
 from . import embree_exact as exact
 from . import embree_memory as memory
-from .compiled import compiled, inlined, stage
-from .embree_memory import LANES, NUMBER, at, float32s, float64s, int32s, int64s, offset
+from .compiled import callback, compiled, external, inlined, stage
+from .embree_memory import LANES, NUMBER, at, casts_at, float32s, float64s, int32s, int64s, offset
 from .embree_rays import begin, make, set_out
 
 _ARGUMENTS, _ARGUMENTS_AT, _FILTER = at("arguments"), offset("arguments"), at("arguments") + 2
@@ -164,14 +164,12 @@ def _one_by_one(scene, scratch, proposer, t_max):  # type: ignore[no-untyped-def
     flags[0] = exact.CALL_FILTER | exact.COHERENT
 
 
-@inlined
-def cast_group(cast, scratch, filters, real, fixed):  # type: ignore[no-untyped-def]
-    """Write to `t` and `key` what the rays of a group hit; False if none hits anything.
-
-    `real` of them are no copies. Starts of packets stay as they are if `fixed`.
-    """
+@callback(types.int64(types.int64, types.int64, types.int64))
+def _cast_group(address, real, fixed):  # type: ignore[no-untyped-def]
+    """Write to `t` and `key` what the rays of a group hit; 0 if none hits anything."""
+    cast = carray(casts_at(address), 1)[0]
     scene, width, mesh, instances = cast.scene, cast.width, cast.mesh, cast.instances
-    t_min, t_max, masked = cast.t_min, cast.t_max, cast.masked
+    scratch, t_min, t_max, masked = cast.scratch, cast.t_min, cast.t_max, cast.masked
     numbers, floats = int64s(scratch), float64s(scratch)
     plain = instances == 0 and not masked
     _reset(scratch, plain)
@@ -182,12 +180,12 @@ def cast_group(cast, scratch, filters, real, fixed):  # type: ignore[no-untyped-
     else:
         _fill(scratch, width, t_min, t_max, fixed)
         arguments = scratch + _ARGUMENTS_AT
-        numbers[_FILTER] = filters[0]
+        numbers[_FILTER] = cast.packets[0]
         if width == 16:
             _intersect_16(scratch + _VALID_AT, scene, scratch + _PACKET_AT, arguments)
         else:
             for part in range(LANES // width):
-                numbers[_FILTER], numbers[_LANE] = filters[part], part * width
+                numbers[_FILTER], numbers[_LANE] = cast.packets[part], part * width
                 asked = scratch + _VALID_AT + 4 * part * width
                 rays = scratch + _PACKET_AT + 4 * _FIELDS * part * width
                 if width == 8:
@@ -211,6 +209,11 @@ def cast_group(cast, scratch, filters, real, fixed):  # type: ignore[no-untyped-
     return True
 
 
+# Given a `CAST`'s address, how many rays are no copies, and whether starts of packets stay as they
+# are. Called by its own address: as a part of each loop it would take 4 s more to compile.
+cast_group = external("raybeam_cast_group", _cast_group)
+
+
 @compiled(types.int64(memory.CASTS, types.int64, types.int64))
 def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     """Cast rays `start` to `stop`, and write those that hit in their order; returns their number.
@@ -218,7 +221,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     `casts` is one `CAST`.
     """
     cast = casts[0]
-    scratch, instances, filters = cast.scratch, cast.instances, cast.packets
+    address, scratch, instances = casts.ctypes.data, cast.scratch, cast.instances
     t_max, still, near = cast.t_max, cast.still != 0, cast.near != 0
     step, high, wide, before = cast.step, cast.high, cast.wide, cast.before
     shift = 0 if wide == 1 else (1 if wide == 2 else 2)
@@ -230,14 +233,14 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
     out_ray, out_metres = memory.uint32s(cast.ray), float64s(cast.distance)
     out_triangle, out_instance = int32s(cast.triangle), int32s(cast.instance)
     prepare(cast)
-    fixed = still and near
+    fixed = np.int64(still and near)
     for lane in range(LANES):
         numbers[_TILE + lane] = (lane >> shift) * step + (lane & (wide - 1))
         numbers[_POSE + lane], floats[_ENTRY + lane] = 0, 0.0
     if still:
-        set_out(cast, scratch, False)
+        set_out(cast, scratch)
         if cast.width > 1:
-            _fill(scratch, cast.width, cast.t_min, t_max, False)
+            _fill(scratch, cast.width, cast.t_min, t_max, np.int64(0))
     kept = 0
     for block in range(start, stop, span):
         count = min(span, stop - block)
@@ -245,7 +248,7 @@ def trace(casts, start, stop):  # type: ignore[no-untyped-def]
         for column in range(0, min(step, count), wide):
             real = _reals(scratch, column, wide, step, count)
             make(cast, scratch, begins)
-            if not cast_group(cast, scratch, filters, real, fixed):
+            if not cast_group(address, real, fixed):
                 for lane in range(LANES):
                     places[numbers[_RAY + lane]] = -1
                 continue

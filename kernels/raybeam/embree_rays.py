@@ -171,7 +171,6 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
     _rows(scratch, block[0], cast.rows * cast.subrays)
     if cast.still == 0:
         _poses(scratch, block[1], block[2], cast.each)
-    begins = cast.shares != 0 and cast.begins != 0
     if cast.shares != 0:
         _divided(cast, scratch)
     else:
@@ -181,7 +180,7 @@ def make(cast, scratch, block):  # type: ignore[no-untyped-def]
     if cast.delays != 0:
         _drift(scratch, cast.poses, cast.delays, cast.rates, _DX, _DY, _DZ)
     if cast.still == 0:
-        set_out(cast, scratch, begins)
+        set_out(cast, scratch)
     if cast.near == 0:
         low, high = cast.low, cast.upper
         for lane in range(LANES):
@@ -242,9 +241,9 @@ def _localise(scratch, x, y, z, scale):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def set_out(cast, scratch, begins):  # type: ignore[no-untyped-def]
-    """Write the local origins of a group's rays; sub-rays have starts already if it `begins`."""
-    floats = float64s(scratch)
+def set_out(cast, scratch):  # type: ignore[no-untyped-def]
+    """Write the local origins of a group's rays; sub-rays may have starts already."""
+    floats, begins = float64s(scratch), cast.shares != 0 and cast.begins != 0
     if not begins:
         for lane in range(LANES):
             floats[_OX + lane] = floats[_OY + lane] = floats[_OZ + lane] = 0.0

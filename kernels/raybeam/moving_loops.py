@@ -57,13 +57,6 @@ def cells_of(rays, times, size):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def _larger(table, rows):  # type: ignore[no-untyped-def]
-    more = np.empty((2 * len(table), 2), np.int64)
-    more[:rows] = table[:rows]
-    return more
-
-
-@inlined
 def _may_meet(cell, look, size, reach):  # type: ignore[no-untyped-def]
     """Whether rays of a cell may meet a body."""
     radius, slack, first, last = size[0], size[1], size[2], size[3]
@@ -92,9 +85,10 @@ def _may_meet(cell, look, size, reach):  # type: ignore[no-untyped-def]
     return True
 
 
-@compiled("i8[:, ::1](f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8)")
-def _meet(wide, cells, number, looks, sizes, reach):  # type: ignore[no-untyped-def]
-    out, found = np.empty((1024, 2), np.int64), 0
+# Loops write to arrays that are long enough: numba takes 8 s to compile slices and copies.
+@compiled("i8(f8[:, ::1], f8[:, ::1], i8[:, ::1], f8[:, :, ::1], f8[:, ::1], f8, i8[:, ::1])")
+def _meet(wide, cells, number, looks, sizes, reach, out):  # type: ignore[no-untyped-def]
+    found = 0
     # Pointers: views of arrays would be counted, which takes longer than the comparisons.
     cell, broad, look = cells.ctypes.data, wide.ctypes.data, looks.ctypes.data
     for b in range(len(sizes)):
@@ -112,11 +106,9 @@ def _meet(wide, cells, number, looks, sizes, reach):  # type: ignore[no-untyped-
                     at = float64s(own + 96 * first)
                     if not _may_meet(float64s(cell + 120 * c), at, size, reach):
                         continue
-                if found == len(out):
-                    out = _larger(out, found)
-                out[found, 0], out[found, 1] = c, b
+                out[0, found], out[1, found] = c, b
                 found += 1
-    return out[:found].copy()
+    return found
 
 
 def meet(
@@ -138,8 +130,9 @@ def meet(
     reach
         Rays end before.
     """
-    pairs = _meet(wide, cells, number, looks, sizes, reach)
-    return pairs[:, 0], pairs[:, 1]
+    pairs = np.empty((2, len(cells) * len(sizes)), np.int64)
+    found = _meet(wide, cells, number, looks, sizes, reach, pairs)
+    return pairs[0, :found], pairs[1, :found]
 
 
 @inlined
@@ -197,10 +190,9 @@ def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
         out[k] = far - along * along - radius * (1 + 1e-6) - 1e-5 * far
 
 
-@compiled("i8[:, ::1](f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1])")
-def _through(rays, ends, cell, poses, boxes, shape, pads):  # type: ignore[no-untyped-def]
-    out, found = np.empty((4096, 2), np.int64), 0
-    near, count = np.empty(CELL), rays.shape[1]
+@compiled("i8(f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], i8[:, ::1])")
+def _through(rays, ends, cell, poses, boxes, shape, pads, out):  # type: ignore[no-untyped-def]
+    found, near, count = 0, np.empty(CELL), rays.shape[1]
     for pair in range(len(cell)):
         begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
         sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
@@ -216,17 +208,15 @@ def _through(rays, ends, cell, poses, boxes, shape, pads):  # type: ignore[no-un
             pz + (g * x + h * y + i * z),
         )
         _near(rays.ctypes.data + 8 * begin, count, x, y, z, ball, near.ctypes.data)
-        if found + CELL > len(out):
-            out = _larger(out, found)
         for k in range(begin, end):
             if near[k - begin] > 0:
                 continue
             x, y, z = taken(turn, rays[0, k] - px, rays[1, k] - py, rays[2, k] - pz)
             u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])
             if passes(sides, pad, ends[k], x, y, z, u, v, w):
-                out[found, 0], out[found, 1] = k, pair
+                out[0, found], out[1, found] = k, pair
                 found += 1
-    return out[:found].copy()
+    return found
 
 
 def through(
@@ -239,5 +229,6 @@ def through(
     (6, n) end at `ends`.
     """
     cell, shape = np.ascontiguousarray(cell), np.ascontiguousarray(shape)
-    pairs = _through(rays, ends, cell, poses, boxes, shape, pads)
-    return pairs[:, 0], pairs[:, 1]
+    pairs = np.empty((2, len(cell) * CELL), np.int64)
+    found = _through(rays, ends, cell, poses, boxes, shape, pads, pairs)
+    return pairs[0, :found], pairs[1, :found]
