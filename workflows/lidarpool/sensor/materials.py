@@ -433,7 +433,8 @@ def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
     """Energy returned by white surfaces hit at right angles, by distance in metres."""
     distance = np.maximum(distance, NEAREST_M)
-    return (REFERENCE_M / distance) ** 2 * np.exp(-2 * extinction * distance)
+    nearer = (REFERENCE_M / distance) ** 2
+    return nearer * np.exp(-2 * extinction * distance) if extinction else nearer
 
 
 def extinction(visibility_km: float | None, wavelength_nm: float) -> float:

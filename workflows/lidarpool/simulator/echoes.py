@@ -18,7 +18,7 @@ from ..sensor.noise import THRESHOLD_SIGMAS
 from ..sensor.optics import Mode
 from .air import AirCaster
 from .doppler import radial_velocities
-from .hits import NO_SURFACE, Hits, Keys, joined, numbers, runs
+from .hits import NO_SURFACE, Hits, Keys, joined, numbers, runs, strongest
 from .motion import Poses, products, turned
 from .paths import Paths
 from .receiver import Receiver
@@ -294,10 +294,12 @@ def chosen(returns: Hits, mode: Mode) -> Bools:
         return np.ones(len(ray), np.bool_)
     if mode in ("first", "last"):
         return first if mode == "first" else last
-    # The strongest has rank 0; of equally strong ones the nearest.
-    rank = np.empty(len(ray), np.int64)
-    rank[np.lexsort((-returns.energy, ray))] = np.arange(len(ray)) - np.repeat(begins, counts)
+    best, there = strongest(returns.energy, begins, counts), np.zeros(len(ray), np.bool_)
+    there[best] = True
     if mode == "strongest":
-        return np.asarray(rank == 0)
-    strongest_is_last = np.repeat(rank[last] == 0, counts)
-    return np.asarray((rank == 0) | last | ((rank == 1) & strongest_is_last))
+        return there
+    # Where the last is the strongest, the second strongest as well.
+    again, others = last[best] & (counts > 1), returns.energy.copy()
+    others[best] = -np.inf
+    there[strongest(others, begins, counts)[again]] = True
+    return there | last

@@ -50,6 +50,8 @@ class Hits(NamedTuple):
 
     def take(self, rows: Bools | Indices) -> Hits:
         """Select some of them."""
+        if rows.dtype == np.bool_:  # of each column it would be counted again
+            rows = np.flatnonzero(rows)
         return Hits(*selected(self, rows))
 
 
@@ -106,3 +108,10 @@ def runs(ray: Ints) -> tuple[Ints, Ints]:
     """Find starts and lengths of runs of equal numbers."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     return begins, np.diff(begins, append=len(ray))
+
+
+def strongest(energy: Floats, begins: Ints, counts: Ints) -> Indices:
+    """Row of the strongest entry of each run, of equally strong ones of the first."""
+    rows = np.flatnonzero(energy == np.repeat(np.maximum.reduceat(energy, begins), counts))
+    run = np.repeat(np.arange(len(begins)), counts)[rows]
+    return rows[np.diff(run, prepend=-1) != 0]

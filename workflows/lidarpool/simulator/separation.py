@@ -6,7 +6,7 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Ints
 from ..sensor.disc import neighbours
-from .hits import NO_SURFACE, Hits, Planes, numbers, runs
+from .hits import NO_SURFACE, Hits, Planes, numbers, runs, strongest
 from .motion import products
 
 SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
@@ -54,8 +54,7 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     which = np.cumsum(new) - 1
     energy = np.bincount(which, hits.energy).astype(np.float64)
     distance = np.bincount(which, hits.energy * hits.distance) / energy
-    strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
-    first = hits.take(strongest[numbers(which[strongest]) == 0])
+    first = hits.take(strongest(hits.energy, begins, np.diff(begins, append=len(rows))))
     velocity = None
     if hits.velocity is not None:
         velocity = np.bincount(which, hits.energy * hits.velocity) / energy

@@ -19,7 +19,7 @@ from ..base.arrays import Floats, Ints, Records
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import Purpose, normal, raw
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
-from .hits import Hits, Keys, Planes, numbers, runs
+from .hits import Hits, Keys, Planes, numbers, runs, strongest
 from .separation import continued
 
 # All in standard deviations of the system waveform.
@@ -149,8 +149,7 @@ def returns_in(
     what = echo[begins[alone]]
     distance[alone] = found.position[what] * (digitizer.sample_ns * LIGHT_M_NS / 2)
     energy[alone], width[alone] = found.energy[what], found.width[what]
-    strongest = np.flatnonzero(hits.energy == np.maximum.reduceat(hits.energy, begins)[which])
-    first = hits.take(strongest[numbers(which[strongest]) == 0])
+    first = hits.take(strongest(hits.energy, begins, np.diff(begins, append=len(rows))))
     width *= FWHM * digitizer.sigma_ns
     velocity = None
     if hits.velocity is not None:
