@@ -60,20 +60,25 @@ def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
 
 
 @inlined
-def divided(shares, offsets, axis, beam, k, x, y, z):  # type: ignore[no-untyped-def]
+def axes_of(axis, x, y, z):  # type: ignore[no-untyped-def]
+    """Axes across a beam: any two, or along and across an `axis` (3,), which may be empty."""
+    if len(axis):
+        return axes_about(x, y, z, axis)
+    return any_axes(x, y, z)
+
+
+@inlined
+def divided(shares, offsets, axes, beam, k, x, y, z):  # type: ignore[no-untyped-def]
     """Direction of sub-ray k of a beam, as `sub_rays.spread`, and where it starts off the beam's.
 
-    `shares` (5, m) are those of `SubRays.table`; `offsets` (2, n) and `axis` (3,) may be empty.
+    `shares` (5, m) are those of `SubRays.table`; `offsets` (2, n) may be empty.
     """
     straight, across, up = shares[0, k], shares[1, k], shares[2, k]
     if offsets.shape[1]:
         across, up = across + offsets[0, beam], up + offsets[1, beam]
         straight = 1 / np.sqrt((1 + across * across) + up * up)
         across, up = across * straight, up * straight
-    if len(axis):
-        a, b, c, d, e, f = axes_about(x, y, z, axis)
-    else:
-        a, b, c, d, e, f = any_axes(x, y, z)
+    a, b, c, d, e, f = axes
     x, y = (straight * x + across * a) + up * d, (straight * y + across * b) + up * e
     z = (straight * z + across * c) + up * f
     p, q = shares[3, k], shares[4, k]
@@ -116,28 +121,35 @@ def _make(  # type: ignore[no-untyped-def]
     ahead, shifts, shares, offsets, axis, positions, rotations, velocities, rates, delays,
     first, rays, each, origins, directions,
 ):  # fmt: skip
-    rows, delay, subrays = ahead.shape[1], 0.0, max(shares.shape[1], 1)
-    total = rows * subrays
+    subrays, delay = max(shares.shape[1], 1), 0.0
+    total, low, row = ahead.shape[1] * subrays, -1 - subrays, 0  # first ray and row of the beam
+    begin, pose = -1 - each, 0  # first ray of the pose
+    bx, by, bz, sx, sy, sz = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
+    axes = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for k in range(len(rays)):
-        part, pose = first + rays[k], 0
-        if part >= total:
-            part %= total
-        row = part if subrays == 1 else whole_times(part, subrays)
-        if len(positions) > 1:
-            pose = whole_times(rays[k], each)
-        dx, dy, dz = ahead[0, row], ahead[1, row], ahead[2, row]
-        x, y, z = 0.0, 0.0, 0.0
-        if len(shifts):
-            x, y, z = shifts[0, row], shifts[1, row], shifts[2, row]
+        number = first + rays[k]
+        # Rays follow each other: most are of the beam and the pose of the one before.
+        if not low <= number < low + subrays:
+            part = number - whole_times(number, total) * total
+            row = part if subrays == 1 else whole_times(part, subrays)
+            low = number - (part - row * subrays)
+            bx, by, bz = ahead[0, row], ahead[1, row], ahead[2, row]
+            if len(shifts):
+                sx, sy, sz = shifts[0, row], shifts[1, row], shifts[2, row]
+            if shares.shape[1]:
+                axes = axes_of(axis, bx, by, bz)
+        if not begin <= rays[k] < begin + each:
+            pose = whole_times(rays[k], each) if len(positions) > 1 else 0
+            begin = pose * each
+        dx, dy, dz, x, y, z = bx, by, bz, sx, sy, sz
         if shares.shape[1]:
-            part -= row * subrays
-            dx, dy, dz, u, v, w = divided(shares, offsets, axis, row, part, dx, dy, dz)
+            dx, dy, dz, u, v, w = divided(shares, offsets, axes, row, number - low, dx, dy, dz)
             x, y, z = x + u, y + v, z + w
         if len(rotations):
             dx, dy, dz = turned(rotations[pose], dx, dy, dz)
             x, y, z = turned(rotations[pose], x, y, z)
         if len(delays):
-            delay = delays[rays[k] - pose * each]
+            delay = delays[rays[k] - begin]
             dx, dy, dz = drifted(rates[pose], delay, dx, dy, dz)
             x, y, z = drifted(rates[pose], delay, x, y, z)
         x, y, z = x + positions[pose, 0], y + positions[pose, 1], z + positions[pose, 2]
