@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -27,21 +28,20 @@ def _keeps() -> bool:
 _KEEPS = _keeps()
 
 
-def _stamp() -> tuple[int, ...]:
-    """Return what changes with any file beside this one: numba looks only at a loop's own."""
-    found = sorted(Path(__file__).parent.glob("*.py"))
+@cache
+def _stamp(folder: Path) -> tuple[int, ...]:
+    """Return what changes with any file beside this one, or loop elsewhere: numba looks at one."""
+    others = [] if folder == Path(__file__).parent else folder.glob("*_loops.py")
+    found = sorted([*Path(__file__).parent.glob("*.py"), *others])
     return tuple(number for f in found for number in (f.stat().st_mtime_ns, f.stat().st_size))
 
 
-def _kept(made: Any) -> Any:
+def _kept(made: Any, function: Any) -> Any:
     """Let compiled code be loaded if this very version of the package had compiled it."""
     if _KEEPS:
         made.enable_caching()
-        made._cache._cache_file._source_stamp = _STAMP
+        made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
     return made
-
-
-_STAMP = _stamp()
 
 
 def compiled(*signature: Any) -> Callable[[Any], Any]:
@@ -50,7 +50,7 @@ def compiled(*signature: Any) -> Callable[[Any], Any]:
         return lambda function: function
 
     def make(function: Any) -> Any:
-        made = _kept(njit(nogil=True, error_model="numpy")(function))
+        made = _kept(njit(nogil=True, error_model="numpy")(function), function)
         for one in signature:
             made.compile(one)
         return made
@@ -63,7 +63,7 @@ def callback(signature: Any) -> Callable[[Any], Any]:
 
     def make(function: Any) -> Any:
         kind = signature.args, signature.return_type
-        made = _kept(CFunc(function, kind, {}, {"error_model": "numpy"}))
+        made = _kept(CFunc(function, kind, {}, {"error_model": "numpy"}), function)
         made.compile()
         return made
 

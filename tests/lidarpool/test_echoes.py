@@ -39,10 +39,9 @@ from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.noise import Purpose, raw
-from lidarpool.simulator.echoes import chosen
 from lidarpool.simulator.hits import Hits
 from lidarpool.simulator.rig import Rig
-from lidarpool.simulator.separation import separated
+from lidarpool.simulator.separation import chosen, separated
 
 # -- random numbers ------------------------------------------------------------------------------
 

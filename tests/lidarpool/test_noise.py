@@ -23,8 +23,9 @@ from lidarpool import (
     Track,
 )
 from lidarpool.sensor.navigation import fixes, imu_samples
-from lidarpool.sensor.noise import Purpose, named_seed, raw
+from lidarpool.sensor.noise import Purpose, named_seed, raw, starts
 from lidarpool.sensor.weather import Weather, rain, snow
+from lidarpool.simulator import pulse_loops
 from lidarpool.simulator.rig import Rig
 
 SENSOR = Sensor.grid(60, 8, step_deg=90, min_range_m=0.5, max_range_m=60)
@@ -66,16 +67,30 @@ def everything():
 
 def test_no_random_number_is_used_twice(monkeypatch):
     """With three kinds of particles: keys that differ have hashes that differ."""
-    drawn = {}
+    drawn, purposes, compiled_bits = {}, {}, pulse_loops._bits
 
     def recorded(seed, purpose, *key):
         bits = raw(seed, purpose, *key)
         drawn.setdefault(purpose, []).append(np.ravel(bits))
         return bits
 
+    def begun(seed, *which):
+        made = starts(seed, *which)
+        purposes.update(zip(made.tolist(), which, strict=True))
+        return made
+
+    def hashed(start, *key):
+        bits = compiled_bits(start, *key)
+        drawn.setdefault(purposes[int(start)], []).append(np.array([bits], np.uint64))
+        return bits
+
     for name, module in [*sys.modules.items()]:
-        if name.startswith("lidarpool") and getattr(module, "raw", None) is raw:
-            monkeypatch.setattr(module, "raw", recorded)
+        for known, other in ((raw, recorded), (starts, begun)):
+            if name.startswith("lidarpool") and getattr(module, known.__name__, None) is known:
+                monkeypatch.setattr(module, known.__name__, other)
+    for name in ("_uniform", "particles", "fog"):  # not compiled, to see what they draw
+        monkeypatch.setattr(pulse_loops, name, getattr(pulse_loops, name).py_func)
+    monkeypatch.setattr(pulse_loops, "_bits", hashed)
     kinds = rain(20.0), snow(1.0), rain(5.0)
     monkeypatch.setattr(Weather, "particles", property(lambda _: kinds))
     scene, survey = everything()

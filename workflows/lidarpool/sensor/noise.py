@@ -298,6 +298,12 @@ def named_seed(seed: int, name: str) -> int:
     return int.from_bytes(sha256(f"{seed}\n{name}".encode()).digest()[:8], "little") >> 1
 
 
+def starts(seed: int, *purposes: Purpose) -> NDArray[np.uint64]:
+    """Beginnings of the hashes of purposes, see `raw`: (k,)."""
+    start = _mixed(np.array([int(seed) * _GAMMA % 2**64], np.uint64))
+    return _mixed(start + np.array([one.value * _GAMMA % 2**64 for one in purposes], np.uint64))
+
+
 def raw(
     seed: int, purpose: Purpose, scan: ArrayLike, ray: ArrayLike, number: ArrayLike = 0
 ) -> NDArray[np.uint64]:
@@ -306,8 +312,7 @@ def raw(
     The seed is below 2**63. The others are (n,) or one for all: the ray within its scan,
     below 2**32, and the number, below 256.
     """
-    start = np.array([int(seed) * _GAMMA % 2**64], np.uint64)
-    start = _mixed(_mixed(start) + np.uint64(purpose.value * _GAMMA % 2**64))
+    start = starts(seed, purpose)
     # A stream of SplitMix64 for each scan, of which a ray has 256 numbers.
     begins = _mixed(start + np.asarray(scan).astype(np.uint64) * np.uint64(_GAMMA))
     steps = np.asarray(ray).astype(np.uint64) * np.uint64(_NUMBERS)
@@ -331,11 +336,12 @@ def normal(
     They are quantiles of 65,536 equal shares of the distribution, so none is beyond 4.3.
     Logarithms and cosines of random numbers would not have the same bits on every machine.
     """
-    return _quantiles()[raw(seed, purpose, scan, ray, number) >> np.uint64(48)]
+    return quantiles()[raw(seed, purpose, scan, ray, number) >> np.uint64(48)]
 
 
 @cache
-def _quantiles() -> Floats:
+def quantiles() -> Floats:
+    """Quantiles of 65,536 equal shares of the normal distribution."""
     shares = (np.arange(2**15) + 0.5) / 2**16
     low = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([low, -low[::-1]])

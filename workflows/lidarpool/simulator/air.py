@@ -7,6 +7,7 @@ sensor may detect are drawn: their number is Poisson's, their ranges and diamete
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from functools import cache, lru_cache
 from statistics import NormalDist
 from typing import NamedTuple
@@ -16,10 +17,11 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Indices, Ints
 from ..scene.colours import GREY, packed
 from ..sensor import Survey
-from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, raw, uniform
+from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .hits import AIR, NO_SURFACE, Hits, Keys, Planes, joined, numbers
+from .separation import AirHits
 from .surfaces import Surfaces
 
 QUANTILES = 1 << 16
@@ -29,15 +31,14 @@ TAIL_SIGMAS = 6.0
 
 
 class _Seen(NamedTuple):
-    """Particles of one kind that may be detected; the arrays (QUANTILES,) are by range."""
+    """Particles of one kind that may be detected."""
 
     counts: Floats  # (k,): cumulative probabilities of 0, 1, … in a beam
-    distance: Floats  # before which an equal share of them is
-    smallest: Floats  # diameter that may be detected, mm
-    larger: Floats  # 1 - exp(-slope * (largest - smallest))
+    # By range, (5, QUANTILES): distances before which an equal share is, smallest diameters that
+    # may be detected, mm, 1 - exp(-slope * (largest - smallest)), energies of a particle of 1 mm,
+    # and of one that fills the beam.
+    tables: Floats
     step: float  # 1 / slope, mm
-    energy: Floats  # of a particle of 1 mm
-    most: Floats  # of one that fills the beam
 
 
 class _Fog(NamedTuple):
@@ -73,32 +74,31 @@ class AirCaster:
         scatters = survey.scatters(self._wavelength_nm)
         self._fog = _fog(air, scatters, noise.threshold, begins, ends, self._gap_m)
 
-    def added(
-        self, hits: Hits, planes: Planes, rays: tuple[int, int], keys: Keys, each: int
-    ) -> tuple[Hits, Planes]:
-        """Add hits in the air to those of surfaces, of beams `rays` with `each` sub-rays.
+    def found(self, hits: Hits, rays: tuple[int, int], keys: Keys, each: int) -> AirHits | None:
+        """Find hits in the air, of beams `rays` with `each` sub-rays, before those of surfaces.
 
-        The hits are in the order of rays, numbered from the first beam's.
+        Hits are in the order of rays, numbered from the first beam's.
         """
-        scan, ray = keys.of(np.arange(*rays))
-        reach = self._reach(hits, len(ray) * each)
+        count = rays[1] - rays[0]
+        given = keys.scan, np.array(keys.begins, np.int64), rays[0]
+        reach = self._reach(hits, count * each)
         parts = [
-            self._met(seen, seed, scan, ray, reach, each)
+            part
             for seen, seed in zip(self._seen, self._seeds, strict=True)
             if seen is not None
+            for part in _met(seen, seed, count, each, given, reach)
         ]
         if self._fog is not None:
-            parts.append(self._in_fog(self._fog, scan, ray, self._clouded(hits, reach), each))
+            clouded = self._clouded(hits, reach)
+            parts.append(_in_fog(self._fog, self._seed, count, each, given, clouded))
         if not parts:
-            return hits, planes
-        sub, distance, energy = map(np.concatenate, zip(*parts, strict=True))
+            return None
+        drawn = AirHits(*map(np.concatenate, zip(*parts, strict=True)))
         if len(self._bent(hits)):
-            outside = ~self._within(hits, sub, distance)
-            sub, distance, energy = sub[outside], distance[outside], energy[outside]
+            drawn = _taken(drawn, ~self._within(hits, drawn.ray, drawn.distance))
         if parts[1:] or each > 1:
-            order = np.argsort(sub, kind="stable")
-            sub, distance, energy = sub[order], distance[order], energy[order]
-        return _inserted(hits, planes, sub, distance, energy)
+            drawn = _taken(drawn, np.argsort(drawn.ray, kind="stable"))
+        return drawn
 
     def _reach(self, hits: Hits, count: int) -> Floats:
         """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
@@ -143,62 +143,58 @@ class AirCaster:
         np.minimum.at(reach, ray[enters], where[enters])
         return reach
 
-    def _met(
-        self, seen: _Seen, seed: int, scan: Ints, ray: Ints, reach: Floats, each: int
-    ) -> tuple[Ints, Floats, Floats]:
-        """Sub-rays, distances and energies of particles of a kind."""
-        chance = uniform(seed, Purpose.PARTICLES, scan, ray)
-        some = np.flatnonzero(chance >= seen.counts[0])
-        beam = np.repeat(some, np.searchsorted(seen.counts, chance[some], side="right"))
-        key = scan[beam], ray[beam], numbers(beam)
-        place = (raw(seed, Purpose.PARTICLE_RANGE, *key) >> np.uint64(48)).astype(np.intp)
-        distance = seen.distance[place]
-        sub = beam * each
-        if each > 1:
-            sub += (raw(seed, Purpose.PARTICLE_SUBRAY, *key) % np.uint64(each)).astype(np.int64)
-        before = np.flatnonzero(distance < reach[sub])
-        place, key = place[before], (key[0][before], key[1][before], key[2][before])
-        rank = uniform(seed, Purpose.PARTICLE_DIAMETER, *key) * seen.larger[place]
-        longer = seen.step * _exponential()[(rank * QUANTILES).astype(np.intp)]
-        diameter = seen.smallest[place] + longer
-        energy = np.minimum(seen.energy[place] * diameter * diameter, seen.most[place])
-        return sub[before], distance[before], each * energy
 
-    def _in_fog(
-        self, fog: _Fog, scan: Ints, ray: Ints, reach: Floats, each: int
-    ) -> tuple[Ints, Floats, Floats]:
-        """Sub-rays, distances and energies of the peaks of fog."""
-        cells = len(fog.energy)
-        free = (np.minimum(reach[::each], FARTHEST_M) - fog.begins) / fog.cell
-        free = np.clip(free, 0, cells).astype(np.int64)
-        some = np.flatnonzero(free)
-        free, scan, ray = free[some], scan[some], ray[some]
-        chance = free + uniform(self._seed, Purpose.FOG_CELL, scan, ray)
-        cell = np.searchsorted(fog.peaks, chance, side="right") - free * cells
-        place = uniform(self._seed, Purpose.FOG_PLACE, scan, ray)
-        return some * each, fog.begins + (cell + place) * fog.cell, each * fog.energy[cell]
+def _met(
+    seen: _Seen, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
+) -> Iterator[tuple[Ints, Floats, Floats]]:
+    """Yield sub-rays, distances and energies of particles of a kind."""
+    from . import pulse_loops  # not before: numba takes half a second to import
+
+    begun = starts(
+        seed,
+        Purpose.PARTICLES,
+        Purpose.PARTICLE_RANGE,
+        Purpose.PARTICLE_SUBRAY,
+        Purpose.PARTICLE_DIAMETER,
+    )
+    beam, room = 0, 2 * beams + len(seen.counts)
+    while beam < beams:
+        out = np.empty(room, np.int64), *np.empty((2, room))
+        table = seen.step, seen.counts, seen.tables, _exponential()
+        beam, count = pulse_loops.particles(beam, beams, each, *table, begun, *given, reach, *out)
+        yield out[0][:count], out[1][:count], out[2][:count]
 
 
-def _inserted(
-    hits: Hits, planes: Planes, ray: Ints, distance: Floats, energy: Floats
-) -> tuple[Hits, Planes]:
+def _in_fog(
+    fog: _Fog, seed: int, beams: int, each: int, given: tuple[int, Ints, int], reach: Floats
+) -> tuple[Ints, Floats, Floats]:
+    """Sub-rays, distances and energies of the peaks of fog."""
+    from . import pulse_loops
+
+    begun = starts(seed, Purpose.FOG_CELL, Purpose.FOG_PLACE)
+    out = np.empty(beams, np.int64), *np.empty((2, beams))
+    table = fog.begins, FARTHEST_M, fog.cell, fog.energy, fog.peaks
+    count = pulse_loops.fog(each, *table, begun, *given, reach, *out)
+    return out[0][:count], out[1][:count], out[2][:count]
+
+
+def _taken(drawn: AirHits, rows: Bools | Indices) -> AirHits:
+    return AirHits(drawn.ray[rows], drawn.distance[rows], drawn.energy[rows])
+
+
+def inserted(hits: Hits, planes: Planes | None, drawn: AirHits) -> tuple[Hits, Planes | None]:
     """Insert hits in the air before the others of their rays."""
-    count = len(ray)
+    count = len(drawn.ray)
     triangle, cause = np.full(count, NO_SURFACE, np.int32), np.full(count, AIR, np.uint8)
     colour = None if hits.colour is None else np.full(count, packed(GREY[0])[0])
-    # Their velocities are filled in by `Paths.with_velocities`.
-    air = Hits(ray, distance, triangle, energy, colour, cause)
-    order = np.argsort(np.concatenate([ray, hits.ray]), kind="stable")
-    row = order - count  # of the others
-
-    def seen(rows: Indices) -> tuple[Floats, Floats]:
-        normals, directions = np.zeros((2, len(rows), 3))
-        solid = row[rows] >= 0
-        if solid.any():
-            normals[solid], directions[solid] = planes(row[rows[solid]])
-        return normals, directions
-
-    return joined([air, hits]).take(order), seen
+    velocity = None if hits.velocity is None else drawn.velocity
+    air = Hits(drawn.ray, drawn.distance, triangle, drawn.energy, colour, cause, velocity)
+    order = np.argsort(np.concatenate([drawn.ray, hits.ray]), kind="stable")
+    if planes is not None:
+        none = np.zeros((count, 3))
+        normals, directions = (np.concatenate([none, one])[order] for one in planes)
+        planes = normals, directions
+    return joined([air, hits]).take(order), planes
 
 
 @lru_cache(TABLES_KEPT)
@@ -219,15 +215,8 @@ def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) 
     larger = -np.expm1(-kind.slope * (kind.largest - smallest))
     most = kind.reflectance * air.white(distance)
     one = most / (1000 * air.width(distance)) ** 2
-    return _Seen(
-        _poisson(float(sums[-1])),
-        distance,
-        single(smallest),
-        single(larger),
-        1 / kind.slope,
-        single(one),
-        single(most),
-    )
+    tables = distance, single(smallest), single(larger), single(one), single(most)
+    return _Seen(_poisson(float(sums[-1])), np.stack(tables), 1 / kind.slope)
 
 
 def _poisson(mean: float) -> Floats:

@@ -11,18 +11,17 @@ import numpy as np
 
 from raybeam import Pattern, ScanReturns, SubRays
 
-from ..base.arrays import Bools, Bytes, Floats, Ints, Ints32, Records, UInts32
+from ..base.arrays import Bytes, Floats, Ints, Ints32, Records, UInts32
 from ..scene.scene import Scene
 from ..sensor import Returns, Sensor, Survey
 from ..sensor.noise import THRESHOLD_SIGMAS
-from ..sensor.optics import Mode
-from .air import AirCaster
-from .doppler import radial_velocities
-from .hits import NO_SURFACE, Hits, Keys, joined, numbers, runs, strongest
+from .air import AirCaster, inserted
+from .doppler import approach, radial_velocities
+from .hits import NO_SURFACE, Hits, Keys, joined, numbers
 from .motion import Poses, products, turned
 from .paths import Paths
 from .receiver import Receiver
-from .separation import separated
+from .separation import AirHits, Report, chosen, separated
 from .surfaces import Surfaces
 from .waveform import Digitizer, recorded, returns_in
 from .world import World
@@ -65,6 +64,7 @@ class EchoCaster:
         # Whether each ray that hits something has one return.
         self._finds = self._returns.waveform != "none"  # returns in waveforms
         self._records = survey.waveform_samples  # of each return
+        self._mode = self._returns.mode
         waves = self._finds or self._records > 0
         self._digitizer = digitizer_of(self._returns, self._sensor) if waves else None
         several = self._returns.subrays > 1 or self._noise.loses or waves
@@ -130,20 +130,24 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window, keys, start, len(beam))
-                if self._air is not None:
-                    hits, planes = self._air.added(hits, planes, (start, stop), keys, len(beam))
-                hits = self._paths.with_velocities(hits, beams, here, window)
+                air, mode = self._in_air(hits, (start, stop), keys, beams, here, row), self._mode
+                if self._digitizer is not None and air is not None:
+                    (hits, planes), air = inserted(hits, planes, air), None
                 if self._finds:
                     assert self._digitizer is not None
                     returns = returns_in(hits, self._digitizer, len(beam), planes)
+                    returns = self._detected(returns._replace(ray=start + returns.ray), keys)
                 else:
-                    returns = separated(hits, self._gap_m, len(beam), planes)
-                returns = self._detected(returns._replace(ray=start + returns.ray), keys)
+                    report = Report(
+                        "all" if self._receiver.adds else mode, self._noise, keys, start
+                    )
+                    returns = separated(hits, self._gap_m, len(beam), planes, air, report)
                 if self._receiver.adds:
                     every = np.arange(start, stop)
                     middles = (every - start) * len(beam)
                     returns = self._receiver.added(returns, keys, every, beams, here, middles, row)
-                returns = returns.take(chosen(self._heights(returns), self._returns.mode))
+                if self._receiver.adds or self._finds:
+                    returns = returns.take(chosen(self._heights(returns), mode))
                 if self._records:
                     returns = self._with_waveforms(returns, hits, start, keys)
                 chunks.append(returns)
@@ -223,6 +227,23 @@ class EchoCaster:
             velocity=velocity,
         )
 
+    def _in_air(
+        self,
+        hits: Hits,
+        rays: tuple[int, int],
+        keys: Keys,
+        beams: Pattern,
+        poses: Poses,
+        row: int,
+    ) -> AirHits | None:
+        """Find hits in the air, which is at rest, before those of surfaces."""
+        if self._air is None:
+            return None
+        air = self._air.found(hits, rays, keys, len(self._beam))
+        if air is None or hits.velocity is None:
+            return air
+        return air._replace(velocity=approach(poses, air.ray, *poses.rays(beams, air.ray, row)))
+
     def _tally(self, triangle: Ints32) -> Ints:
         surfaces = self._surfaces
         some = triangle[triangle != NO_SURFACE]
@@ -282,24 +303,3 @@ def digitizer_of(returns: Returns, sensor: Sensor) -> Digitizer:
     """Return what samples the waveforms of a sensor."""
     system_ns = returns.system_ns(sensor.optics)
     return Digitizer(system_ns, returns.sample_ns, returns.waveform == "gaussian")
-
-
-def chosen(returns: Hits, mode: Mode) -> Bools:
-    """Whether a mode reports each return: (n,)."""
-    ray = returns.ray
-    begins, counts = runs(ray)
-    first, last = np.zeros((2, len(ray)), np.bool_)
-    first[begins], last[begins + counts - 1] = True, True
-    if mode == "all" or len(begins) == len(ray):
-        return np.ones(len(ray), np.bool_)
-    if mode in ("first", "last"):
-        return first if mode == "first" else last
-    best, there = strongest(returns.energy, begins, counts), np.zeros(len(ray), np.bool_)
-    there[best] = True
-    if mode == "strongest":
-        return there
-    # Where the last is the strongest, the second strongest as well.
-    again, others = last[best] & (counts > 1), returns.energy.copy()
-    others[best] = -np.inf
-    there[strongest(others, begins, counts)[again]] = True
-    return there | last

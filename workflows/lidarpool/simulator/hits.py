@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -55,9 +55,9 @@ class Hits(NamedTuple):
         return Hits(*selected(self, rows))
 
 
-# Normals of the surfaces of some hits, by row, as they are seen in mirrors, and directions of their
-# rays: (n, 3) each.
-Planes = Callable[[Indices], tuple[Floats, Floats]]
+# Normals of the surfaces of hits, as they are seen in mirrors, and directions of their rays:
+# (n, 3) each.
+Planes = tuple[Floats, Floats]
 
 
 def joined(parts: list[Hits]) -> Hits:

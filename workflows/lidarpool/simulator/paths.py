@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 from raybeam import Pattern
 
-from ..base.arrays import Floats, Indices, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Floats, Integers, Ints, Ints32, UInts32
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.noise import Purpose, raw
 from .doppler import BLOCK_HITS, approach
-from .hits import AIR, Hits, Keys, Planes, joined, selected
+from .hits import Hits, Keys, Planes, joined, selected
 from .media import Media, Rays, Within, depths
 from .motion import Clock, Poses, products
 from .surfaces import Surfaces, light_of
@@ -88,7 +88,7 @@ class Paths:
         keys: Keys,
         first: int = 0,
         each: int = 1,
-    ) -> tuple[Hits, Planes]:
+    ) -> tuple[Hits, Planes | None]:
         """Cast the sub-rays of a window, and follow the light through glass and off mirrors.
 
         There are `each` of a beam, and the first beam has the number `first` for its keys.
@@ -184,11 +184,11 @@ class Paths:
         if parts[1:]:
             order = np.argsort(hits.ray, kind="stable")
             hits, normals = hits.take(order), np.concatenate(seen)[order]
-
-        def planes(rows: Indices) -> tuple[Floats, Floats]:
-            return normals[rows], poses.rays(beams, hits.ray[rows], window[0])[1]
-
-        return hits, planes
+        if each == 1:
+            return hits, None
+        if parts[1:]:
+            directions = poses.rays(beams, hits.ray, window[0])[1]
+        return hits, (normals, directions)
 
     def _behind(
         self,
@@ -237,18 +237,6 @@ class Paths:
             growth = growth + index * there - (1.0 if within is None else within.index) * back
         own = light.ray, light.times, path.origins, path.directions, share, before
         return _Light(*own, turns, within, growth), -away
-
-    def with_velocities(
-        self, hits: Hits, beams: Pattern, poses: Poses, window: tuple[int, int]
-    ) -> Hits:
-        """Give hits in the air, which is at rest, their radial velocities, if hits have any."""
-        if hits.velocity is None or hits.cause is None:
-            return hits
-        rows = np.flatnonzero((hits.cause == AIR) & np.isnan(hits.velocity))
-        ray = hits.ray[rows]
-        velocity = hits.velocity.copy()
-        velocity[rows] = approach(poses, ray, *poses.rays(beams, ray, window[0]))
-        return hits._replace(velocity=velocity)
 
     def _velocities(self, light: _Light, step: Floats, triangle: Ints32, poses: Poses) -> Floats:
         """Velocities of where light ends after so many metres, m/s: (n, 3)."""

@@ -2,17 +2,47 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Ints
+from ..base.arrays import AnyArray, Bools, Floats, Ints
+from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
-from .hits import NO_SURFACE, Hits, Planes, numbers, runs, strongest
-from .motion import products
+from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
+from ..sensor.optics import Mode
+from .hits import AIR, NO_SURFACE, SURFACE, Hits, Keys, Planes
 
-SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
+_MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"  # as of `pulse_loops`
+_NONE = np.zeros(0)
 
 
-def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = None) -> Hits:
+class AirHits(NamedTuple):
+    """Hits in the air, in the order of sub-rays: arrays (k,)."""
+
+    ray: Ints
+    distance: Floats
+    energy: Floats
+    velocity: Floats = _NONE  # if hits have velocities
+
+
+class Report(NamedTuple):
+    """Which returns are detected and reported."""
+
+    mode: Mode = "all"
+    noise: Noise | None = None  # which loses some; None if all are detected
+    keys: Keys | None = None
+    first: int = 0  # number of the first beam for the keys
+
+
+def separated(
+    hits: Hits,
+    gap_m: float,
+    each: int = 1,
+    planes: Planes | None = None,
+    air: AirHits | None = None,
+    report: Report | None = None,
+) -> Hits:
     """Make returns of hits: those of a beam within a distance of the next are one return.
 
     So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
@@ -23,43 +53,56 @@ def separated(hits: Hits, gap_m: float, each: int = 1, planes: Planes | None = N
     The hits of all sub-rays, `each` of a beam, are in the order of rays; `gap_m` is half of the
     pulse's length. Returns are in the order of beams and distances; their `ray` is the beam.
     """
-    rows = np.arange(len(hits.ray))
-    some = hits.energy > 0
-    if not some.all():
-        rows, hits = rows[some], hits.take(some)
-    if not len(rows):
-        return hits
-    beam = hits.ray // each
-    begins, counts = runs(beam)
-    width = np.maximum.reduceat(hits.distance, begins) - np.minimum.reduceat(hits.distance, begins)
-    new = np.zeros(len(rows), np.bool_)
-    new[begins] = True
-    # Few beams hit an edge or graze a surface, and only their hits are sorted.
-    wide = np.flatnonzero(np.repeat(width > gap_m, counts))
-    if len(wide):
-        order = np.arange(len(rows))
-        order[wide] = wide[np.lexsort((hits.distance[wide], beam[wide]))]
-        rows, hits = rows[order], hits.take(order)
-        new[1:] |= np.diff(hits.distance) > gap_m
-        if planes is not None and each > 1:
-            # Of those, the beams that fall into several returns.
-            begins, counts = runs(beam[wide])
-            several = np.add.reduceat(new[wide], begins, dtype=np.int64) > 1
-            falls = wide[np.repeat(several, counts)]
-            if len(falls):
-                part, marks = hits.take(falls), new[falls]
-                normal, direction = planes(rows[falls])
-                new[falls] &= ~continued(part, marks, gap_m, each, normal, direction)
-    begins = np.flatnonzero(new)
-    which = np.cumsum(new) - 1
-    energy = np.bincount(which, hits.energy).astype(np.float64)
-    distance = np.bincount(which, hits.energy * hits.distance) / energy
-    first = hits.take(strongest(hits.energy, begins, np.diff(begins, append=len(rows))))
-    velocity = None
-    if hits.velocity is not None:
-        velocity = np.bincount(which, hits.energy * hits.velocity) / energy
-    energy /= each
-    return first._replace(ray=beam[begins], distance=distance, energy=energy, velocity=velocity)
+    from . import pulse_loops  # not before: numba takes half a second to import
+
+    air = air or AirHits(np.zeros(0, np.int64), _NONE, _NONE)
+    mode, noise, keys, first = report or Report()
+    normals, directions, pairs = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2), np.int64)
+    if planes is not None and each > 1:
+        (normals, directions), pairs = planes, neighbours(each)
+    begun, table, limits = np.zeros(0, np.uint64), _NONE, (0.0, 0.0, THRESHOLD_SIGMAS)
+    if noise is not None and noise.loses:
+        begun, table = starts(noise.seed, Purpose.LOSS, Purpose.DETECTION), quantiles()
+        limits = noise.dropout, noise.threshold, THRESHOLD_SIGMAS
+    speeds = _NONE if hits.velocity is None else hits.velocity
+    begins, scan = (np.zeros(1), 0) if keys is None else (keys.begins, keys.scan)
+    most = len(hits.ray) + len(air.ray)
+    whole, real = np.empty((2, most), np.int64), np.empty((3, most))
+    count = pulse_loops.returns(
+        each, gap_m, _MODES.index(mode),
+        _own(hits.ray, np.int64), _own(hits.distance), _own(hits.energy),
+        hits.triangle != NO_SURFACE, _own(speeds),
+        _own(air.ray, np.int64), _own(air.distance), _own(air.energy), _own(air.velocity),
+        _own(pairs, np.int64), _own(normals.T), _own(directions.T),
+        *map(float, limits), begun, table, scan, _own(begins, np.int64), first, whole, real,
+    )  # fmt: skip
+    beam, row = whole[:, :count].copy()
+    distance, energy, velocity = real[:, :count].copy()
+    made = hits.take(np.maximum(row, 0)) if len(hits.ray) else _unknown(hits, count)
+    if len(air.ray):
+        flies = np.flatnonzero(row < 0)
+        cause = np.full(count, SURFACE, np.uint8) if made.cause is None else made.cause
+        cause[flies], made.triangle[flies] = AIR, NO_SURFACE
+        if made.colour is not None:
+            made.colour[flies] = packed(GREY[0])[0]
+        made = made._replace(cause=cause)
+    return made._replace(
+        ray=beam + first,
+        distance=distance,
+        energy=energy,
+        velocity=None if hits.velocity is None else velocity,
+    )
+
+
+def _unknown(hits: Hits, count: int) -> Hits:
+    """Make the columns of hits for some returns, none of which is of a surface."""
+    columns = (None if one is None else np.zeros(count, one.dtype) for one in hits)
+    return Hits._make(columns)
+
+
+def _own(array: AnyArray, kind: type = np.float64) -> AnyArray:
+    """Give an array as the loops are compiled for: of one type, contiguous and not read-only."""
+    return np.require(array, kind, ["C", "W"])
 
 
 def continued(
@@ -74,33 +117,19 @@ def continued(
 
     The hits of each beam are sorted by distance; `new` are the returns by distances alone.
     """
-    beam = hits.ray // each
-    # The hit of each sub-ray, after so many panes of glass: a row for each beam and number of them.
-    solid = np.flatnonzero(hits.triangle != NO_SURFACE)
-    if not len(solid):
-        return np.zeros(len(beam), np.bool_)
-    order = solid[np.argsort(hits.ray[solid], kind="stable")]
-    panes = np.zeros(len(beam), np.int64)
-    panes[order] = numbers(hits.ray[order])
-    most = int(panes.max()) + 1
-    row = (np.cumsum(np.diff(beam, prepend=beam[0]) != 0)) * most + panes
-    table = np.full((int(row.max()) + 1, each), -1)
-    table[row[solid], hits.ray[solid] % each] = solid
-    one, other = table[:, neighbours(each)].reshape(-1, 2).T
-    number = np.cumsum(new)
-    pair = (one >= 0) & (other >= 0) & (number[one] != number[other])
-    one, other = one[pair], other[pair]
-    near = 1 / hits.distance
+    from . import pulse_loops
 
-    def half_way(this: Ints, that: Ints) -> Floats:
-        """Ranges half-way to another hit, on the plane of the first."""
-        plane, looks = normal[this].T, direction.T
-        slope = products(plane, looks[:, that]) / products(plane, looks[:, this])
-        return np.asarray(2 / (near[this] * np.maximum(1 + slope, 1e-9)))
+    still, solid = np.ones(len(new), np.bool_), hits.triangle != NO_SURFACE
+    pairs, planes = _own(neighbours(each), np.int64), (_own(normal.T), _own(direction.T))
+    where = _own(hits.ray, np.int64), _own(hits.distance), solid
+    pulse_loops.continues(_own(new, np.bool_), still, *where, gap_m, each, pairs, *planes)
+    return ~still
 
-    step = np.abs(half_way(one, other) - half_way(other, one))
-    apart = np.abs(hits.distance[one] - hits.distance[other])
-    meet = step <= np.maximum(gap_m, SLOPE * apart)
-    low, high = np.sort([one[meet], other[meet]], axis=0)
-    begin, end = (np.bincount(hit + 1, minlength=len(beam) + 1) for hit in (low, high))
-    return np.asarray(np.cumsum(begin - end)[:-1] > 0)
+
+def chosen(returns: Hits, mode: Mode) -> Bools:
+    """Whether a mode reports each return: (n,)."""
+    from . import pulse_loops
+
+    there, number = np.empty(len(returns.ray), np.bool_), _MODES.index(mode)
+    pulse_loops.reported(_own(returns.ray, np.int64), _own(returns.energy), number, there)
+    return there

@@ -120,7 +120,9 @@ def returns_in(
         if planes is not None and each > 1 and broad.any():
             on = wide[np.repeat(broad, counts)]
             every = np.ones(len(on), np.bool_)
-            inside = continued(hits.take(on), every, gap_m, each, *planes(rows[on]))
+            inside = continued(
+                hits.take(on), every, gap_m, each, *(one[rows[on]] for one in planes)
+            )
             starts = np.cumsum(counts[broad]) - counts[broad]
             inside[starts] = True
             broad[broad] = ~np.logical_and.reduceat(inside, starts)
@@ -135,7 +137,9 @@ def returns_in(
             falls = wide[np.repeat(several, counts)]
             if len(falls):
                 part, marks = hits.take(falls), new[falls]
-                new[falls] &= ~continued(part, marks, gap_m, each, *planes(rows[falls]))
+                new[falls] &= ~continued(
+                    part, marks, gap_m, each, *(one[rows[falls]] for one in planes)
+                )
     begins = np.flatnonzero(new)
     which = np.cumsum(new) - 1
     energy = np.bincount(which, hits.energy).astype(np.float64)

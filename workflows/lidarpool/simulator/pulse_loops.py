@@ -1,0 +1,360 @@
+"""Loops over pulses: particles that a beam meets, and the returns that a receiver reports.
+
+Each is compiled when it is first called. Random numbers are those of `lidarpool.sensor.noise.raw`,
+of which `starts` are the beginnings.
+"""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined, stage
+
+ALL, FIRST, LAST, STRONGEST, DUAL = range(5)  # modes
+SLOPE = 0.5  # of the distance between neighbouring hits: what the slopes of one surface may miss
+
+_30, _27, _31, _11, _48 = (np.uint64(shift) for shift in (30, 27, 31, 11, 48))
+_ONE, _OTHER = np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
+_GAMMA, _NUMBERS, _NEXT = np.uint64(0x9E3779B97F4A7C15), np.uint64(256), np.uint64(1)
+
+
+@inlined
+def _mixed(x):
+    """As `noise._mixed`, of one number."""
+    x = (x ^ (x >> _30)) * _ONE
+    x = (x ^ (x >> _27)) * _OTHER
+    return x ^ (x >> _31)
+
+
+@inlined
+def _bits(start, scan, ray, number):
+    """64 random bits."""
+    begin = _mixed(start + np.uint64(scan) * _GAMMA)
+    return _mixed(begin + (np.uint64(ray) * _NUMBERS + np.uint64(number) + _NEXT) * _GAMMA)
+
+
+@inlined
+def _uniform(start, scan, ray, number):
+    return np.float64(_bits(start, scan, ray, number) >> _11) * 2.0**-53
+
+
+@inlined
+def _scan_of(begins, ray, scan):
+    """Row of the scan of a ray, from that of a ray before."""
+    while scan + 1 < len(begins) and begins[scan + 1] <= ray:
+        scan += 1
+    return scan
+
+
+@compiled()
+def particles(
+    beam, stop, each, step, counts, tables, exponential,
+    starts, scan, begins, first, reach, ray, distance, energy,
+):  # fmt: skip
+    """Draw the particles of a kind that beams meet, from one on, while there is room for them.
+
+    `counts` are cumulative probabilities of numbers of particles; rows of `tables` are distance,
+    smallest diameter, range of ranks, energy of 1 mm, and most. Writes sub-rays, distances and
+    energies; returns the first beam that is left, and how many were written.
+    """
+    count, row = 0, 0
+    while beam < stop and count + len(counts) <= len(ray):
+        row = _scan_of(begins, first + beam, row)
+        own, number = scan + row, first + beam - begins[row]
+        chance, particle = _uniform(starts[0], own, number, 0), 0
+        while counts[particle] <= chance:  # the last is 1
+            place = np.int64(_bits(starts[1], own, number, particle) >> _48)
+            where = beam * each
+            if each > 1:
+                where += np.int64(_bits(starts[2], own, number, particle) % np.uint64(each))
+            if tables[0, place] < reach[where]:
+                rank = _uniform(starts[3], own, number, particle) * tables[2, place]
+                longer = step * exponential[np.int64(rank * len(exponential))]
+                diameter = tables[1, place] + longer
+                ray[count], distance[count] = where, tables[0, place]
+                light = tables[3, place] * diameter * diameter
+                energy[count] = each * min(light, tables[4, place])
+                count += 1
+            particle += 1
+        beam += 1
+    return beam, count
+
+
+@compiled()
+def fog(
+    each, begin_m, end_m, cell_m, energies, peaks,
+    starts, scan, begins, first, reach, ray, distance, energy,
+):  # fmt: skip
+    """Draw the peaks of fog in beams; writes as `particles` does, returns how many."""
+    count, row, cells = 0, 0, len(energies)
+    for beam in range(len(reach) // each):
+        free = (min(reach[beam * each], end_m) - begin_m) / cell_m
+        if not free >= 1:
+            continue
+        whole = cells if free >= cells else np.int64(free)
+        row = _scan_of(begins, first + beam, row)
+        own, number = scan + row, first + beam - begins[row]
+        chance = whole + _uniform(starts[0], own, number, 0)
+        low, high = 0, cells  # the cell, by halves
+        while low < high:
+            middle = (low + high) // 2
+            if peaks[whole * cells + middle] <= chance:
+                low = middle + 1
+            else:
+                high = middle
+        place = _uniform(starts[1], own, number, 0)
+        ray[count], distance[count] = beam * each, begin_m + (low + place) * cell_m
+        energy[count] = each * energies[low]
+        count += 1
+    return count
+
+
+@inlined
+def _half_way(this, that, near, normals, directions):
+    """Range half-way to another hit, on the plane of the first."""
+    x, y, z = normals[0, this], normals[1, this], normals[2, this]
+    there = x * directions[0, that] + y * directions[1, that] + z * directions[2, that]
+    here = x * directions[0, this] + y * directions[1, this] + z * directions[2, this]
+    most = 1 + there / here
+    if most < 1e-9:  # and not if it is unknown
+        most = 1e-9
+    return 2 / (near * most)
+
+
+@stage
+def _joined(
+    begin, stop, new, still, ray, distance, solid, row, gap_m, each, pairs, normals, directions,
+    table, changes,
+):  # fmt: skip
+    """Unmark in `still` where a surface of a beam continues, by returns that begin at `new`."""
+    count = stop - begin
+    panes = 0
+    for k in range(count * each):
+        table[k] = -1
+    for k in range(begin, stop):  # the hit of each sub-ray, after so many panes of glass
+        changes[k - begin] = 0
+        if solid[k]:
+            pane = 0
+            while table[pane * each + ray[k] % each] >= 0:
+                pane += 1
+            table[pane * each + ray[k] % each] = k
+            panes = max(panes, pane + 1)
+    changes[count] = 0
+    which = begin
+    for k in range(begin, stop):  # the return of each hit
+        if new[k]:
+            which = k
+        row[k, 1] = which
+    for pane in range(panes):
+        for pair in range(len(pairs)):
+            one = table[pane * each + pairs[pair, 0]]
+            other = table[pane * each + pairs[pair, 1]]
+            if one < 0 or other < 0 or row[one, 1] == row[other, 1]:
+                continue
+            i, j = row[one, 0], row[other, 0]
+            here = _half_way(i, j, 1 / distance[one], normals, directions)
+            there = _half_way(j, i, 1 / distance[other], normals, directions)
+            apart = abs(distance[one] - distance[other])
+            if abs(here - there) <= max(gap_m, SLOPE * apart):
+                changes[min(one, other) + 1 - begin] += 1
+                changes[max(one, other) + 1 - begin] -= 1
+    inside = 0
+    for k in range(begin, stop):
+        inside += changes[k - begin]
+        if inside > 0:
+            still[k] = False
+
+
+@compiled()
+def continues(new, still, ray, distance, solid, gap_m, each, pairs, normals, directions):
+    """Unmark in `still` where surfaces continue, of the beams of hits: see `continued`."""
+    row, begin = np.empty((len(ray), 2), np.int64), 0
+    table, changes = np.empty(each, np.int64), np.empty(2, np.int64)
+    while begin < len(ray):
+        stop, beam = begin, ray[begin] // each
+        while stop < len(ray) and ray[stop] // each == beam:
+            row[stop, 0] = stop
+            stop += 1
+        if (stop - begin) * each > len(table):
+            table = np.empty(2 * (stop - begin) * each, np.int64)
+            changes = np.empty(2 * (stop - begin) + 1, np.int64)
+        _joined(
+            begin, stop, new, still, ray, distance, solid, row, gap_m, each, pairs, normals,
+            directions, table, changes,
+        )  # fmt: skip
+        begin = stop
+
+
+@stage
+def _mark(energy, begin, stop, mode, there):
+    """Mark what a mode reports of the returns of a pulse; of equally strong ones the nearest."""
+    best, second = begin, -1
+    for k in range(begin + 1, stop):
+        if energy[k] > energy[best]:
+            best = k
+    if mode == DUAL and best == stop - 1:
+        for k in range(begin, stop - 1):
+            if second < 0 or energy[k] > energy[second]:
+                second = k
+    for k in range(begin, stop):
+        there[k] = mode == ALL or k == second
+    there[begin] |= mode == FIRST
+    there[stop - 1] |= mode in (LAST, DUAL)
+    there[best] |= mode in (STRONGEST, DUAL)
+
+
+@compiled()
+def reported(ray, energy, mode, there):
+    """Mark what a mode reports of returns."""
+    begin = 0
+    while begin < len(ray):
+        stop = begin + 1
+        while stop < len(ray) and ray[stop] == ray[begin]:
+            stop += 1
+        _mark(energy, begin, stop, mode, there)
+        begin = stop
+
+
+@stage
+def _room(size, each):
+    """Make scratch memory for hits of a beam."""
+    numbers, flags = np.int64, np.bool_
+    return (
+        np.empty((size, 2), numbers), np.empty(size, numbers),
+        np.empty(size), np.empty(size), np.zeros(size),
+        np.empty(size, flags), np.empty(size, flags), np.empty(size, flags),
+        np.empty(size * each, numbers), np.empty(size + 1, numbers),
+    )  # fmt: skip
+
+
+@compiled()
+def returns(
+    each, gap_m, mode, ray, distance, energy, solid,
+    velocity, air_ray, air_distance, air_energy, air_velocity, pairs,
+    normals, directions, dropout, threshold, sigmas, starts, quantiles,
+    scan, begins, first, whole, real,
+):  # fmt: skip
+    """Make the returns of beams, see `separation.separated`; returns how many there are.
+
+    Hits of surfaces and of the air are in the order of sub-rays. Writes beams and rows of the
+    strongest hits to `whole` (2, k), those of the air as -1, -2, …, and distances, energies and
+    velocities to `real` (3, k).
+    """
+    i, j, count, number_row, moves = 0, 0, 0, 0, len(velocity) > 0
+    size = 64
+    own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
+    while i < len(ray) or j < len(air_ray):
+        beam = ray[i] // each if i < len(ray) else air_ray[j] // each
+        if j < len(air_ray):
+            beam = min(beam, air_ray[j] // each)
+        end = (beam + 1) * each
+        last, last_air = i, j
+        while last < len(ray) and ray[last] < end:
+            last += 1
+        while last_air < len(air_ray) and air_ray[last_air] < end:
+            last_air += 1
+        if last - i + last_air - j > size:
+            size = 2 * (last - i + last_air - j)
+            own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
+        n, least, most = 0, np.inf, -np.inf
+        while i < last or j < last_air:  # what is in the air first
+            if j < last_air and (i == last or air_ray[j] <= ray[i]):
+                sub[n], far[n], light[n], hard[n] = (
+                    air_ray[j],
+                    air_distance[j],
+                    air_energy[j],
+                    False,
+                )
+                own[n, 0] = -1 - j
+                if moves:
+                    speed[n] = air_velocity[j]
+                j += 1
+            else:
+                sub[n], far[n], light[n], hard[n] = ray[i], distance[i], energy[i], solid[i]
+                own[n, 0] = i
+                if moves:
+                    speed[n] = velocity[i]
+                i += 1
+            if light[n] > 0:
+                least, most = min(least, far[n]), max(most, far[n])
+                n += 1
+        if n == 0:
+            continue
+        new[0], several = True, False
+        if most - least > gap_m:  # few beams hit an edge or graze a surface
+            for k in range(1, n):
+                a, b, c, d, e, f = sub[k], far[k], light[k], hard[k], own[k, 0], speed[k]
+                place = k
+                while place > 0 and far[place - 1] > b:
+                    sub[place], far[place], light[place] = (
+                        sub[place - 1],
+                        far[place - 1],
+                        light[place - 1],
+                    )
+                    hard[place], own[place, 0] = hard[place - 1], own[place - 1, 0]
+                    speed[place] = speed[place - 1]
+                    place -= 1
+                sub[place], far[place], light[place], hard[place] = a, b, c, d
+                own[place, 0], speed[place] = e, f
+            for k in range(1, n):
+                new[k] = far[k] - far[k - 1] > gap_m
+                several |= new[k]
+            if several and len(pairs):
+                _joined(
+                    0, n, new, new, sub, far, hard, own, gap_m, each, pairs, normals, directions,
+                    table, changes,
+                )  # fmt: skip
+        else:
+            for k in range(1, n):
+                new[k] = False
+        begin, k = count, 0
+        while k < n:  # a return
+            best, sum_, mean, drift = k, 0.0, 0.0, 0.0
+            while True:
+                sum_ += light[k]
+                mean += light[k] * far[k]
+                if moves:
+                    drift += light[k] * speed[k]
+                if light[k] > light[best]:
+                    best = k
+                k += 1
+                if k == n or new[k]:
+                    break
+            whole[0, count], whole[1, count] = beam, own[best, 0]
+            real[0, count], real[1, count] = mean / sum_, sum_ / each
+            if moves:
+                real[2, count] = drift / sum_
+            count += 1
+        stop = count
+        if len(starts):  # those that are detected
+            number_row = _scan_of(begins, first + beam, number_row)
+            key, at = scan + number_row, first + beam - begins[number_row]
+            count = begin
+            for k in range(begin, stop):
+                seen = dropout == 0 or _uniform(starts[0], key, at, k - begin) >= dropout
+                if seen and threshold > 0:
+                    above = sigmas * (real[1, k] / threshold - 1)
+                    drawn = np.int64(_bits(starts[1], key, at, k - begin) >> _48)
+                    seen = above + quantiles[drawn] > 0
+                if seen:
+                    for row in range(2):
+                        whole[row, count] = whole[row, k]
+                    for row in range(3):
+                        real[row, count] = real[row, k]
+                    count += 1
+            stop = count
+        if mode != ALL and stop - begin > 1:
+            for k in range(begin, stop):
+                light[k - begin] = real[1, k]
+            _mark(light, 0, stop - begin, mode, there)
+            count = begin
+            for k in range(begin, stop):
+                if there[k - begin]:
+                    for row in range(2):
+                        whole[row, count] = whole[row, k]
+                    for row in range(3):
+                        real[row, count] = real[row, k]
+                    count += 1
+    return count
