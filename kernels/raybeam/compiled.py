@@ -30,9 +30,10 @@ _KEEPS = _keeps()
 
 @cache
 def _stamp(folder: Path) -> tuple[int, ...]:
-    """Return what changes with any file beside this one, or loop elsewhere: numba looks at one."""
-    others = [] if folder == Path(__file__).parent else folder.glob("*_loops.py")
-    found = sorted([*Path(__file__).parent.glob("*.py"), *others])
+    """Return what changes with any source of a loop's package, or this one: numba looks at one."""
+    while (folder.parent / "__init__.py").exists():
+        folder = folder.parent
+    found = sorted({*Path(__file__).parent.glob("*.py"), *folder.rglob("*.py")})
     return tuple(number for f in found for number in (f.stat().st_mtime_ns, f.stat().st_size))
 
 

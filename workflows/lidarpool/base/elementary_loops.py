@@ -1,0 +1,36 @@
+"""The functions of `elementary`, compiled."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+from raybeam.compiled import compiled, inlined
+
+from . import elementary
+
+sin_cos, exp, log = map(inlined, (elementary.sin_cos_of, elementary.exp_of, elementary.log_of))
+arctan2 = inlined(elementary.arctan2_of)
+
+
+@compiled()
+def sin_cos_each(x, sine, cosine):
+    for k in range(len(x)):
+        sine[k], cosine[k] = sin_cos(x[k])
+
+
+@compiled()
+def exp_each(x, out):
+    for k in range(len(x)):
+        out[k] = exp(x[k])
+
+
+@compiled()
+def log_each(x, out):
+    for k in range(len(x)):
+        out[k] = log(x[k])
+
+
+@compiled()
+def arctan2_each(y, x, out):
+    for k in range(len(x)):
+        out[k] = arctan2(y[k], x[k])
