@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import importlib.util
 import os
-import threading
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import ClassVar, NamedTuple
+from typing import TYPE_CHECKING, ClassVar, NamedTuple
 from weakref import ref
 
 import numpy as np
 
 from . import embree_library
-from .arrays import AnyArray, Floats
+from .arrays import Floats
 from .backend import Backend, Found
 from .crossing import Crossing, Nearest
 from .hits import Part, joined
@@ -24,6 +23,9 @@ from .mesh import NEAR
 from .poses import Poses
 from .rays import Rays
 from .scan import Scan
+
+if TYPE_CHECKING:
+    from .embree_memory import Cast
 
 _SHARE = 1 << 13  # rays that a thread takes at a time, where there are several
 # Cosine of 20 degrees. Packets of 16 rays within that are cast four to six times as fast as single
@@ -149,7 +151,7 @@ class EmbreeBackend(Backend):
 
         own, limits = self._base.copy(), crossing.limits
         own["t_min"], own["t_max"] = (limit * self._scene.frame.scale for limit in limits)
-        own["scratch"], _ = _own.memory(0)
+        own["scratch"], _ = self._memory.own.memory(0)
         given = crossing.row, crossing.body, crossing.number
         row, body, number = map(np.ascontiguousarray, given)
         # Threads may time calls at the same time: each list has enough, whatever the order.
@@ -170,64 +172,41 @@ class EmbreeBackend(Backend):
                 if tried:
                     plan.choose(partial(self._cast, cast, begin, end))
 
-    def _of_rays(self, rays: Rays) -> _Cast:
+    def _of_rays(self, rays: Rays) -> Cast:
         """Prepare to cast rays that are not of a pattern."""
         one = len(rays.origins) == 1
         origins, at = (None, rays.origins) if one else (rays.origins, np.zeros((1, 3)))
-        poses = Poses(at, None, max(len(rays), 1))
-        return self._made(rays.directions, origins, poses, 0, (rays.t_min, rays.t_max))
-
-    def _of_scan(self, scan: Scan) -> _Cast:
-        """Prepare to cast a scan."""
-        pattern, limits = scan.pattern, (scan.t_min, scan.t_max)
-        sub_rays, aside = pattern.sub_rays, 0.0
-        if sub_rays is not None and sub_rays.starts is not None:
-            aside = float(np.abs(sub_rays.starts).max())
-        given = pattern.directions, pattern.origins, scan.poses, scan.first, limits
-        cast = self._made(*given, aside)
-        if sub_rays is not None:
-            record = cast.record
-            record["subrays"] = len(sub_rays)
-            record["shares"] = cast.keep(sub_rays.table(pattern.offsets))
-            record["begins"] = sub_rays.starts is not None
-            record["offsets"] = cast.keep(pattern.offsets)
-            if sub_rays.axis is not None:
-                record["about"], record["axis"] = 1, sub_rays.axis
+        cast, poses = self._memory.Cast(self._base), Poses(at, None, max(len(rays), 1))
+        cast.take(rays.directions, origins, poses, 0)
+        self._reach(cast, poses, origins, (rays.t_min, rays.t_max))
         return cast
 
-    def _made(
+    def _of_scan(self, scan: Scan) -> Cast:
+        """Prepare to cast a scan."""
+        pattern, cast = scan.pattern, self._memory.Cast(self._base)
+        aside = cast.take_pattern(pattern, scan.poses, scan.first)
+        self._reach(cast, scan.poses, pattern.origins, (scan.t_min, scan.t_max), aside)
+        return cast
+
+    def _reach(
         self,
-        directions: Floats,
-        origins: Floats | None,
+        cast: Cast,
         poses: Poses,
-        first: int,
+        origins: Floats | None,
         limits: tuple[float, float],
         aside: float = 0.0,
-    ) -> _Cast:
-        """Note what rays are made of; sub-rays start so far `aside`, metres, of their beam."""
-        cast, motion, frame = _Cast(self._base), poses.motion, self._scene.frame
-        record = cast.record
-        record["directions"] = cast.keep(directions.T)
-        record["origins"] = cast.keep(None if origins is None else origins.T)
-        record["positions"] = cast.keep(poses.positions.T)
-        turns = poses.rotations
-        record["rotations"] = cast.keep(None if turns is None else np.moveaxis(turns, 0, -1))
+    ) -> None:
+        """Note limits, and whether all rays start near the scene, so far `aside` of their beam."""
+        motion, frame, record = poses.motion, self._scene.frame, cast.record
         reach = float(np.abs(frame.to_local(poses.positions)).max(initial=0))
         reach += 2 * aside * frame.scale
         if origins is not None:
             reach += 2 * float(np.abs(origins).max(initial=0)) * frame.scale
         if motion is not None:
-            record["delays"] = cast.keep(motion.delays)
-            record["velocities"] = cast.keep(motion.velocities.T)
-            record["rates"] = cast.keep(motion.rates.T)
             way = np.abs(motion.delays).max(initial=0) * np.abs(motion.velocities).max(initial=0)
             reach += 2 * float(way) * frame.scale
-        record["rows"], record["poses"], record["each"] = len(directions), len(poses), poses.rays
-        record["first"], record["subrays"] = first, 1
-        record["still"] = len(poses) == 1 and origins is None and motion is None and not aside
         record["near"] = reach < NEAR
         record["t_min"], record["t_max"] = (limit * frame.scale for limit in limits)
-        return cast
 
     def _plan(self, scan: Scan) -> _Plan:
         """Ways to group the rays of a scan: those that were the fastest for others like it."""
@@ -239,7 +218,7 @@ class EmbreeBackend(Backend):
             plan = self._plans[len(scan.pattern), each] = _Plan(scan, each)
         return plan
 
-    def _cast(self, cast: _Cast, start: int, stop: int, way: _Way = _IN_TURN) -> Part:
+    def _cast(self, cast: Cast, start: int, stop: int, way: _Way = _IN_TURN) -> Part:
         """Hits of rays `start` to `stop`, in their order, numbered from `start`."""
         n = stop - start
         ray, distance, triangle = np.empty(n, np.uint32), np.empty(n), np.empty(n, np.int32)
@@ -249,7 +228,7 @@ class EmbreeBackend(Backend):
             own, at = cast.record.copy(), begin - start
             own["step"], own["high"], own["wide"] = way.step, way.high, way.wide
             own["coherence"], own["before"] = way.coherence, start
-            own["scratch"], own["room"] = _own.memory(way.step * way.high)
+            own["scratch"], own["room"] = self._memory.own.memory(way.step * way.high)
             own["ray"], own["distance"] = ray[at:].ctypes.data, distance[at:].ctypes.data
             own["triangle"], own["instance"] = triangle[at:].ctypes.data, instance[at:].ctypes.data
             count = self._loops.trace(own, begin, min(begin + share, stop))
@@ -337,39 +316,3 @@ def _spread(scan: Scan, way: _Way) -> float:
     _, directions = scan.pattern.made(scan.first, ray.reshape(-1), scan.poses)
     packets = directions.reshape(-1, len(lags), 3)
     return float((packets[:, 1:] * packets[:, :1]).sum(axis=2).min(axis=1).mean())
-
-
-class _Cast:
-    """A `CAST`, and the arrays whose addresses it has."""
-
-    def __init__(self, base: AnyArray) -> None:
-        self.record = base.copy()
-        self._kept: list[AnyArray] = []
-
-    def keep(self, array: AnyArray | None) -> int:
-        """Address of an array, in float64 and contiguous; 0 for none."""
-        if array is None:
-            return 0
-        self._kept.append(np.ascontiguousarray(array, np.float64))
-        return self._kept[-1].ctypes.data
-
-
-class _Own(threading.local):
-    """Memory of a thread, since threads of one worker may cast at the same time."""
-
-    def __init__(self) -> None:
-        self._scratch, self._room = np.zeros(0, np.int64), np.zeros(0)
-
-    def memory(self, rays: int) -> tuple[int, int]:
-        """Addresses of the scratch memory, a multiple of 64, and of room for rays of a block."""
-        from .embree_memory import SCRATCH
-
-        if not len(self._scratch):
-            self._scratch = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64)
-        if len(self._room) < 2 * rays:
-            self._room = np.zeros(2 * rays)
-        address = self._scratch.ctypes.data
-        return address + -address % 64, self._room.ctypes.data
-
-
-_own = _Own()

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 from typing import Any
 
 import numba
 import numpy as np
 from numba import types
 from numba.extending import intrinsic
+
+from .arrays import AnyArray, Floats
+from .pattern import Pattern
+from .poses import Poses
 
 LANES = 16  # rays that go together; Embree takes them at once, or in two or four packets
 
@@ -151,3 +156,67 @@ uint8s, uint32s = pointer(types.uint8), pointer(types.uint32)
 
 CASTS = types.Array(numba.from_dtype(CAST), 1, "C")  # of one cast
 casts_at = pointer(CASTS.dtype)
+
+
+class Cast:
+    """A `CAST`, and the arrays whose addresses it has."""
+
+    def __init__(self, base: AnyArray) -> None:
+        self.record = base.copy()
+        self._kept: list[AnyArray] = []
+
+    def keep(self, array: AnyArray | None) -> int:
+        """Address of an array, in float64 and contiguous; 0 for none."""
+        if array is None:
+            return 0
+        self._kept.append(np.ascontiguousarray(array, np.float64))
+        return self._kept[-1].ctypes.data
+
+    def take(self, directions: Floats, origins: Floats | None, poses: Poses, first: int) -> None:
+        """Note what rays are made of: beams (n, 3), poses, and the row of ray 0."""
+        record, motion, turns = self.record, poses.motion, poses.rotations
+        record["directions"] = self.keep(directions.T)
+        record["origins"] = self.keep(None if origins is None else origins.T)
+        record["positions"] = self.keep(poses.positions.T)
+        record["rotations"] = self.keep(None if turns is None else np.moveaxis(turns, 0, -1))
+        if motion is not None:
+            record["delays"] = self.keep(motion.delays)
+            record["velocities"] = self.keep(motion.velocities.T)
+            record["rates"] = self.keep(motion.rates.T)
+        record["rows"], record["poses"], record["each"] = len(directions), len(poses), poses.rays
+        record["first"], record["subrays"] = first, 1
+        record["still"] = len(poses) == 1 and origins is None and motion is None
+
+    def take_pattern(self, pattern: Pattern, poses: Poses, first: int) -> float:
+        """Note what rays of a pattern are made of; how far off their beams they start, metres."""
+        self.take(pattern.directions, pattern.origins, poses, first)
+        sub_rays, record = pattern.sub_rays, self.record
+        if sub_rays is None:
+            return 0.0
+        record["subrays"] = len(sub_rays)
+        record["shares"] = self.keep(sub_rays.table(pattern.offsets))
+        record["begins"] = sub_rays.starts is not None
+        record["offsets"] = self.keep(pattern.offsets)
+        if sub_rays.axis is not None:
+            record["about"], record["axis"] = 1, sub_rays.axis
+        if sub_rays.starts is None:
+            return 0.0
+        record["still"] = 0
+        return float(np.abs(sub_rays.starts).max())
+
+
+class _Own(threading.local):
+    """Memory of a thread, since threads of one worker may cast at the same time."""
+
+    def __init__(self) -> None:
+        self._scratch, self._room = np.zeros(SCRATCH.itemsize // 8 + 8, np.int64), np.zeros(0)
+
+    def memory(self, rays: int) -> tuple[int, int]:
+        """Addresses of the scratch memory, a multiple of 64, and of room for rays of a block."""
+        if len(self._room) < 2 * rays:
+            self._room = np.zeros(2 * rays)
+        address = self._scratch.ctypes.data
+        return address + -address % 64, self._room.ctypes.data
+
+
+own = _Own()

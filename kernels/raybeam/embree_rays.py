@@ -1,4 +1,4 @@
-"""Rays of a scan, made sixteen at a time in compiled loops; with the operations of `Pattern.made`.
+"""Rays of a pattern, made sixteen at a time in compiled loops, with the operations of `plain_rays`.
 
 Each step is a loop over the rays of a group that becomes a few vector instructions.
 """
@@ -6,17 +6,50 @@ Each step is a loop over the rays of a group that becomes a few vector instructi
 from __future__ import annotations
 
 import numpy as np
+from numba import types
 
-from .compiled import inlined, stage
+from . import embree_memory as memory
+from .arrays import Floats, Ints
+from .compiled import compiled, inlined, stage
 from .embree_memory import LANES, at, float64s, int64s
 from .mesh import NEAR
-from .ray_loops import any_axes, axes_about, whole_times
+from .pattern import Pattern
+from .poses import Poses
 
 _OX, _OY, _OZ, _DX, _DY, _DZ = map(at, ("ox", "oy", "oz", "dx", "dy", "dz"))
 _RAY, _ROW, _POSE, _WITHIN = map(at, ("ray", "row", "pose", "within"))
 _STRAIGHT, _ACROSS, _UP = at("straight"), at("across"), at("up")
 _ASIDE, _ABOVE, _ENTRY = at("aside"), at("above"), at("entry")
 _TINY = 2.0**-60  # replaces a direction component of zero, to avoid 0 * inf
+
+
+@inlined
+def whole_times(number, other):  # type: ignore[no-untyped-def]
+    """How many times a whole number is in another, both below 2^52: faster than `//`, and exact."""
+    return np.int64(np.float64(number) / np.float64(other))
+
+
+@inlined
+def any_axes(x, y, z):  # type: ignore[no-untyped-def]
+    """As `sub_rays.any_axes`, of one direction."""
+    sign = -1.0 if z < 0 else 1.0
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    return 1 + sign * x * x * a, sign * b, -sign * x, b, sign + y * y * a, -y
+
+
+@inlined
+def axes_about(x, y, z, axis):  # type: ignore[no-untyped-def]
+    """As `sub_rays.axes_about`, of one direction."""
+    a, b, c = axis
+    p, q, r = b * z - c * y, c * x - a * z, a * y - b * x
+    length = np.sqrt((p * p + q * q) + r * r)
+    least = max(length, 1e-300)
+    p, q, r = p / least, q / least, r / least
+    u, v, w = y * r - z * q, z * p - x * r, x * q - y * p
+    if length < 1e-6:
+        p, q, r, u, v, w = any_axes(x, y, z)
+    return p, q, r, u, v, w
 
 
 @stage
@@ -277,3 +310,43 @@ def entered_at(low, high, o, d):  # type: ignore[no-untyped-def]
         entry = _clip(low[1], high[1], o[1], d[1], entry)
         entry = _clip(low[2], high[2], o[2], d[2], entry)
     return entry
+
+
+@compiled(types.void(memory.CASTS, types.int64[::1], types.float64[:, ::1], types.float64[:, ::1]))
+def _gather(casts, rays, origins, directions):  # type: ignore[no-untyped-def]
+    """Make rays with these numbers; origins are not written if there is no room for any."""
+    cast, count, begins = casts[0], len(rays), origins.shape[1] > 0
+    scratch = cast.scratch
+    numbers, floats = int64s(scratch), float64s(scratch)
+    for lane in range(LANES):
+        numbers[_POSE + lane] = 0
+    for start in range(0, count, LANES):
+        first = rays[start]
+        for k in range(start + 1, min(start + LANES, count)):
+            first = min(first, rays[k])
+        for lane in range(LANES):
+            numbers[_RAY + lane] = rays[min(start + lane, count - 1)] - first
+        make(cast, scratch, begin(cast, first))
+        for lane in range(min(LANES, count - start)):
+            k = start + lane
+            directions[0, k], directions[1, k] = floats[_DX + lane], floats[_DY + lane]
+            directions[2, k] = floats[_DZ + lane]
+            if begins:
+                origins[0, k], origins[1, k] = floats[_OX + lane], floats[_OY + lane]
+                origins[2, k] = floats[_OZ + lane]
+
+
+def made(pattern: Pattern, first: int, ray: Ints, poses: Poses) -> tuple[Floats | None, Floats]:
+    """Make rays of a pattern, see `Pattern.made`: origins and directions, (3, n) each.
+
+    None for origins that are all the position of the pose.
+    """
+    cast = memory.Cast(np.zeros(1, memory.CAST))
+    record = cast.record
+    cast.take_pattern(pattern, poses, first)
+    record["scale"], record["near"] = 1.0, 1  # metres
+    record["scratch"], _ = memory.own.memory(0)
+    origins = np.empty((3, 0 if record["still"] else len(ray)))
+    directions = np.empty((3, len(ray)))
+    _gather(record, np.ascontiguousarray(ray), origins, directions)
+    return None if record["still"] else origins, directions

@@ -159,10 +159,10 @@ class Pattern:
         """Make checked rays, in compiled loops if numba is installed; see `plain_rays`."""
         if not (_compiles() and len(ray)):
             return plain_rays(self, first, ray, poses)
-        from . import ray_loops  # not before: numba takes half a second to import
+        from . import embree_rays  # not before: numba takes half a second to import
 
-        origins, directions = ray_loops.made(self, first, ray, poses)
-        return (poses.positions if self.starts_at_once(poses) else origins.T), directions.T
+        origins, directions = embree_rays.made(self, first, ray, poses)
+        return (poses.positions if origins is None else origins.T), directions.T
 
     def starts_at_once(self, poses: Poses) -> bool:
         """Whether all rays start at one position."""

@@ -1,6 +1,7 @@
 """The functions of `elementary`, compiled."""
 
 # mypy: disable-error-code="no-untyped-def"
+# ruff: noqa: D103
 
 from __future__ import annotations
 
