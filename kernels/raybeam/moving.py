@@ -212,8 +212,9 @@ class _Chunk:
             row, body = row[there], body[there]
             poses, number = _table(*moving.poses(body, times[row])), np.arange(len(row))
         limits, shape = (self._scan.t_min, self._scan.t_max), moving.shape[body]
-        for one in np.unique(shape).tolist():  # none without rays
-            own = shape == one if len(moving.shapes) > 1 else slice(None)
+        several = len(moving.shapes) > 1
+        for one in np.unique(shape).tolist() if several else [0]:
+            own = shape == one if several else slice(None)
             which = row[own], body[own], number[own]
             crossing = Crossing(rays, times, *which, poses, boxes[one], limits)
             moving.shapes[one].strike(crossing, self._nearest)

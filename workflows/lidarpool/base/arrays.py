@@ -19,3 +19,8 @@ Bytes = NDArray[np.uint8]
 AnyFloats = NDArray[np.floating[Any]]
 Records = NDArray[np.void]  # rows of named fields
 AnyArray = NDArray[Any]
+
+
+def owned(array: AnyArray, kind: type = np.float64) -> AnyArray:
+    """Give an array as compiled loops take it: of one type, contiguous and not read-only."""
+    return np.require(array, kind, ["C", "W"])

@@ -26,7 +26,7 @@ from .surfaces import Surfaces
 from .waveform import Digitizer, recorded, returns_in
 from .world import World
 
-CHUNK_RAYS = 1 << 18  # sub-rays that are cast at a time
+CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
 
 
 @dataclass(frozen=True)

@@ -66,6 +66,8 @@ def joined(parts: list[Hits]) -> Hits:
     If some have a cause, those without are surfaces; if some have a velocity, that of those without
     is unknown; those without a width have the width 0.
     """
+    if len(parts) == 1:
+        return parts[0]
     *own, colours, causes, velocities, widths, waveforms = zip(*parts, strict=True)
     return Hits(*map(np.concatenate, own))._replace(
         colour=None if parts[0].colour is None else np.concatenate(colours),

@@ -124,22 +124,24 @@ class Paths:
         seen: list[Floats] = []  # normals as the sensor sees them
         clear = np.full(len(ray), nearest)  # where light is first, metres from the origin
         for _ in range(LEAFY_PASSES_MOST if leafy else PASSES_MOST):
-            normals = surfaces.normals(triangle, light.times, poses.ways)
-            along = products(normals.T, light.directions.T)
-            cosine = np.abs(along)
             within, leaves = light.within, np.zeros(0, np.intp)
             if within is not None:
                 met = within.meet(light.origins, light.directions, (clear, step), light.ray, draw)
                 step, triangle, leaves = step.copy(), triangle.copy(), met.rows
-                step[leaves] = clear[leaves] + met.metres
-                triangle[leaves], cosine[leaves] = met.triangles, met.cosines
-                normals[leaves] = light.directions[leaves]  # no leaf continues another
+                step[leaves], triangle[leaves] = clear[leaves] + met.metres, met.triangles
             distance = light.before + (step if within is None else within.optical(step))
             colour = None
             if self._coloured:
                 points = light.origins + step[:, None] * light.directions
                 colour = surfaces.colours(triangle, points, light.times, poses.ways)
-            energy = light.share * self.energy(triangle, cosine, distance, colour)
+            normals, along, rows, energy = surfaces.lit(
+                triangle, light.directions, distance, self._light, light.times, poses.ways, colour
+            )
+            if len(leaves):
+                normals[leaves] = light.directions[leaves]  # no leaf continues another
+                own = None if colour is None else colour[leaves]
+                energy[leaves] = self.energy(triangle[leaves], met.cosines, distance[leaves], own)
+            energy *= light.share
             if within is not None:
                 within.go(step)
                 energy *= within.factor(light.directions, distance)
@@ -151,7 +153,6 @@ class Paths:
             hits = Hits(light.ray, distance, triangle, energy, colour, velocity=velocity)
             turns = light.turns
             looks = normals if turns is None else np.einsum("nji,nj->ni", turns, normals)
-            rows = surfaces.objects(triangle)
             goes = materials.passes[rows] | materials.mirrors[rows]
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back

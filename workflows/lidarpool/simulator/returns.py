@@ -21,8 +21,8 @@ from ..sensor.optics import LIGHT_M_NS
 from .doppler import radial_velocities
 from .echoes import Echoes
 from .hits import FALSE_ALARM, NO_SURFACE
-from .motion import Poses, products, turned
-from .surfaces import Surfaces, light_of
+from .motion import Poses, turned
+from .surfaces import Lit, Surfaces, light_of
 
 LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
 
@@ -252,19 +252,27 @@ class BatchReturns:
 
         It means nothing where there is no surface.
         """
-        normals = self._surfaces.normals(self.found.triangle, self._times, self._poses.ways)
-        return np.abs(products(normals.T, self.directions.T))
+        return np.abs(self._lit.along)
+
+    @cached_property
+    def _lit(self) -> Lit:
+        light = light_of(self.survey, self.sensor)
+        return self._surfaces.lit(
+            self.found.triangle,
+            self.directions,
+            self.found.distance,
+            light,
+            self._times,
+            self._poses.ways,
+            self._colours if self._surfaces.materials.textured else None,
+        )
 
     @cached_property
     def intensity(self) -> Floats:
         """Received energy, see `Surfaces.energy`."""
         if self.found.energy is not None:
             return self.found.energy
-        light = light_of(self.survey, self.sensor)
-        colours = self._colours if self._surfaces.materials.textured else None
-        return self._surfaces.energy(
-            self.found.triangle, self.cosine, self.found.distance, light, colours
-        )
+        return self._lit.energy
 
     @cached_property
     def _colours(self) -> UInts32:

@@ -10,14 +10,14 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32
+from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32, owned
 from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ..sensor.trajectory import velocities
-from .motion import carried_at, into_axes, products
+from .motion import carried_at, into_axes
 from .voxels import Grids
 from .ways import Ways
 
@@ -35,6 +35,15 @@ class Light(NamedTuple):
 
     wavelength_nm: float
     extinction: float  # 1/m
+
+
+class Lit(NamedTuple):
+    """How rays meet surfaces."""
+
+    normals: Floats  # (n, 3)
+    along: Floats  # (n,): cosines of the angles between normals and directions, of either sign
+    objects: Ints32  # (n,)
+    energy: Floats  # (n,): see `Surfaces.energy`
 
 
 def light_of(survey: Survey, sensor: Sensor) -> Light:
@@ -92,8 +101,7 @@ class Surfaces:
         # Objects of the triangles of faces and of actors; the last is of no triangle.
         owned = [scene.face_object, np.repeat(owners, moving), np.full(1, -1, np.int32)]
         self.owners = np.concatenate(owned)
-        if shared is not None:
-            self._turns = _turns(shared.transforms)
+        self._turns = np.zeros((0, 3, 3)) if shared is None else _turns(shared.transforms)
 
     @property
     def materials(self) -> MaterialTable:
@@ -113,35 +121,64 @@ class Surfaces:
         made.grids = self.grids and self.grids.moved(scene.instances)
         return made
 
-    def _found(self, triangle: Integers) -> tuple[Integers, Indices, Indices]:
-        """Rows without instances, which of them are in one, and in which: (n,), (k,), (k,)."""
-        plain, actors = self._begins[[0, -1]]
-        rows = np.where(triangle >= actors, triangle - (actors - plain), triangle)
-        on = np.flatnonzero((triangle >= plain) & (triangle < actors))
-        which = np.searchsorted(self._begins, triangle[on], side="right") - 1
-        return rows, on, which
+    def _find(self, triangle: Integers) -> tuple[Indices, Ints32, Indices]:
+        """Rows among the triangles that are kept once, objects, and instances or -1: (n,) each."""
+        from . import surface_loops  # not before: numba takes half a second to import
+
+        count = len(triangle)
+        (rows, which), objects = np.empty((2, count), np.int64), np.empty(count, np.int32)
+        surface_loops.find(owned(triangle, np.int32), *self._numbers, rows, objects, which)
+        return rows, objects, which
+
+    @cached_property
+    def _numbers(self) -> tuple[Any, ...]:
+        """Numbers of triangles, objects and instances, see `surface_loops.find`."""
+        shared, none = self._scene.instances, np.zeros(0, np.int64)
+        placed = (
+            (none, none) if shared is None else (shared.owner, self._first_of_part[shared.part])
+        )
+        owner, firsts = owned(placed[0], np.int32), owned(placed[1], np.int64)
+        begins, to_kept = owned(self._begins, np.int64), owned(self._to_kept, np.int64)
+        return begins, owned(self.owners, np.int32), owner, firsts, to_kept, self._standing
 
     def normals(self, triangle: Integers, times: Floats | Ints, ways: Ways) -> Floats:
         """Return the unit normals of triangles (n,): (n, 3), in single precision.
 
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
         """
-        normals = np.empty((3, len(triangle)))
-        rows, on, which = self._rows(triangle)
-        for axis, out in zip(self.unit_normals, normals, strict=True):
-            out[:] = axis.take(rows)
-        if len(on):
-            # In one order of rounding, that of columns.cu.
-            turns = self._turns[which].transpose(1, 2, 0)
-            x, y, z = (products(row, normals[:, on]) for row in turns)
-            normals[:, on] = [x, y, z] / np.sqrt((x * x + y * y) + z * z)
-        rows, actor = self._on_actors(triangle, ways)
-        if len(rows):
-            _, rotations = ways.poses(actor, times[rows].astype(np.float64))
-            own = normals[:, rows]
-            for out, row in zip(normals, rotations.transpose(1, 2, 0), strict=True):
-                out[rows] = products(row, own)
-        return normals.T
+        return self._normals(self._find(triangle), times, ways).T
+
+    def _normals(
+        self, found: tuple[Indices, Ints32, Indices], times: Floats | Ints, ways: Ways
+    ) -> Floats:
+        from . import surface_loops
+
+        rows, objects, which = found
+        poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
+        if ways:
+            poses, run = ways.runs(objects - np.int64(self._standing), times)
+        normals = np.empty((3, len(rows)))
+        surface_loops.oriented(rows, which, self._turns, run, poses, self.unit_normals, normals)
+        return normals
+
+    def lit(
+        self,
+        triangle: Integers,
+        directions: Floats,
+        distance: Floats,
+        light: Light,
+        times: Floats | Ints,
+        ways: Ways,
+        colours: UInts32 | None = None,
+    ) -> Lit:
+        """How rays (n,) with unit directions (n, 3) meet triangles; others as of `energy`."""
+        from . import surface_loops
+
+        found = self._find(triangle)
+        normals, along = self._normals(found, times, ways), np.empty(len(triangle))
+        surface_loops.along(normals, owned(directions.T), along)
+        energy = self._energy(found[1], np.abs(along), distance, light, colours)
+        return Lit(normals.T, along, found[1], energy)
 
     def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
         """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
@@ -149,20 +186,6 @@ class Surfaces:
             return _NONE, _NONE
         rows = np.flatnonzero(triangle >= self._begins[-1])
         return rows, self.objects(triangle[rows]) - self._standing
-
-    def _rows(self, triangle: Integers) -> tuple[Integers, Indices, Indices]:
-        """Rows among the triangles that are kept once, and the others as `_found`."""
-        rows, on, which = triangle, _NONE, _NONE
-        if self._scene.instances is not None:
-            rows, on, which = self._found(triangle)
-            local = rows[on] - self._begins[which]
-            rows[on] = self._first_of_part[self._scene.instances.part[which]] + local
-        moving = np.flatnonzero(triangle >= self._begins[-1]) if self._meshes else _NONE
-        if len(moving):
-            actor = self.objects(triangle[moving]) - self._standing
-            rows = rows.copy()
-            rows[moving] = triangle[moving] + self._to_kept[actor]
-        return rows, on, which
 
     def colours(
         self,
@@ -182,13 +205,14 @@ class Surfaces:
 
     def _colours(self, triangle: Integers, points: Floats, times: Any, ways: Ways) -> UInts32:
         assert self._lookup is not None
-        rows, on, which = self._rows(triangle)
+        rows, _, which = self._find(triangle)
+        on = np.flatnonzero(which >= 0)
         if len(on) or ways:
             points = points.copy()
         if len(on):
             assert self._scene.instances is not None
-            back = points[on] - self._scene.instances.transforms[which, :, 3]
-            points[on] = np.einsum("ni,nij->nj", back, self._turns[which])
+            back = points[on] - self._scene.instances.transforms[which[on], :, 3]
+            points[on] = np.einsum("ni,nij->nj", back, self._turns[which[on]])
         moving, actor = self._on_actors(triangle, ways)
         if len(moving):
             places, rotations = ways.poses(actor, times[moving].astype(np.float64))
@@ -255,14 +279,7 @@ class Surfaces:
 
     def objects(self, triangle: Integers) -> Ints32:
         """Objects of triangles (n,); -1 of no surface."""
-        shared = self._scene.instances
-        if shared is None:
-            return self.owners[triangle]
-        rows, on, which = self._found(triangle)
-        rows[on] = -1
-        objects = self.owners[rows]
-        objects[on] = shared.owner[which]
-        return objects
+        return self._find(triangle)[1]
 
     def instances(self, triangle: Integers) -> Indices:
         """Instances that triangles (n,) belong to; each belongs to one."""
@@ -272,11 +289,11 @@ class Surfaces:
         """Counters of hits of triangles (n,), see `Scene.counters`."""
         if self._scene.instances is None:
             return triangle
-        rows, on, which = self._found(triangle)
-        plain, instances = self._begins[0], len(self._begins) - 1
-        rows[rows >= plain] += instances
-        rows[on] = plain + which
-        return rows
+        plain, actors = self._begins[[0, -1]]
+        which = self._find(triangle)[2]
+        apart = actors - plain - (len(self._begins) - 1)
+        own = np.where(triangle >= actors, triangle - apart, triangle)
+        return np.where(which >= 0, plain + which, own)
 
     def energy(
         self,
@@ -292,10 +309,27 @@ class Surfaces:
         retro-reflector, a gain replaces the cosine. Where materials are `textured`, the colours
         (n,) are needed.
         """
+        return self._energy(self.objects(triangle), cosine, distance, light, colours)
+
+    def _energy(
+        self,
+        objects: Ints32,
+        cosine: Floats,
+        distance: Floats,
+        light: Light,
+        colours: UInts32 | None,
+    ) -> Floats:
+        from . import surface_loops
+
         table = self.at(light.wavelength_nm)
-        bright = luminance(colours) if table.textured and colours is not None else None
-        scattered = table.scattered(self.objects(triangle), cosine, bright)
-        return np.asarray(scattered * at_right_angles(distance, light.extinction))
+        if table.textured or table.roughness.any():
+            bright = luminance(colours) if table.textured and colours is not None else None
+            scattered = table.scattered(objects, cosine, bright)
+            return np.asarray(scattered * at_right_angles(distance, light.extinction))
+        out = np.empty(len(objects))
+        shares = table.reflectance, table.retro, light.extinction
+        surface_loops.shine(objects, owned(cosine), owned(distance), *shares, out)
+        return out
 
     @cached_property
     def solids(self) -> tuple[Bools, Bools]:
@@ -412,7 +446,7 @@ class Surfaces:
 
 def _turns(transforms: Floats) -> Floats:
     """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
-    return np.asarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)
+    return np.ascontiguousarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:

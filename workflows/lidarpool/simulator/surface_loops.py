@@ -1,0 +1,148 @@
+"""Loops over hits: what surfaces they are on, how these lie, and what light they send back."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined
+
+from ..base.elementary_loops import exp, sin_cos
+from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
+
+
+@inlined
+def _product(x, y, z, a, b, c):
+    """As `motion.products`."""
+    return (x * a + y * b) + z * c
+
+
+@compiled("(i4[::1], i8[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, i8[::1], i4[::1], i8[::1])")
+def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, objects, which):
+    """Write rows among the triangles that are kept once, objects, and instances, or -1.
+
+    Triangles of instances begin at `begins`, whose last is where those of actors begin; `shared`
+    and `firsts` are objects and first rows of instances.
+    """
+    plain, actors = begins[0], begins[-1]
+    for k in range(len(triangle)):
+        t, which[k] = np.int64(triangle[k]), -1
+        if t < plain:
+            rows[k], objects[k] = t, owners[t]
+        elif t >= actors:
+            owner = owners[t - (actors - plain)]
+            rows[k], objects[k] = t + to_kept[owner - standing], owner
+        else:
+            low, high = 0, len(shared)  # the last that begins, by halves
+            while high - low > 1:
+                middle = (low + high) // 2
+                if begins[middle] <= t:
+                    low = middle
+                else:
+                    high = middle
+            rows[k], objects[k], which[k] = firsts[low] + t - begins[low], shared[low], low
+
+
+@compiled("(i8[::1], i8[::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f4[:, ::1], f8[:, ::1])")
+def oriented(rows, which, turns, run, poses, normals, out):
+    """Write unit normals (3, n): of instances turned, and of actors by poses (12, m) of `run`."""
+    for k in range(len(rows)):
+        row = rows[k]
+        x = np.float64(normals[0, row])
+        y = np.float64(normals[1, row])
+        z = np.float64(normals[2, row])
+        if which[k] >= 0:  # in one order of rounding, that of columns.cu
+            t = turns[which[k]]
+            a = _product(t[0, 0], t[0, 1], t[0, 2], x, y, z)
+            b = _product(t[1, 0], t[1, 1], t[1, 2], x, y, z)
+            c = _product(t[2, 0], t[2, 1], t[2, 2], x, y, z)
+            length = np.sqrt((a * a + b * b) + c * c)
+            x, y, z = a / length, b / length, c / length
+        if len(run) and run[k] >= 0:
+            p = run[k]
+            x, y, z = (
+                _product(poses[3, p], poses[4, p], poses[5, p], x, y, z),
+                _product(poses[6, p], poses[7, p], poses[8, p], x, y, z),
+                _product(poses[9, p], poses[10, p], poses[11, p], x, y, z),
+            )
+        out[0, k], out[1, k], out[2, k] = x, y, z
+
+
+@compiled("(f8[:, ::1], f8[:, ::1], f8[::1])")
+def along(normals, directions, out):
+    """Write scalar products of vectors (3, n)."""
+    for k in range(len(out)):
+        out[k] = _product(
+            normals[0, k], normals[1, k], normals[2, k],
+            directions[0, k], directions[1, k], directions[2, k],
+        )  # fmt: skip
+
+
+@compiled("(i4[::1], f8[::1], f8[::1], f8[::1], b1[::1], f8, f8[::1])")
+def shine(objects, cosine, distance, reflectance, retro, extinction, out):
+    """Write energies, see `Surfaces.energy`, of materials that are neither textured nor rough."""
+    for k in range(len(objects)):
+        row = objects[k]
+        back = reflectance[row] * (RETRO_GAIN if retro[row] else cosine[k])
+        far = max(distance[k], NEAREST_M)
+        nearer = REFERENCE_M / far
+        nearer = nearer * nearer
+        out[k] = back * (nearer * exp(-2 * extinction * far) if extinction else nearer)
+
+
+@compiled("i8(i8[::1], f8[::1], i8[::1], i8[::1])")
+def runs(number, times, first, run):
+    """Write for each actor's time its run, and the first of each; returns how many runs.
+
+    In a run, actors and times are equal; numbers below 0 are in none.
+    """
+    count, last = 0, -1
+    for k in range(len(number)):
+        run[k] = -1
+        if number[k] < 0:
+            continue
+        if last < 0 or number[k] != number[last] or times[k] != times[last]:
+            first[count] = k
+            count += 1
+        run[k], last = count - 1, k
+    return count
+
+
+@compiled(
+    "i8(i8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], "
+    "f8[:, :, ::1], f8[::1], f8[:, ::1])"
+)
+def on_tracks(
+    number, times_ns, member, first, count, limits, times, start, speed, turn, rates, out
+):
+    """Write poses (12, n) on straight tracks, with the operations of `Track.poses`.
+
+    Returns the first row whose time is not within its track, or -1; leaves other ways out.
+    """
+    for k in range(len(number)):
+        way = member[number[k]]
+        if way < 0:
+            continue
+        at = times_ns[k] / 1e9 + limits[0, way]
+        low, high, strict = limits[1, way], limits[2, way], limits[3, way]
+        if max(low - at, at - high) > strict:
+            return k
+        if strict == np.inf:
+            at = min(max(at, low), high)
+        segment, room = first[way], count[way] - 1  # the last that has begun, by halves
+        while room:
+            half = (room + 1) // 2
+            if times[segment + half] <= at:
+                segment, room = segment + half, room - half
+            else:
+                room = half - 1
+        since = at - times[segment]
+        for axis in range(3):
+            out[axis, k] = speed[axis, segment] * since + start[axis, segment]
+        sine, cosine = sin_cos(since * rates[segment])
+        for part in range(9):
+            out[3 + part, k] = (
+                turn[0, part, segment] + sine * turn[1, part, segment]
+            ) + cosine * turn[2, part, segment]
+    return -1
