@@ -1,8 +1,9 @@
 """What is real, beside what is bare: `python -m benchmarks.realism [--rounds N] [--json]`.
 
 One sweep of an OS1-64 in a city of 100,000 triangles, one thread: bare, with cars that move (boxes,
-and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, in rain, fog and snow,
-and all of it. Each figure is the median of the rounds, and a multiple of the bare sweep's.
+and meshes of 1,000 triangles), from a sensor that moves too, with sub-rays, with noise, in rain,
+fog and snow; cars, sub-rays, noise and rain together (`real`), and all of it. Each figure is the
+median of the rounds, and a multiple of the bare sweep's.
 """
 
 from __future__ import annotations
@@ -60,8 +61,8 @@ def cars(count: int, mesh: SceneMesh, seed: int) -> list[Actor]:
 def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> dict[str, Any]:
     """Make a function of the round for each row, which gives its number of points."""
     lidar = load_sensor(sensor)
-    weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 1.0}}
-    weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 18.8}
+    weather = {"rain": {"rain_mm_h": 10.0}, "snow": {"snow_mm_h": 2.0}}
+    weather["fog"] = {"visibility_km": 0.2, "fog_lidar_ratio_sr": 20.0}
     plain, fine = box("Car", (4.5, 1.8, 1.5)), fine_box(1_000)
     way = Track([0, 1], [PLACE, (PLACE[0] + SPEED_M_S, *PLACE[1:])])
 
@@ -82,16 +83,20 @@ def cases(scene: Scene, backend: str, counts: tuple[int, ...], sensor: str) -> d
         rows[f"{count} meshes"] = case(cars(count, fine, count))
     some = counts[len(counts) // 2]
     rows[f"{some} boxes, moving"] = case(cars(some, plain, some), way)
-    for subrays in (7, 19):
-        rows[f"{subrays} sub-rays"] = case([], returns=Returns(subrays=subrays, divergence_mrad=3))
+    for subrays, mode in ((7, "strongest"), (19, "all")):
+        beam = Returns(subrays=subrays, divergence_mrad=3, mode=mode)
+        rows[f"{subrays} sub-rays"] = case([], returns=beam)
+    rows["noise"] = case([], noise=Noise(range_m=0.02))
     noise = Noise(detection_range_m=90)  # without which no weather returns light
     rows |= {name: case([], noise=noise, **options) for name, options in weather.items()}
+    beam = Returns(subrays=7, divergence_mrad=3)
+    real = {"noise": Noise(detection_range_m=90, range_m=0.02), "returns": beam}
+    rows["real"] = case(cars(some, plain, some), **real, **weather["rain"])
     together = {name: value for options in weather.values() for name, value in options.items()}
     rows["all"] = case(
         cars(some, fine, some),
         way,
-        noise=noise,
-        returns=Returns(subrays=7, divergence_mrad=3),
+        **real,
         **together,
     )
     return rows

@@ -25,8 +25,8 @@ from .caster import RayCaster
 from .crossing import SPAN, Crossing, Nearest, Swept
 from .scan import Scan
 
-_CHUNK = 1 << 15  # rays at a time
-_PAIRS = 1 << 11  # of cells and bodies at a time
+_CHUNK = 1 << 17  # rays at a time
+_PAIRS = 1 << 14  # of cells and bodies at a time
 _POSES = 1 << 18  # on a device: 25 MB
 _LOOKS = 128  # cells for each look at the bodies
 
@@ -46,15 +46,15 @@ class Moving:
     there
         float64 (b, 2): first and last time when each is there.
     poses
-        Called with numbers of bodies (m,) and times (m,); gives positions (m, 3), metres, and
-        rotations (m, 3, 3) from the body's axes.
+        Called with numbers of bodies (m,) and times (m,); gives (12, m): positions, metres, and
+        rotations from the body's axes, by rows.
     """
 
     shapes: tuple[RayCaster | Bending, ...]
     boxes: Floats
     shape: Indices
     there: Floats
-    poses: Callable[[Ints, Floats], tuple[Floats, Floats]]
+    poses: Callable[[Ints, Floats], Floats]
 
     @cached_property
     def middle(self) -> Floats:
@@ -80,7 +80,7 @@ def hits_on(
     Parameters
     ----------
     moving, scan
-        Bodies and rays.
+        Bodies and rays, which are made unless a cast has written the scan's `rays_out`.
     times
         Gives the times of rays (m,).
     before
@@ -92,8 +92,14 @@ def hits_on(
     if before is not None:
         np.minimum(found.distance, before, out=found.distance)
     for start, stop in scan.chunks(_CHUNK):
-        at = times(np.arange(start, stop, dtype=np.int64))
-        _Chunk(loops, moving, scan, start, at, found.part(start, stop)).cast()
+        ray = np.arange(start, stop, dtype=np.int64)
+        if scan.rays_out is None:
+            rays = np.empty((6, len(ray)))
+            origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
+            rays[:3], rays[3:] = origins.T, directions.T
+        else:
+            rays = np.ascontiguousarray(scan.rays_out[:, start:stop])
+        _Chunk(loops, moving, scan, rays, times(ray), found.part(start, stop)).cast()
     return found
 
 
@@ -101,15 +107,10 @@ class _Chunk:
     """Some rays of a scan, their times, and what they hit."""
 
     def __init__(
-        self, loops: Any, moving: Moving, scan: Scan, start: int, times: Floats, nearest: Nearest
+        self, loops: Any, moving: Moving, scan: Scan, rays: Floats, times: Floats, nearest: Nearest
     ) -> None:
         self._loops, self._moving, self._scan = loops, moving, scan
-        self._times, self._nearest = times, nearest
-        ray = np.arange(start, start + len(times), dtype=np.int64)
-        origins, directions = scan.pattern.made(scan.first, ray, scan.poses)
-        room = -(-len(times) // loops.CELL) * loops.CELL  # the loops read whole cells
-        self._rays = np.zeros((6, room))
-        self._rays[:3, : len(times)], self._rays[3:, : len(times)] = origins.T, directions.T
+        self._rays, self._times, self._nearest = rays, times, nearest
 
     def cast(self) -> None:
         """Note the nearest hits on all bodies."""
@@ -162,9 +163,9 @@ class _Chunk:
         there = (first <= time) & (time <= last)
         poses, corners = np.full((len(body), 12), np.nan), np.full((2, len(body), 3), np.nan)
         if there.any():
-            positions, turns = moving.poses(body[there], time[there])
-            poses[there] = _table(positions, turns).T
-            middle = positions + _turned(turns, moving.middle[[shape]])
+            table = moving.poses(body[there], time[there])
+            poses[there], turns = table.T, _rotations(table)
+            middle = table[:3].T + _turned(turns, moving.middle[[shape]])
             half = _turned(np.abs(turns), moving.half[[shape]]) + PADS_M
             corners[:, there] = middle - half, middle + half
         low, high = corners.reshape(2, -1, many, 3)
@@ -182,8 +183,9 @@ class _Chunk:
         number = spans.astype(np.int64).clip(0, steps)
         at = np.clip(np.linspace(first, last, steps + 1), *moving.there[bodies].T[:, :, None])
         many = np.repeat(bodies, steps + 1)
-        positions, rotations = moving.poses(many, at.ravel())
-        middles = positions + _turned(rotations, moving.middle[moving.shape[many]])
+        table = moving.poses(many, at.ravel())
+        rotations = _rotations(table)
+        middles = table[:3].T + _turned(rotations, moving.middle[moving.shape[many]])
         halves = rotations.transpose(0, 2, 1) * moving.half[moving.shape[many]][..., None]
         looks = np.empty((len(bodies), steps + 1, 12))
         looks[..., :3] = middles.reshape(len(bodies), -1, 3)
@@ -198,10 +200,10 @@ class _Chunk:
         loops, moving, times, rays = self._loops, self._moving, self._times, self._rays
         shape, boxes = moving.shape[body], moving.boxes.reshape(-1, 6)
         begins, ends = np.clip(cells[:, [loops.BEGIN, loops.END]].T, *moving.there[body].T)
-        poses = _table(*moving.poses(body, begins))
+        poses = moving.poses(body, begins)
         pads, late = np.full(len(cell), loops.PADS_M), np.flatnonzero(ends > begins)
         if len(late):  # the box is larger by what happens until the cell's end
-            change = np.abs(_table(*moving.poses(body[late], ends[late])) - poses[:, late])
+            change = np.abs(moving.poses(body[late], ends[late]) - poses[:, late])
             size = np.abs(moving.boxes).max(axis=(1, 2))[shape[late]]
             pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
         row, pair = loops.through(rays, self._nearest.distance, cell, poses, boxes, shape, pads)
@@ -210,7 +212,7 @@ class _Chunk:
             first, last = moving.there[body].T
             there = (first <= times[row]) & (times[row] <= last)
             row, body = row[there], body[there]
-            poses, number = _table(*moving.poses(body, times[row])), np.arange(len(row))
+            poses, number = moving.poses(body, times[row]), np.arange(len(row))
         limits, shape = (self._scan.t_min, self._scan.t_max), moving.shape[body]
         several = len(moving.shapes) > 1
         for one in np.unique(shape).tolist() if several else [0]:
@@ -220,11 +222,9 @@ class _Chunk:
             moving.shapes[one].strike(crossing, self._nearest)
 
 
+def _rotations(poses: Floats) -> Floats:
+    return poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
+
+
 def _turned(rotations: Floats, vectors: Floats) -> Floats:
     return (rotations * vectors[:, None, :]).sum(axis=2)
-
-
-def _table(positions: Floats, rotations: Floats) -> Floats:
-    table = np.empty((12, len(positions)))
-    table[:3], table[3:] = positions.T, rotations.transpose(1, 2, 0).reshape(9, -1)
-    return table

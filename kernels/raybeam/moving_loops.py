@@ -193,6 +193,10 @@ def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
 @compiled("i8(f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], i8[:, ::1])")
 def _through(rays, ends, cell, poses, boxes, shape, pads, out):  # type: ignore[no-untyped-def]
     found, near, count = 0, np.empty(CELL), rays.shape[1]
+    if count < CELL:  # the loop over a cell has a constant length
+        given, rays = rays, np.zeros((6, CELL))
+        rays[:, :count] = given
+        count = CELL
     for pair in range(len(cell)):
         begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
         sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
@@ -207,9 +211,10 @@ def _through(rays, ends, cell, poses, boxes, shape, pads, out):  # type: ignore[
             py + (d * x + e * y + f * z),
             pz + (g * x + h * y + i * z),
         )
-        _near(rays.ctypes.data + 8 * begin, count, x, y, z, ball, near.ctypes.data)
+        first = min(begin, count - CELL)
+        _near(rays.ctypes.data + 8 * first, count, x, y, z, ball, near.ctypes.data)
         for k in range(begin, end):
-            if near[k - begin] > 0:
+            if near[k - first] > 0:
                 continue
             x, y, z = taken(turn, rays[0, k] - px, rays[1, k] - py, rays[2, k] - pz)
             u, v, w = taken(turn, rays[3, k], rays[4, k], rays[5, k])

@@ -40,6 +40,9 @@ class Scan:
         int64 (g,): numbers of the rays at which groups begin; ascending, the first is 0.
     tally
         Whether to count hits by triangle.
+    rays_out
+        float64 (6, n): origins and directions of the rays, in the mesh's axes, are written here;
+        or None.
     """
 
     pattern: Pattern
@@ -51,6 +54,7 @@ class Scan:
     keep_every: int
     groups: Ints
     tally: bool
+    rays_out: Floats | None = None
 
     def __len__(self) -> int:
         return self.count
@@ -63,7 +67,10 @@ class Scan:
     def rays(self, start: int, stop: int) -> Rays:
         """Rays `start` to `stop`, with the bits of `Pattern.rays`."""
         ray = np.arange(start, stop, dtype=np.int64)
-        return Rays(*self.pattern.made(self.first, ray, self.poses), self.t_min, self.t_max)
+        origins, directions = self.pattern.made(self.first, ray, self.poses)
+        if self.rays_out is not None:
+            self.rays_out[:3, start:stop], self.rays_out[3:, start:stop] = origins.T, directions.T
+        return Rays(origins, directions, self.t_min, self.t_max)
 
 
 def check_scan(
@@ -79,6 +86,7 @@ def check_scan(
     groups: ArrayLike | None = None,
     tally: bool = False,
     motion: Motion | None = None,
+    rays_out: Floats | None = None,
 ) -> Scan:
     """Check the arguments of `RayCaster.scan`, which describes them and the errors."""
     start, stop = (0, len(pattern)) if window is None else map(index, window)
@@ -104,6 +112,7 @@ def check_scan(
         index(keep_every),
         np.zeros(1, np.int64) if groups is None else np.asarray(groups, np.int64),
         tally,
+        rays_out,
     )
 
 

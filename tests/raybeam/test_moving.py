@@ -53,7 +53,8 @@ class Bodies:
         angle, axis = self.rate[body] * times, self.axis[body]
         cross = np.cross(np.eye(3), axis[:, None])
         spin = np.sin(angle)[:, None, None] * cross
-        return places, np.eye(3) + spin + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
+        turns = np.eye(3) + spin + (1 - np.cos(angle))[:, None, None] * (cross @ cross)
+        return table(places, turns)
 
     def moving(self, backend):
         mask = np.array([[False, True], [True, False]])
@@ -62,6 +63,11 @@ class Bodies:
         casters = [RayCaster.of([Instance(mesh)], backend, threads=1) for mesh in shapes]
         boxes = np.array([[[-2, -1, -0.7], [2, 1, 0.7]], *2 * [[[-1.0, -1, 0], [1, 1, 0]]]])
         return Moving(tuple(casters), boxes, self.shape, self.there, self.poses)
+
+
+def table(places, turns):
+    """Poses as `Moving.poses` gives them."""
+    return np.concatenate([places.T, turns.transpose(1, 2, 0).reshape(9, -1)])
 
 
 def fan(count):
@@ -108,7 +114,8 @@ def by_all(moving, scan, times):
     best = {}
     for body, (first, last) in enumerate(moving.there):
         rows = np.flatnonzero((first <= times) & (times <= last))
-        places, turns = moving.poses(np.full(len(rows), body), times[rows])
+        poses = moving.poses(np.full(len(rows), body), times[rows])
+        places, turns = poses[:3].T, poses[3:].reshape(3, 3, -1).transpose(2, 0, 1)
         starts = np.broadcast_to(origins, directions.shape)[rows] - places
         local = [
             np.stack([(x * a + y * b) + z * c for a, b, c in turns.transpose(2, 1, 0)], axis=1)
@@ -207,7 +214,7 @@ def test_a_quadrangle_flaps():
 
     def flown(bodies, times):
         across = np.stack([0.3 * times, 4.0 - times, np.full(len(times), 0.2)], axis=1)
-        return across, np.broadcast_to(np.diag([1.0, 1.0, 1.0]), (len(times), 3, 3))
+        return table(across, np.broadcast_to(np.diag([1.0, 1.0, 1.0]), (len(times), 3, 3)))
 
     moving = Moving((wing,), wing.box[None], np.zeros(1, int), np.array([[0.1, 1.3]]), flown)
     directions = np.array([0.0, 3.6, 0.2]) + rng.uniform(-1.5, 1.5, (4_000, 3)) * [1, 1, 0.4]
@@ -216,7 +223,7 @@ def test_a_quadrangle_flaps():
     for ray in range(0, 4_000, 3):
         expected = np.inf
         if 0.1 <= times[ray] <= 1.3:
-            where, _ = flown([0], times[ray : ray + 1])
+            where = flown([0], times[ray : ray + 1])[:3].T
             then = RayCaster(wing.at(times[ray : ray + 1])[0] + where, wing.faces, backend="numpy")
             expected = then.cast([0, 0, 0], directions[ray]).distance[0]
         assert found.distance[ray] == pytest.approx(expected, rel=1e-12)

@@ -11,7 +11,7 @@ import numpy as np
 import raybeam.poses
 from raybeam import Motion, Pattern
 
-from ..base.arrays import Floats, Integers
+from ..base.arrays import Floats, Integers, owned
 from ..sensor import Mounted, Trajectory
 from ..sensor.trajectory import velocities
 from .ways import Ways
@@ -32,9 +32,11 @@ class Clock:
 
     def of(self, ray: Integers) -> Floats:
         """Return the firing times of rays (n,): (n,)."""
-        firing, beam = np.divmod(self.start + ray // self.subrays, len(self.delays))
-        times: Floats = self.begins[firing] + self.delays[beam]
-        return times
+        from . import surface_loops  # not before: numba takes half a second to import
+
+        out, tables = np.empty(len(ray)), (owned(self.begins), owned(self.delays))
+        surface_loops.times(owned(ray, np.int64), self.start, self.subrays, *tables, out)
+        return out
 
 
 @dataclass(frozen=True)

@@ -99,10 +99,12 @@ class Paths:
         leafy = media is not None and media.leafy
         # How far light goes in a crown depends on its other side, however far that is.
         reach = np.inf if leafy else farthest
-        found = self._world.scan(beams, poses, window=window, t_min=nearest, t_max=reach)
+        rays = np.empty((6, window[1] - window[0]))
+        found = self._world.scan(
+            beams, poses, window=window, t_min=nearest, t_max=reach, rays_out=rays
+        )
         ray = found.ray.astype(np.int64)
-        origins, directions = poses.rays(beams, ray, window[0])
-        origins = np.broadcast_to(origins, directions.shape)
+        origins, directions = rays.take(ray, axis=1).reshape(2, 3, -1).transpose(0, 2, 1)
         light = _Light(
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
         )
@@ -117,8 +119,8 @@ class Paths:
             light.turns = np.broadcast_to(np.eye(3), (len(ray), 3, 3))
         if media is not None:
             left = depths(draw(Purpose.LEAF, ray)) if leafy else None
-            rays = Rays(origins, directions, light.times, poses.ways)
-            light.within = media.within(self._world, rays, left)
+            given = Rays(origins, directions, light.times, poses.ways)
+            light.within = media.within(self._world, given, left)
         step, triangle = found.distance, found.triangle
         parts: list[Hits] = []
         seen: list[Floats] = []  # normals as the sensor sees them
@@ -188,7 +190,7 @@ class Paths:
         if each == 1:
             return hits, None
         if parts[1:]:
-            directions = poses.rays(beams, hits.ray, window[0])[1]
+            directions = rays[3:].take(hits.ray, axis=1).T
         return hits, (normals, directions)
 
     def _behind(

@@ -298,9 +298,14 @@ def returns(
                     place -= 1
                 sub[place], far[place], light[place], hard[place] = a, b, c, d
                 own[place, 0], speed[place] = e, f
-            for k in range(1, n):
-                new[k] = far[k] - far[k - 1] > gap_m
-                several |= new[k]
+            surface, number = -1, 0
+            for k in range(n):
+                if k:
+                    new[k] = far[k] - far[k - 1] > gap_m
+                    number += np.int64(new[k])
+                if hard[k]:  # surfaces can only continue if they are in several returns
+                    several |= surface >= 0 and surface != number
+                    surface = number
             if several and len(pairs):
                 _joined(
                     0, n, new, new, sub, far, hard, own, gap_m, each, pairs, normals, directions,

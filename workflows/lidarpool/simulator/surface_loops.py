@@ -91,6 +91,37 @@ def shine(objects, cosine, distance, reflectance, retro, extinction, out):
         out[k] = back * (nearer * exp(-2 * extinction * far) if extinction else nearer)
 
 
+@compiled("(i8[::1], i8, i8, f8[::1], f8[::1], f8[::1])")
+def times(ray, start, subrays, begins, delays, out):
+    """Write when rays are fired, of which `subrays` are of a beam, from beam `start` on."""
+    low, firing, each = np.int64(0), np.int64(-1), len(delays)
+    for k in range(len(ray)):  # they follow each other
+        beam = start + ray[k] // subrays
+        if firing < 0 or not low <= beam < low + each:
+            firing = beam // each
+            low = firing * each
+        out[k] = begins[firing] + delays[beam - low]
+
+
+@compiled("i8(u4[::1], f8[::1], i4[::1], u4[::1], f8[::1], i4[::1], i8[::1], f8[::1], i4[::1])")
+def merge(
+    ray, distance, triangle, other_ray, other_distance, other_triangle, out, out_m, out_triangle
+):
+    """Write hits in the order of rays, the others in place of those of their rays; how many."""
+    i, j, count = 0, 0, 0
+    while i < len(ray) or j < len(other_ray):
+        if j == len(other_ray) or (i < len(ray) and ray[i] < other_ray[j]):
+            out[count], out_m[count], out_triangle[count] = ray[i], distance[i], triangle[i]
+            i += 1
+        else:
+            i += np.int64(i < len(ray) and ray[i] == other_ray[j])
+            out[count], out_m[count] = other_ray[j], other_distance[j]
+            out_triangle[count] = other_triangle[j]
+            j += 1
+        count += 1
+    return count
+
+
 @compiled("i8(i8[::1], f8[::1], i8[::1], i8[::1])")
 def runs(number, times, first, run):
     """Write for each actor's time its run, and the first of each; returns how many runs.
@@ -123,6 +154,10 @@ def on_tracks(
     for k in range(len(number)):
         way = member[number[k]]
         if way < 0:
+            continue
+        if k and number[k] == number[k - 1] and times_ns[k] == times_ns[k - 1]:
+            for part in range(12):
+                out[part, k] = out[part, k - 1]
             continue
         at = times_ns[k] / 1e9 + limits[0, way]
         low, high, strict = limits[1, way], limits[2, way], limits[3, way]

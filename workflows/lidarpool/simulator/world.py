@@ -38,6 +38,7 @@ from .surfaces import Surfaces
 from .ways import Ways
 
 AUTO_TAKES = "Backend 'auto' takes one that works."
+RAYS_KEPT = 1 << 17  # of one cast; those of a longer one are made again, part by part
 SHORT = 1e-3  # of the distance: a ray that ends so much before a point has reached it
 
 
@@ -117,11 +118,15 @@ class World:
         keep_every: int = 1,
         groups: Ints | None = None,
         tally: bool = False,
+        rays_out: Floats | None = None,
     ) -> ScanReturns:
         """See `RayCaster.scan`; the poses have a clock if there are actors."""
         start, stop = (0, len(pattern)) if window is None else window
+        if self._shapes is not None and rays_out is None and stop - start <= RAYS_KEPT:
+            rays_out = np.empty((6, stop - start))  # which actors need
         common: dict[str, Any] = {
-            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max
+            **poses.given, "window": (start, stop), "t_min": t_min, "t_max": t_max,
+            "rays_out": rays_out,
         }  # fmt: skip
         if self._begins is None and self._shapes is None:
             return self.caster.scan(
@@ -169,19 +174,24 @@ class World:
         self, found: ScanReturns, scan: Scan, poses: Poses
     ) -> tuple[Ints, Floats, Ints32]:
         """Rays, distances and triangles of all hits, those on actors among them."""
-        distance, triangle = np.full(len(scan), np.inf), np.full(len(scan), -1, np.int32)
-        distance[found.ray], triangle[found.ray] = found.distance, found.triangle
-        on = self.on_actors(scan, poses, distance)
-        distance[on.ray], triangle[on.ray] = on.distance, on.triangle
-        ray = np.flatnonzero(triangle >= 0)
-        return ray, distance[ray], triangle[ray]
+        from . import surface_loops  # not before: numba takes half a second to import
+
+        before = np.full(len(scan), np.inf)
+        before[found.ray] = found.distance
+        on = self.on_actors(scan, poses, before)
+        most = len(found.ray) + len(on.ray)
+        merged = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int32)
+        hits = found.ray, found.distance, found.triangle, on.ray, on.distance, on.triangle
+        count = surface_loops.merge(*hits, *merged)
+        ray, distance, triangle = (column[:count] for column in merged)
+        return ray, distance, triangle
 
     def on_actors(self, scan: Scan, poses: Poses, before: Floats | None = None) -> OtherHits:
         """Find the nearest hits of rays on actors, at less than distances `before` (n,)."""
         assert self._shapes is not None
         casters, boxes, parts, shape = self._shapes
         ways = poses.ways
-        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.poses)
+        moving = Moving(casters, boxes, shape, ways.presence_ns, ways.table)
         hits = hits_on(moving, scan, poses.times, before)
         ray = np.flatnonzero(hits.body >= 0)
         body, triangle = hits.body[ray], hits.triangle[ray]
