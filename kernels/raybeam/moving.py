@@ -131,10 +131,10 @@ class _Chunk:
         order = np.argsort((way**2).sum(axis=1), kind="stable")
         reach = float(self._nearest.distance.max())
         cell, which = loops.meet(wide, cells, number, looks[order], sizes[order], reach)
-        body = bodies[order][which]
+        body, spans = bodies[order][which], cells[:, [loops.BEGIN, loops.END]]
         for start in range(0, len(cell), _PAIRS):
             some = slice(start, start + _PAIRS)
-            self._cast_at(cell[some], cells[cell[some]], body[some])
+            self._cast_at(cell[some], spans[cell[some]].T, body[some])
 
     def _sweep(self, bodies: Ints) -> None:
         """Note the nearest hits on bodies whose shapes are on a device."""
@@ -195,19 +195,22 @@ class _Chunk:
         sizes = np.column_stack([moving.radius[shape], slack, moving.there[bodies]])
         return number, looks, sizes
 
-    def _cast_at(self, cell: Indices, cells: Floats, body: Ints) -> None:
-        """Cast the rays of cells on bodies, one each."""
+    def _cast_at(self, cell: Indices, spans: Floats, body: Ints) -> None:
+        """Cast the rays of cells, of some spans of time, on bodies, one each."""
         loops, moving, times, rays = self._loops, self._moving, self._times, self._rays
         shape, boxes = moving.shape[body], moving.boxes.reshape(-1, 6)
-        begins, ends = np.clip(cells[:, [loops.BEGIN, loops.END]].T, *moving.there[body].T)
-        poses = moving.poses(body, begins)
+        begins, ends = np.clip(spans, *moving.there[body].T)
+        new = (np.diff(body, prepend=-1) != 0) | (np.diff(begins, prepend=np.nan) != 0)
+        number = np.cumsum(new) - 1  # several cells of a body may begin at one time
+        poses = moving.poses(body[new], begins[new])
         pads, late = np.full(len(cell), loops.PADS_M), np.flatnonzero(ends > begins)
         if len(late):  # the box is larger by what happens until the cell's end
-            change = np.abs(moving.poses(body[late], ends[late]) - poses[:, late])
+            change = np.abs(moving.poses(body[late], ends[late]) - poses[:, number[late]])
             size = np.abs(moving.boxes).max(axis=(1, 2))[shape[late]]
             pads[late] += 2 * (change[:3].sum(axis=0) + size * change[3:].sum(axis=0))
-        row, pair = loops.through(rays, self._nearest.distance, cell, poses, boxes, shape, pads)
-        body, number = body[pair], pair
+        given = cell, number, poses, boxes, shape, pads
+        row, pair = loops.through(rays, self._nearest.distance, *given)
+        body, number = body[pair], number[pair]
         if len(late):  # each ray at its own time
             first, last = moving.there[body].T
             there = (first <= times[row]) & (times[row] <= last)

@@ -190,8 +190,11 @@ def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
         out[k] = far - along * along - radius * (1 + 1e-6) - 1e-5 * far
 
 
-@compiled("i8(f8[:, ::1], f8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], i8[:, ::1])")
-def _through(rays, ends, cell, poses, boxes, shape, pads, out):  # type: ignore[no-untyped-def]
+@compiled(
+    "i8(f8[:, ::1], f8[::1], i8[::1], i8[::1], f8[:, ::1], f8[:, ::1], i8[::1], f8[::1], "
+    "i8[:, ::1])"
+)
+def _through(rays, ends, cell, number, poses, boxes, shape, pads, out):  # type: ignore[no-untyped-def]
     found, near, count = 0, np.empty(CELL), rays.shape[1]
     if count < CELL:  # the loop over a cell has a constant length
         given, rays = rays, np.zeros((6, CELL))
@@ -201,10 +204,11 @@ def _through(rays, ends, cell, poses, boxes, shape, pads, out):  # type: ignore[
         begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
         sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
         (a, b, c), (d, e, f) = sides
-        pad, turn = pads[pair], turn_of(poses, pair)
+        pad, pose = pads[pair], number[pair]
+        turn = turn_of(poses, pose)
         x, y, z = (a + d) / 2, (b + e) / 2, (c + f) / 2
         ball = (d - x + pad) ** 2 + (e - y + pad) ** 2 + (f - z + pad) ** 2
-        px, py, pz = poses[0, pair], poses[1, pair], poses[2, pair]
+        px, py, pz = poses[0, pose], poses[1, pose], poses[2, pose]
         (a, b, c), (d, e, f), (g, h, i) = turn
         x, y, z = (
             px + (a * x + b * y + c * z),
@@ -225,15 +229,15 @@ def _through(rays, ends, cell, poses, boxes, shape, pads, out):  # type: ignore[
 
 
 def through(
-    rays: Floats, ends: Floats, cell: Indices, poses: Floats, boxes: Floats, shape: Ints,
-    pads: Floats,
+    rays: Floats, ends: Floats, cell: Indices, number: Ints, poses: Floats, boxes: Floats,
+    shape: Ints, pads: Floats,
 ) -> tuple[Indices, Indices]:  # fmt: skip
     """Rays of cells (m,) that pass through boxes, and their numbers of cell and box.
 
-    Boxes (s, 6), `shape` of which (m,), have poses (12, m) and are larger by `pads` (m,); rays
-    (6, n) end at `ends`.
+    Boxes (s, 6), `shape` of which (m,), have the poses (12, p) of a `number` (m,) and are larger by
+    `pads` (m,); rays (6, n) end at `ends`.
     """
     cell, shape = np.ascontiguousarray(cell), np.ascontiguousarray(shape)
     pairs = np.empty((2, len(cell) * CELL), np.int64)
-    found = _through(rays, ends, cell, poses, boxes, shape, pads, pairs)
+    found = _through(rays, ends, cell, number, poses, boxes, shape, pads, pairs)
     return pairs[0, :found], pairs[1, :found]

@@ -20,6 +20,7 @@ from numpy.typing import ArrayLike
 from .arrays import Floats
 
 _FEW = 128  # numbers
+POWERS = np.ldexp(1.0, np.arange(-600, 601))  # of two
 
 
 def sin_cos_of(x: float) -> tuple[float, float]:
@@ -89,19 +90,21 @@ def sin_cos_of(x: float) -> tuple[float, float]:
 
 def exp_of(x: float) -> float:
     """Exponential of a number."""
-    if not x < 709.782712893384:
-        return x * math.inf if x == x else x
-    if x < -745.2:
-        return 0.0
-    k = math.floor(x * 1.4426950408889634 + 0.5)
-    high, low = x - k * 6.93147180369123816490e-01, k * 1.90821492927058770002e-10
+    # Without branches, so that loops become vector instructions.
+    within = x if x < 710.0 else 710.0
+    within = within if within > -746.0 else -746.0  # not a number, either
+    k = math.floor(within * 1.4426950408889634 + 0.5)
+    high, low = within - k * 6.93147180369123816490e-01, k * 1.90821492927058770002e-10
     y = high - low
     t = y * y
     c = 6.61375632143793436117e-05 + t * (
         -1.65339022054652515390e-06 + t * 4.13813679705723846039e-08
     )
     c = y - t * (1.66666666666666019037e-01 + t * (-2.77777777770155933842e-03 + t * c))
-    return math.ldexp(1.0 - ((low - (y * c) / (2.0 - c)) - high), k)
+    y = 1.0 - ((low - (y * c) / (2.0 - c)) - high)
+    half = k >> 1  # 2^1024 is no number
+    y = y * POWERS[half + 600] * POWERS[k - half + 600]
+    return y if x == x else x
 
 
 def log_of(x: float) -> float:

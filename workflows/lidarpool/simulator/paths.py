@@ -104,7 +104,9 @@ class Paths:
             beams, poses, window=window, t_min=nearest, t_max=reach, rays_out=rays
         )
         ray = found.ray.astype(np.int64)
-        origins, directions = rays.take(ray, axis=1).reshape(2, 3, -1).transpose(0, 2, 1)
+        directions, one = rays[3:].take(ray, axis=1).T, poses.start_at_once(beams)
+        origins = rays[:3].take(ray[:1] if one else ray, axis=1).T
+        origins = np.broadcast_to(origins, directions.shape)
         light = _Light(
             ray, poses.times(ray), origins, directions, np.ones(len(ray)), np.zeros(len(ray))
         )
