@@ -24,7 +24,7 @@ from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.optics import Returns
-from lidarpool.simulator.motion import into_axes
+from lidarpool.base.vectors import into_axes
 from lidarpool.simulator.rig import Rig
 from raybeam import moving_loops
 

@@ -19,7 +19,7 @@ from lidarpool.scenario.scenario import Scenario
 from lidarpool.scene.actors import box
 from lidarpool.sensor import Mounted
 from lidarpool.sensor.trajectory import presence_ns
-from lidarpool.simulator.motion import into_axes
+from lidarpool.base.vectors import into_axes
 from lidarpool.simulator.rig import Rig
 
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -195,6 +195,58 @@ def arccos(x: ArrayLike) -> Floats:
     return arctan2(np.sqrt((1 - x) * (1 + x)), x)
 
 
+def log1p(x: ArrayLike) -> Floats:
+    """Logarithms of 1 + x, exact for small x too (Kahan 1982)."""
+    x = np.asarray(x, np.float64)
+    near = 1 + x
+    off = near - 1
+    return np.asarray(np.where(off == 0, x, log(near) * (x / np.where(off == 0, 1, off))))[()]
+
+
+def expm1(x: ArrayLike) -> Floats:
+    """Exponentials of x, less 1, exact for small x too (Kahan 1982)."""
+    x = np.asarray(x, np.float64)
+    near = exp(x)
+    plain = (near == 1) | (near < 0.5) | (near > 2)
+    less = near - 1
+    found = less * (x / np.where(plain, 1, log(near)))
+    return np.where(near == 1, x, np.where(plain, less, found))[()]
+
+
+def power(x: ArrayLike, exponent: float) -> Floats:
+    """Powers of numbers above 0, or 0; of a large exponent less exact."""
+    return exp(exponent * log(x))
+
+
+def cbrt(x: ArrayLike) -> Floats:
+    """Cube roots of numbers other than 0; those of cubes are exact."""
+    size = np.abs(x)
+    root = power(size, 1 / 3)
+    root = root - (root * root * root - size) / (3 * root * root)  # Newton's method
+    return np.copysign(root, x)
+
+
+def geomspace(start: float, stop: float, count: int) -> Floats:
+    """Return numbers (count,) from one to another above 0 that have one ratio."""
+    out = start * exp(np.linspace(0, float(log(stop / start)), count))
+    out[-1] = stop
+    return out
+
+
+def interp(x: ArrayLike, at: Floats, values: Floats) -> Floats:
+    """Return values between those at ascending places (k,), and the first or last beyond."""
+    x = np.asarray(x, np.float64)
+    row = np.clip(np.searchsorted(at, x, "right") - 1, 0, max(len(at) - 2, 0))
+    slopes = np.diff(values, append=values[-1]) / np.diff(at, append=np.inf)
+    found = (x - at[row]) * slopes[row] + values[row]
+    return np.where(x < at[0], values[0], np.where(x >= at[-1], values[-1], found))
+
+
+def decade(x: float) -> int:
+    """Exponent of the largest power of ten that is at most a number above 0, of 16 digits."""
+    return int(f"{x:.15e}".partition("e")[2])
+
+
 def _each(
     name: str, one: Callable[..., Any], results: int, *given: ArrayLike
 ) -> tuple[Floats, ...]:

@@ -22,6 +22,7 @@ import numpy as np
 
 from ...base.allowance import LEAST, bytes_of, check_fits, memory_share
 from ...base.arrays import AnyArray, Bools, Floats
+from ...base.elementary import decade
 from ...base.vocabulary import UNITS_M
 from ...base.words import plural
 from ..scene_mesh import SceneMesh
@@ -384,8 +385,8 @@ def _check_size(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> Non
     step = grid.pixel_m
     while np.prod(np.ceil((high - low) / step) + 1) > 0.9 * most:
         step *= 1.1
-    digits = 2 - math.floor(math.log10(step))
-    step = math.ceil(step * 10**digits) / 10**digits
+    scale = float(f"1e{2 - decade(step)}")
+    step = math.ceil(step * scale) / scale
     coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "
