@@ -24,6 +24,8 @@ _FEW = 128  # numbers
 
 def sin_cos_of(x: float) -> tuple[float, float]:
     """Sine and cosine of an angle in radians, below 2^50."""
+    if not 0.0 < abs(x) < math.inf:
+        return (x, 1.0) if x == 0.0 else (math.nan, math.nan)
     # Less the multiple k of pi / 2, a sum of three numbers; products in two parts (Dekker 1971).
     k = float(math.floor(x * 0.6366197723675814 + 0.5))
     a = k * 134217729.0

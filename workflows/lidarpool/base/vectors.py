@@ -99,5 +99,6 @@ def rank(matrices: Floats) -> Ints:
     unit = matrices / np.where(largest > 0, largest, 1)[..., None, None]
     cofactors, size = adjugates(unit)
     lengths, areas = length(unit.reshape(shape)), length(cofactors.reshape(shape))
-    flat = ~(np.abs(size) > _FLAT * lengths * areas)
-    return np.asarray(3 - flat - ~(areas > _FLAT * lengths * lengths), np.int64)
+    thin = ~(areas > _FLAT * lengths * lengths)
+    flat = thin | ~(np.abs(size) > _FLAT * lengths * areas)
+    return np.asarray(3 - flat.astype(np.int64) - thin)

@@ -77,9 +77,7 @@ def _tables(leaf_angle: str | float) -> tuple[Floats, Floats, Floats]:
     turn = arccos(-np.minimum(along / np.maximum(across, 1e-300), 1))
     mean = (along * (2 * turn - np.pi) + 2 * across * sin(turn)) / np.pi
     square = along**2 + across**2 / 2
-    # To single precision, in which they are the same on every machine.
-    found = ((of * share).sum(axis=1) for of in (mean, square))
-    crossing, bright = (values.astype(np.float32).astype(np.float64) for values in found)
+    crossing, bright = ((of * share).sum(axis=1) for of in (mean, square))
     return cosine[:, 0], crossing, bright / crossing
 
 

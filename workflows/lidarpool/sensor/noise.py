@@ -335,7 +335,6 @@ def normal(
     """Numbers of mean 0 and variance 1, normally distributed: (n,); arguments as of `raw`.
 
     They are quantiles of 65,536 equal shares of the distribution, so none is beyond 4.3.
-    Logarithms and cosines of random numbers would not have the same bits on every machine.
     """
     return quantiles()[raw(seed, purpose, scan, ray, number) >> np.uint64(48)]
 
@@ -346,5 +345,5 @@ def quantiles() -> Floats:
     shares = (np.arange(2**15) + 0.5) / 2**16
     low = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([low, -low[::-1]])
-    # To single precision, in which logarithms are the same on every machine.
+    # To single precision, in which the logarithms of C libraries are the same.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

@@ -269,7 +269,7 @@ def highest(signals: Floats) -> Floats:
 
 
 def single(table: Floats) -> Floats:
-    """Round to single precision, in which exponentials are the same on every machine."""
+    """Round to single precision, in which the error functions of C libraries are the same."""
     return table.astype(np.float32).astype(np.float64)
 
 

@@ -439,7 +439,7 @@ def refracted(
 def depths(bits: NDArray[np.uint64]) -> Floats:
     """Exponentially distributed numbers of mean 1, from random bits: (n,).
 
-    The number of halvings and a table of 32,768 logarithms give the same on every machine.
+    By the number of halvings and a table of 32,768 logarithms, which is fast.
     """
     share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
     part, halvings = np.frexp(share)
