@@ -50,7 +50,11 @@ def test_it_is_within_units_of_the_last_place(name, limit):
     [
         ("sin", [0.0, -0.0, NAN, INF], [0.0, -0.0, NAN, NAN]),
         ("exp", [0.0, -0.0, 710, -750, INF, -INF, NAN], [1, 1, INF, 0, INF, 0, NAN]),
-        ("log", [0.0, -0.0, 1, INF, -1, NAN, 5e-324], [-INF, -INF, 0, INF, NAN, NAN, np.log(5e-324)]),
+        (
+            "log",
+            [0.0, -0.0, 1, INF, -1, NAN, 5e-324],
+            [-INF, -INF, 0, INF, NAN, NAN, np.log(5e-324)],
+        ),
         ("arcsin", [0.0, -0.0, 2, NAN], [0.0, -0.0, NAN, NAN]),
         ("arccos", [1.0, -1, 2, NAN], [0.0, np.pi, NAN, NAN]),
         ("log1p", [0.0, -0.0, -1], [0.0, -0.0, -INF]),
@@ -97,7 +101,9 @@ def test_small_helpers():
 
 def test_matrices():
     some = RNG.normal(size=(50, 3, 3))
-    np.testing.assert_allclose(matmul(some, inverse(some)), np.tile(np.eye(3), (50, 1, 1)), atol=1e-9)
+    np.testing.assert_allclose(
+        matmul(some, inverse(some)), np.tile(np.eye(3), (50, 1, 1)), atol=1e-9
+    )
     np.testing.assert_allclose(determinant(some), np.linalg.det(some), atol=1e-12)
     line, plane = np.outer([1, 2, 3.0], [0.3, 0.7, 0.1]), some[0] @ np.diag([1, 1, 0.0])
     given = np.stack([some[0], np.diag([1, 1e-9, 1e-12]), plane, line, np.eye(3) * 1e-200])

@@ -239,7 +239,8 @@ def interp(x: ArrayLike, at: Floats, values: Floats) -> Floats:
     """Return values between those at ascending places (k,), and the first or last beyond."""
     x = np.asarray(x, np.float64)
     row = np.clip(np.searchsorted(at, x, "right") - 1, 0, max(len(at) - 2, 0))
-    slopes = np.diff(values, append=values[-1]) / np.diff(at, append=np.inf)
+    with np.errstate(divide="ignore", invalid="ignore"):  # between equal places, of no use
+        slopes = np.diff(values, append=values[-1]) / np.diff(at, append=np.inf)
     found = (x - at[row]) * slopes[row] + values[row]
     return np.where(x < at[0], values[0], np.where(x >= at[-1], values[-1], found))
 
