@@ -157,7 +157,8 @@ def arctan2_of(y: float, x: float) -> float:
 
 def sin_cos(x: ArrayLike) -> tuple[Floats, Floats]:
     """Sines and cosines of angles in radians, of any shape."""
-    return _each("sin_cos", sin_cos_of, 2, x)
+    sine, cosine = _each("sin_cos", sin_cos_of, 2, x)
+    return sine, cosine
 
 
 def sin(x: ArrayLike) -> Floats:

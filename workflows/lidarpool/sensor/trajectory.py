@@ -77,7 +77,7 @@ class Pose:
             yaw = arctan2(rotation[1, 0], rotation[0, 0])
             roll = arctan2(rotation[2, 1], rotation[2, 2])
         else:  # straight up or down: yaw and roll have the same axis
-            yaw, roll = arctan2(-rotation[0, 1], rotation[1, 1]), 0.0
+            yaw, roll = arctan2(-rotation[0, 1], rotation[1, 1]), np.zeros(())
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
