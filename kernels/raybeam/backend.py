@@ -71,7 +71,7 @@ class Backend(ABC):
 
     @classmethod
     def build(cls) -> str:
-        """Versions and instruction set that its bits depend on, beside NumPy; "" for none."""
+        """Versions, and the like, that its bits depend on, beside NumPy's; "" for none."""
         return ""
 
     def __init__(self, scene: Scene, threads: int | None, device: int | None) -> None:

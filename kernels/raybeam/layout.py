@@ -132,7 +132,7 @@ def _records(corners: Floats) -> Floats32:
     """
     first = corners[:, 0]
     edge, other = corners[:, 1] - first, corners[:, 2] - first
-    e, g = np.linalg.norm(edge, axis=1), np.linalg.norm(other, axis=1)
+    e, g = (np.sqrt((side * side).sum(axis=1)) for side in (edge, other))
     out = np.empty((len(corners), 3, 4), np.float32)
     out[:, 0, :3], out[:, 1, :3], out[:, 2, :3] = first, edge, other
     out[:, 0, 3] = _UNIT * g * (48 + 24 * e) + _FLOOR

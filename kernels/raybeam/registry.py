@@ -23,7 +23,7 @@ def available_backends() -> dict[str, str]:
 
 
 def backend_build(name: str) -> str:
-    """Versions and instruction set that the bits of a backend depend on, beside NumPy.
+    """Describe what the bits of a backend depend on, beside NumPy's version.
 
     Two processes in which these and NumPy's are the same give the same hits, to the bit.
 

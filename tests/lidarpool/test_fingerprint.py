@@ -256,6 +256,6 @@ def test_the_first_difference_is_named():
     there = here | {"numpy": "1.0 with nothing"}
     assert difference(there, here) == f"numpy 1.0 with nothing, the run numpy {here['numpy']}"
     assert difference({}, here).startswith("lidarpool not installed, the run lidarpool 0.")
-    assert " with " in here["numpy"]  # the instruction sets
+    assert here["numpy"] == np.__version__  # and no instruction sets
     if not available_backends()["embree"]:
-        assert "vectors of" in software("embree")["backend"]
+        assert software("embree")["backend"].startswith("embree ")

@@ -20,11 +20,11 @@ from lidarpool import (
     Track,
     load_sensor,
 )
+from lidarpool.base.vectors import into_axes
 from lidarpool.run.job_source import identity_of
 from lidarpool.scenario.build import Job
 from lidarpool.scene.actors import Actor, box
 from lidarpool.sensor.optics import Returns
-from lidarpool.simulator.motion import into_axes
 from lidarpool.simulator.rig import Rig
 from raybeam import moving_loops
 

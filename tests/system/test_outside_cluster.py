@@ -47,7 +47,7 @@ def test_an_outside_cluster_gives_the_same_bytes(lidarpool, outside, tmp_path, a
 
 @pytest.mark.slow
 def test_a_worker_whose_embree_gives_other_bits_casts_nothing(outside, cluster_client, same_cloud):
-    """Another instruction set, for example: workers like most others cast."""
+    """Another version, for example: workers like most others cast."""
     expected = simulate(Scene.seed(), SURVEY, client=cluster_client, backend="numpy")
     cluster = outside()
     ours = [cluster.add(("GPU", 1)), cluster.add(("GPU", 1))]

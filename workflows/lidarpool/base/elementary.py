@@ -20,11 +20,13 @@ from numpy.typing import ArrayLike
 from .arrays import Floats
 
 _FEW = 128  # numbers
-POWERS = np.ldexp(1.0, np.arange(-600, 601))  # of two
+_TWO = np.ldexp(1.0, np.arange(-539, 514))  # powers of 2
 
 
 def sin_cos_of(x: float) -> tuple[float, float]:
     """Sine and cosine of an angle in radians, below 2^50."""
+    if not 0.0 < abs(x) < math.inf:
+        return (x, 1.0) if x == 0.0 else (math.nan, math.nan)
     # Less the multiple k of pi / 2, a sum of three numbers; products in two parts (Dekker 1971).
     k = float(math.floor(x * 0.6366197723675814 + 0.5))
     a = k * 134217729.0
@@ -102,8 +104,8 @@ def exp_of(x: float) -> float:
     )
     c = y - t * (1.66666666666666019037e-01 + t * (-2.77777777770155933842e-03 + t * c))
     y = 1.0 - ((low - (y * c) / (2.0 - c)) - high)
-    half = k >> 1  # 2^1024 is no number
-    y = y * POWERS[half + 600] * POWERS[k - half + 600]
+    half = k >> 1  # by two factors, neither of which overflows or is rounded
+    y = float(y * _TWO[half + 539] * _TWO[k - half + 539])
     return y if x == x else x
 
 
@@ -158,7 +160,8 @@ def arctan2_of(y: float, x: float) -> float:
 
 def sin_cos(x: ArrayLike) -> tuple[Floats, Floats]:
     """Sines and cosines of angles in radians, of any shape."""
-    return _each("sin_cos", sin_cos_of, 2, x)
+    sine, cosine = _each("sin_cos", sin_cos_of, 2, x)
+    return sine, cosine
 
 
 def sin(x: ArrayLike) -> Floats:
@@ -196,6 +199,59 @@ def arccos(x: ArrayLike) -> Floats:
     """Angles with these cosines, radians."""
     x = np.asarray(x, np.float64)
     return arctan2(np.sqrt((1 - x) * (1 + x)), x)
+
+
+def log1p(x: ArrayLike) -> Floats:
+    """Logarithms of 1 + x, exact for small x too (Kahan 1982)."""
+    x = np.asarray(x, np.float64)
+    near = 1 + x
+    off = near - 1
+    return np.asarray(np.where(off == 0, x, log(near) * (x / np.where(off == 0, 1, off))))[()]
+
+
+def expm1(x: ArrayLike) -> Floats:
+    """Exponentials of x, less 1, exact for small x too (Kahan 1982)."""
+    x = np.asarray(x, np.float64)
+    near = exp(x)
+    plain = (near == 1) | (near < 0.5) | (near > 2)
+    less = near - 1
+    found = less * (x / np.where(plain, 1, log(near)))
+    return np.where(near == 1, x, np.where(plain, less, found))[()]
+
+
+def power(x: ArrayLike, exponent: float) -> Floats:
+    """Powers of numbers above 0, or 0; of a large exponent less exact."""
+    return exp(exponent * log(x))
+
+
+def cbrt(x: ArrayLike) -> Floats:
+    """Cube roots of numbers other than 0; those of cubes are exact."""
+    size = np.abs(x)
+    root = power(size, 1 / 3)
+    root = root - (root * root * root - size) / (3 * root * root)  # Newton's method
+    return np.copysign(root, x)
+
+
+def geomspace(start: float, stop: float, count: int) -> Floats:
+    """Return numbers (count,) from one to another above 0 that have one ratio."""
+    out = start * exp(np.linspace(0, float(log(stop / start)), count))
+    out[-1] = stop
+    return out
+
+
+def interp(x: ArrayLike, at: Floats, values: Floats) -> Floats:
+    """Return values between those at ascending places (k,), and the first or last beyond."""
+    x = np.asarray(x, np.float64)
+    row = np.clip(np.searchsorted(at, x, "right") - 1, 0, max(len(at) - 2, 0))
+    with np.errstate(divide="ignore", invalid="ignore"):  # between equal places, of no use
+        slopes = np.diff(values, append=values[-1]) / np.diff(at, append=np.inf)
+    found = (x - at[row]) * slopes[row] + values[row]
+    return np.where(x < at[0], values[0], np.where(x >= at[-1], values[-1], found))
+
+
+def decade(x: float) -> int:
+    """Exponent of the largest power of ten that is at most a number above 0, of 16 digits."""
+    return int(f"{x:.15e}".partition("e")[2])
 
 
 def _each(

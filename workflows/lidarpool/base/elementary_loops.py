@@ -1,7 +1,6 @@
 """The functions of `elementary`, compiled."""
 
 # mypy: disable-error-code="no-untyped-def"
-# ruff: noqa: D103
 
 from __future__ import annotations
 
@@ -15,23 +14,27 @@ arctan2 = inlined(elementary.arctan2_of)
 
 @compiled()
 def sin_cos_each(x, sine, cosine):
+    """Sines and cosines of numbers (n,)."""
     for k in range(len(x)):
         sine[k], cosine[k] = sin_cos(x[k])
 
 
 @compiled()
 def exp_each(x, out):
+    """Exponentials of numbers (n,)."""
     for k in range(len(x)):
         out[k] = exp(x[k])
 
 
 @compiled()
 def log_each(x, out):
+    """Logarithms of numbers (n,)."""
     for k in range(len(x)):
         out[k] = log(x[k])
 
 
 @compiled()
 def arctan2_each(y, x, out):
+    """Angles of vectors (n,) and (n,)."""
     for k in range(len(x)):
         out[k] = arctan2(y[k], x[k])

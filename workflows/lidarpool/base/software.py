@@ -24,21 +24,18 @@ T = TypeVar("T")
 PACKAGES = ("lidarpool", "poolpart", "raybeam")
 IMPORTED = time.time()  # in a forked worker, when the fork server imported it
 CLOCKS_S = 5.0  # clocks of a file server and of this machine may differ by so much
-# NumPy's functions whose last bits differ between instruction sets.
-_FUNCTIONS = "^(exp|log|arcsin|arccos|tan|power)$"
 
 
 def software(backend: str = "") -> dict[str, str]:
     """Describe the software of this process: equal software gives equal bytes.
 
     ``lidarpool`` is its version and a hash of the installed sources. Where it casts with a
-    ray-casting `backend`, ``numpy`` and ``backend`` are versions and instruction sets as well.
+    ray-casting `backend`, ``numpy`` and ``backend`` are versions. Processors do not matter: no byte
+    comes from a function whose last bits depend on them, see `elementary` and `vectors`.
     """
     found = {"lidarpool": f"{__version__} (sources {sources()})"}
     if backend:
-        kernels = np.lib.introspect.opt_func_info(func_name=_FUNCTIONS, signature="float64")
-        used = {str(types["current"]) for by in kernels.values() for types in by.values()}
-        found["numpy"] = f"{np.__version__} with {' and '.join(sorted(used)) or 'no SIMD'}"
+        found["numpy"] = np.__version__
         found["backend"] = f"{backend} {backend_build(backend)}".strip()
     return found
 

@@ -21,6 +21,7 @@ import numpy as np
 
 from ..base.archives import read_array, read_arrays
 from ..base.arrays import AnyArray, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..base.elementary import decade
 from ..base.errors import LidarpoolError
 from ..base.sampling import even_indices
 from ..base.storage import Storage, target_of
@@ -348,5 +349,5 @@ def positions(cells: Integers, precision_m: float, origin: Floats) -> Floats:
     """World coordinates, (n, 3), of points in these cells, (n, 3)."""
     found = cells * precision_m + origin
     # Multiplying gives 0.07000000000000001 for 0.07; take the nearest short decimal.
-    digits = max(0, int(np.ceil(-np.log10(precision_m))) + 3)
+    digits = max(0, 3 - decade(precision_m))
     return np.round(found, digits, out=found)

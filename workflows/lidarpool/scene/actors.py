@@ -10,6 +10,7 @@ import numpy as np
 from ..base.arrays import Floats, Indices
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
+from ..base.vectors import turned
 from ..sensor import Stations, Trajectory
 from ..sensor.trajectory import CENTRE, presence_ns, quaternions_of
 from .colours import joined
@@ -56,7 +57,7 @@ class Actor:
     def placed(self, time_ns: float) -> SceneMesh:
         """Its mesh at a time, in the scene's local coordinates; one point if it is absent."""
         positions, rotations = self.trajectory.poses(0, np.array([time_ns]))
-        vertices = self.mesh.vertices if rotations is None else self.mesh.vertices @ rotations[0].T
+        vertices = turned(self.mesh.vertices, None if rotations is None else rotations[0])
         first, last = presence_ns(self.trajectory)
         vertices = vertices if first <= time_ns <= last else 0 * vertices
         # Masks do not show.

@@ -11,7 +11,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Bytes, Floats, Floats32, Integers, Ints, Ints32, UInts32
+from ..base.elementary import power
 from ..base.errors import LidarpoolError
+from ..base.vectors import matmul
 from ..base.words import plural
 
 # What has no colour is grey, of half of the light, as the default reflectance is.
@@ -23,7 +25,7 @@ _FLAT = 1e-200  # m⁴: the square of the area of a triangle that no ray hits, t
 
 _byte = np.arange(256) / 255
 # {sRGB byte: linear light}, IEC 61966-2-1
-LINEAR = np.where(_byte <= 0.04045, _byte / 12.92, ((_byte + 0.055) / 1.055) ** 2.4)
+LINEAR = np.where(_byte <= 0.04045, _byte / 12.92, power((_byte + 0.055) / 1.055, 2.4))
 _EDGES = (LINEAR[:-1] + LINEAR[1:]) / 2
 
 
@@ -88,8 +90,8 @@ class Colours:
     def divided(self, rows: Integers, weights: Floats) -> Colours:
         """Colours of pieces of faces (k,), whose corners have these weights of theirs (k, 3, 3)."""
         whole = self.take(rows)
-        uv = None if whole.uv is None else (weights @ whole.uv).astype(np.float32)
-        corners = None if whole.corners is None else (weights @ whole.corners).astype(np.uint8)
+        uv = None if whole.uv is None else matmul(weights, whole.uv).astype(np.float32)
+        corners = None if whole.corners is None else matmul(weights, whole.corners).astype(np.uint8)
         return replace(whole, uv=uv, corners=corners)
 
     def mirrored(self) -> Colours:

@@ -16,6 +16,7 @@ from PIL import Image
 
 from ..base.arrays import AnyArray, Bytes, Floats, Indices
 from ..base.errors import LidarpoolError
+from ..base.vectors import applied, matmul, turned
 from .colours import LINEAR
 from .files.meshfile import GENERATOR
 from .scene import Scene
@@ -87,9 +88,9 @@ class _Writer:
         if isinstance(parts[0], SceneInstance):
             turn = np.eye(4)
             turn[:3, :3] = UP_AXES["y"].T
-            node["matrix"] = (turn @ parts[0].matrix @ turn.T).T.ravel().tolist()
+            node["matrix"] = matmul(matmul(turn, parts[0].matrix), turn.T).T.ravel().tolist()
         elif far:
-            node["translation"] = (self._origin @ UP_AXES["y"]).tolist()
+            node["translation"] = applied(UP_AXES["y"].T, self._origin).tolist()
         self._tree["scenes"][0]["nodes"].append(self._put("nodes", node))
 
     def _primitives(self, mesh: SceneMesh) -> list[dict[str, Any]]:
@@ -108,7 +109,9 @@ class _Writer:
                     tints = shown.corners
             if uv is None and tints is None:
                 if points is None:
-                    points = self._array((mesh.vertices @ UP_AXES["y"]).astype("<f4"), "VEC3")
+                    points = self._array(
+                        turned(mesh.vertices, UP_AXES["y"].T).astype("<f4"), "VEC3"
+                    )
                 faces = self._array(mesh.faces[rows].astype("<u4").reshape(-1, 1), "SCALAR")
                 primitive: dict[str, Any] = {"attributes": {"POSITION": points}, "indices": faces}
             else:
@@ -133,7 +136,7 @@ class _Writer:
         tints: Bytes | None,
     ) -> dict[str, int]:
         """Attributes of some triangles (k,), whose corners have their own (k, 3, …)."""
-        corners = mesh.vertices[mesh.faces[rows]].reshape(-1, 3) @ UP_AXES["y"]
+        corners = turned(mesh.vertices[mesh.faces[rows]].reshape(-1, 3), UP_AXES["y"].T)
         attributes = {"POSITION": self._array(corners.astype("<f4"), "VEC3")}
         if uv is not None:
             attributes["TEXCOORD_0"] = self._array(uv.reshape(-1, 2).astype("<f4"), "VEC2")

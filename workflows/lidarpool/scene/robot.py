@@ -13,8 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
+from ..base.elementary import interp, sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked
+from ..base.vectors import applied, matmul
 from ..base.words import did_you_mean, plural, printable
 from ..sensor import Pose, Stations, Trajectory
 from ..sensor.calibrations import text_of
@@ -185,7 +187,9 @@ class Robot:
             for link in self.links:
                 if (joint := self.joints.get(link)) is not None:
                     body, place = owner[joint.parent]
-                    owner[link] = (link, np.eye(4)) if joint.moves else (body, place @ joint.origin)
+                    owner[link] = (
+                        (link, np.eye(4)) if joint.moves else (body, matmul(place, joint.origin))
+                    )
                 if (mesh := self.meshes.get(link)) is not None:
                     body, place = owner[link]
                     names.setdefault(body, link)
@@ -206,16 +210,17 @@ class Robot:
         hinges: list[Hinge] = []
         place = np.eye(4)
         for joint in chain:
-            place = place @ joint.origin
+            place = matmul(place, joint.origin)
             if joint.moves:
                 value, slides = values[joint.name], joint.kind == "prismatic"
                 if np.ptp(value):
                     hinges.append(Hinge(place, joint.axis, slides, value))
                     place = np.eye(4)
                 elif slides:
-                    place[:3, 3] += place[:3, :3] @ (joint.axis * value[0])
+                    place[:3, 3] += applied(place[:3, :3], joint.axis * value[0])
                 elif value[0]:
-                    place[:3, :3] = place[:3, :3] @ rotation_about(joint.axis, np.degrees(value[0]))
+                    turn = rotation_about(joint.axis, np.degrees(value[0]))
+                    place[:3, :3] = matmul(place[:3, :3], turn)
         if not hinges and (place == np.eye(4)).all():
             return base
         if not hinges and isinstance(base, Stations):
@@ -402,7 +407,7 @@ class LinkPath:
         start = place
         for hinge in self.hinges:
             place, turn = _then(place, turn, hinge.before)
-            value = np.interp(at, self.times_s, hinge.values)
+            value = interp(at, self.times_s, hinge.values)
             if moving:
                 start, velocity = place, velocity + _cross(rate, place - start)
                 along = _times(turn, hinge.axis[:, None, None] * self._slopes(hinge, at))[:, 0]
@@ -412,8 +417,9 @@ class LinkPath:
                     velocity = velocity + along
             else:  # Rodrigues, 1840
                 cross = np.cross(np.eye(3), hinge.axis)
-                square = cross @ cross
-                spin = np.sin(value) * cross[..., None] + (1 - np.cos(value)) * square[..., None]
+                square = matmul(cross, cross)
+                sine, cosine = sin_cos(value)
+                spin = sine * cross[..., None] + (1 - cosine) * square[..., None]
                 turn = _times(turn, spin + np.eye(3)[..., None])
                 if moving:
                     rate = rate + along

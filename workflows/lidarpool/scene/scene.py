@@ -14,6 +14,7 @@ import numpy as np
 from ..base.arrays import Bools, Floats, Ints32
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked, checked_fields, shown
+from ..base.vectors import hypot
 from ..base.words import plural
 from ..sensor import Pose, Track
 from . import colours as coloured
@@ -478,7 +479,7 @@ class Scene:
         reach = np.zeros(len(self.names))
         for corner in range(3):
             offset = self.vertices[self.faces[:, corner], :2] - centres[self.face_object]
-            np.maximum.at(reach, self.face_object, np.hypot(*offset.T))
+            np.maximum.at(reach, self.face_object, hypot(*offset.T))
         if (shared := self.instances) is not None:
             np.maximum.at(reach, shared.owner, shared.reach(centres[shared.owner]))
         return np.column_stack([centres, reach])

@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from ..base.arrays import AnyArray, AnyFloats, Bools, Floats, Floats32, Integers, Ints
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked_fields
+from ..base.vectors import determinant, length, matmul, rank, turned
 from .colours import Colours
 
 UV_MOST = 1 << 30  # texture coordinates beyond this have no digits left
@@ -56,7 +57,7 @@ class Voxels:
     def moved(self, linear: Floats, offset: Floats) -> Voxels:
         """Return it at p -> linear @ p + offset; the densities are shared, and stay per m³."""
         shift = np.pad(offset[:, None], ((0, 0), (3, 0)))
-        return Voxels(self.density, linear @ self.matrix + shift)
+        return Voxels(self.density, matmul(linear, self.matrix) + shift)
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,12 +127,14 @@ class SceneMesh:
     def moved(self, name: str, linear: Floats, offset: Floats) -> SceneMesh:
         """Return a renamed copy at p -> linear @ p + offset, with faces still outward."""
         faces, cutouts, colours = self.faces, self.cutouts, self.colours
-        if np.linalg.det(linear) < 0:
+        if determinant(linear) < 0:
             faces = faces[:, ::-1]
             cutouts = tuple(replace(cut, uv=cut.uv[:, ::-1]) for cut in cutouts)
             colours = colours and colours.mirrored()
         voxels = self.voxels and self.voxels.moved(linear, offset)
-        return SceneMesh(name, self.vertices @ linear.T + offset, faces, cutouts, colours, voxels)
+        return SceneMesh(
+            name, turned(self.vertices, linear) + offset, faces, cutouts, colours, voxels
+        )
 
 
 def _check_voxels(name: str, voxels: Voxels) -> None:
@@ -140,7 +143,7 @@ def _check_voxels(name: str, voxels: Voxels) -> None:
     well = well and max(density.shape) <= VOXELS_MOST
     well = well and bool(0 <= density.min() <= density.max() <= DENSEST)
     well = well and matrix.shape == (3, 4) and bool(np.isfinite(matrix).all())
-    if not well or np.linalg.matrix_rank(matrix[:, :3]) < 3:
+    if not well or rank(matrix[:, :3]) < 3:
         raise LidarpoolError(
             f"The voxels of {name!r} are {density.dtype} {density.shape}, with a matrix "
             f"{matrix.shape}; they must be float32 (nx, ny, nz), {VOXELS_MOST:,} at most along "
@@ -208,5 +211,5 @@ def points_array(name: str, points: ArrayLike) -> Floats:
 def triangle_areas(corners: AnyFloats) -> Floats:
     """Areas (n,) of triangles with these corners (n, 3, 3)."""
     sides = corners[:, 1:] - corners[:, :1]
-    doubled = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
+    doubled = length(np.cross(sides[:, 0], sides[:, 1]))
     return np.asarray(doubled / 2, np.float64)

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats, Ints
+from ..base.elementary import cos, interp, sin, sin_cos
+from ..base.vectors import length
 from .scene_mesh import SceneMesh
 
 SEED_RADIUS_M = 2.0
@@ -56,7 +58,7 @@ def seed_objects(rings: int = SEED_RINGS, segments: int = SEED_SEGMENTS) -> tupl
     `2 * rings * segments` triangles: by default 76,800 in all.
     """
     angles = np.linspace(-np.pi / 2, np.pi / 2, rings + 2)
-    sphere = SEED_RADIUS_M * np.stack([np.cos(angles), 1 + np.sin(angles)], axis=1)
+    sphere = SEED_RADIUS_M * np.stack([cos(angles), 1 + sin(angles)], axis=1)
     profiles = {"Sphere": sphere} | {
         name: resample(smooth(outline), rings + 2) for name, outline in SEED_OUTLINES.items()
     }
@@ -83,8 +85,8 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
     azimuth = 2 * np.pi * np.arange(segments) / segments
     radius, height = line[1:-1].T
     around = np.empty((rings, segments, 3))
-    around[..., 0] = radius[:, None] * np.cos(azimuth)
-    around[..., 1] = radius[:, None] * np.sin(azimuth)
+    around[..., 0] = radius[:, None] * cos(azimuth)
+    around[..., 1] = radius[:, None] * sin(azimuth)
     around[..., 2] = height[:, None]
     poles = [[0.0, 0.0, line[0, 1]], [0.0, 0.0, line[-1, 1]]]
     vertices = np.concatenate([around.reshape(-1, 3), poles])
@@ -94,7 +96,7 @@ def revolve(profile: ArrayLike, segments: int, name: str = "Revolved") -> SceneM
 def capsule(radius: float, height: float, segments: int, name: str) -> SceneMesh:
     """Make a ball around zero that is drawn apart at its equator by a height, which may be zero."""
     angles = np.linspace(-np.pi / 2, np.pi / 2, segments // 2 + 1)
-    ball, up = radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), [0, height / 2]
+    ball, up = radius * np.stack(sin_cos(angles)[::-1], axis=1), [0, height / 2]
     middle = segments // 4
     profile = np.concatenate([ball[: middle + bool(height)] - up, ball[middle:] + up])
     return revolve(profile, segments, name)
@@ -139,6 +141,6 @@ def smooth(outline: ArrayLike, rounds: int = 5) -> Floats:
 def resample(line: ArrayLike, count: int) -> Floats:
     """Place points (count, d) at equal distances along a polyline (n, d), both ends included."""
     points = np.asarray(line, dtype=np.float64)
-    length = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    at = np.linspace(0.0, length[-1], count)
-    return np.stack([np.interp(at, length, column) for column in points.T], axis=1)
+    along = np.concatenate([[0.0], np.cumsum(length(np.diff(points, axis=0)))])
+    at = np.linspace(0.0, along[-1], count)
+    return np.stack([interp(at, along, column) for column in points.T], axis=1)

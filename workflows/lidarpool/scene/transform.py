@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
+from ..base.elementary import sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array
+from ..base.vectors import length, matmul, rank
 from ..sensor import Pose
 
 # Proper rotations that take the named axis to +z; the rows hold only 0 and ±1, so that
@@ -23,9 +26,9 @@ UP_AXES = {
 
 def rotation_about(axis: ArrayLike, degrees: float) -> Floats:
     """Rotation (3, 3) about an axis, which has a length (Rodrigues 1840)."""
-    cross = np.cross(np.eye(3), np.array(axis) / np.linalg.norm(axis))
-    angle = np.radians(degrees)
-    turn: Floats = np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+    cross = np.cross(np.eye(3), np.array(axis) / length(np.array(axis, np.float64)))
+    sine, cosine = sin_cos_of(math.radians(degrees))
+    turn: Floats = sine * cross + (1 - cosine) * matmul(cross, cross)
     return np.eye(3) + turn
 
 
@@ -58,7 +61,7 @@ class Transform:
             )
         if not (np.isfinite(linear).all() and np.isfinite(offset).all()):
             raise LidarpoolError("A transform must be of finite numbers.")
-        if np.linalg.matrix_rank(linear) < 3:
+        if rank(linear) < 3:
             raise LidarpoolError("The transform flattens the mesh: its matrix has no inverse.")
         object.__setattr__(self, "linear", linear)
         object.__setattr__(self, "offset", offset)

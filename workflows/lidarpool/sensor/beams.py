@@ -13,6 +13,7 @@ from pydantic import Field
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import about
+from ..base.elementary import cos, sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked, checked_fields
 
@@ -81,7 +82,7 @@ class Beams:
         """
         angle = radians_per_ns * self.time_ns
         x, y, z = self.origin.T
-        cos, sin = np.cos(angle), np.sin(angle)
+        sin, cos = sin_cos(angle)
         origin = np.column_stack([cos * x - sin * y, sin * x + cos * y, z])
         return Beams(self.elevation, self.azimuth + angle, self.time_ns, origin)
 
@@ -225,7 +226,7 @@ class Mirror(Spin):
         """See `Head.azimuths`."""
         phase = self._within(firings) / self.firings_per_turn
         if self.motion == "sine":
-            place = -np.cos(2 * np.pi * phase) / 2
+            place = -cos(2 * np.pi * phase) / 2
         elif self.motion == "triangle":
             place = 0.5 - np.abs(2 * phase - 1)
         else:

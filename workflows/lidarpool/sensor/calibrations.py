@@ -14,6 +14,7 @@ import yaml
 
 from ..base.allowance import check_fits
 from ..base.arrays import Floats
+from ..base.elementary import sin_cos
 from ..base.errors import LidarpoolError
 from ..base.yamlfile import load_yaml
 from .beams import Beams
@@ -101,8 +102,9 @@ def _velodyne(name: str, data: Any) -> Calibration:
         ]
     ).T
     # Offsets at right angles to the beam, upwards and to the left.
-    ahead, cos, sin = -up * np.sin(elevation), np.cos(azimuth), np.sin(azimuth)
-    origin = [ahead * cos - left * sin, ahead * sin + left * cos, up * np.cos(elevation)]
+    (rise, level), (sin, cos) = sin_cos(elevation), sin_cos(azimuth)
+    ahead = -up * rise
+    origin = [ahead * cos - left * sin, ahead * sin + left * cos, up * level]
     beams = Beams(elevation, azimuth, origin=np.column_stack(origin))
     return Calibration(name, "velodyne", beams)
 
@@ -212,8 +214,8 @@ def _livox(name: str, rows: Floats) -> Calibration:
     back = np.flatnonzero(np.diff(times) < 0)
     if len(back):
         raise ValueError(f"times go back in line {back[0] + 3}")
-    level = np.sin(zenith)
-    rays = np.column_stack([level * np.cos(azimuth), level * np.sin(azimuth), np.cos(zenith)])
+    (level, up), (sin, cos) = sin_cos(zenith), sin_cos(azimuth)
+    rays = np.column_stack([level * cos, level * sin, up])
     if len(times) < 2 or (np.diff(times) == 1).all():
         return Calibration(name, "livox", rays=rays)
     shot_ns = (times - times[0]) * 1e9

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from ..base.arrays import Floats, Indices
+from ..base.elementary import log1p, sin_cos
 
 # {sub-rays: distance from the middle, as a share of the radius, and angle in degrees, of a sixth of
 # them}; the others are turned by multiples of 60 degrees, and one is in the middle. They were found
@@ -65,7 +66,8 @@ def _places(count: int) -> Floats:
     # have the disc's mean; the energy of a return from any plane, and its range, are such.
     radius *= np.sqrt(count / 2 / (6 * (radius**2).sum()))
     angles = np.radians(angle + 60 * np.arange(6)[:, None])
-    points = np.stack([radius * np.cos(angles), radius * np.sin(angles)], axis=-1)
+    sines, cosines = sin_cos(angles)
+    points = np.stack([radius * cosines, radius * sines], axis=-1)
     return np.concatenate([np.zeros((1, 2)), points.reshape(-1, 2)])
 
 
@@ -81,7 +83,7 @@ def _gaussian_places(count: int) -> Floats:
     """
     places = _places(count)
     share = (places**2).sum(axis=1)
-    outwards = np.sqrt(-np.log1p(-share[1:]) / 2 / share[1:])
+    outwards = np.sqrt(-log1p(-share[1:]) / 2 / share[1:])
     places = np.concatenate([places[:1], places[1:] * outwards[:, None]])
     return np.asarray(places * np.sqrt(count / 2 / (places**2).sum()))
 

@@ -14,6 +14,7 @@ from pydantic import Field
 
 from ..base.arrays import Floats
 from ..base.declared import allowed
+from ..base.elementary import arccos, arcsin, cos, interp, log, sin, sin_cos
 
 LeafAngles = Literal[
     "spherical", "planophile", "erectophile", "plagiophile", "extremophile", "uniform"
@@ -36,47 +37,47 @@ def density(leaf_angle: str | float, angle: Floats) -> Floats:
     With "spherical", normals point everywhere alike. A number is that of Campbell (1990): normals
     as those of an ellipsoid, its horizontal axis so many times the vertical one; 1 is spherical.
     """
+    sine, cosine = sin_cos(angle)
     if leaf_angle == "spherical":
-        return np.sin(angle)
+        return sine
     if isinstance(leaf_angle, str):
         wave = {
-            "planophile": 1 + np.cos(2 * angle),
-            "erectophile": 1 - np.cos(2 * angle),
-            "plagiophile": 1 - np.cos(4 * angle),
-            "extremophile": 1 + np.cos(4 * angle),
+            "planophile": 1 + cos(2 * angle),
+            "erectophile": 1 - cos(2 * angle),
+            "plagiophile": 1 - cos(4 * angle),
+            "extremophile": 1 + cos(4 * angle),
             "uniform": np.ones_like(angle),
         }[leaf_angle]
         return np.asarray(2 / np.pi * wave)
     x = float(leaf_angle)
-    shape = np.sin(angle) / (np.cos(angle) ** 2 + (x * np.sin(angle)) ** 2) ** 2
+    shape = sine / (cosine**2 + (x * sine) ** 2) ** 2
     if x == 1:
         return np.asarray(shape)
     if x < 1:
-        e = np.sqrt(1 - x**2)
-        axes = x + np.arcsin(e) / e
+        e = np.sqrt(1 - x * x)
+        axes = x + arcsin(e) / e
     else:
-        e = np.sqrt(1 - x**-2)
-        axes = x + np.log((1 + e) / (1 - e)) / (2 * e * x)
-    return np.asarray(2 * x**3 / axes * shape)
+        e = np.sqrt(1 - 1 / (x * x))
+        axes = x + log((1 + e) / (1 - e)) / (2 * e * x)
+    return np.asarray(2 * (x * x * x) / axes * shape)
 
 
 @cache
 def _tables(leaf_angle: str | float) -> tuple[Floats, Floats, Floats]:
     """Cosines of light from the vertical, and for them what `projection` and `brightness` are."""
-    cosine = np.sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
+    cosine = sin(np.linspace(0, np.pi / 2, _NODES))[:, None]
     angle = (np.arange(_ANGLES, dtype=np.float64) + 0.5) * (np.pi / 2 / _ANGLES)
     share = density(leaf_angle, angle)
     share /= share.sum()
     # Cosine between light and a leaf's normal: `along + across * cos(azimuth)`.
-    along = cosine * np.cos(angle)
-    across = np.sqrt(np.maximum(1 - cosine**2, 0)) * np.sin(angle)
+    of_leaf = sin_cos(angle)
+    along = cosine * of_leaf[1]
+    across = np.sqrt(np.maximum(1 - cosine**2, 0)) * of_leaf[0]
     # Its mean size over all azimuths (Ross 1981): beyond `turn`, light meets the other side.
-    turn = np.arccos(-np.minimum(along / np.maximum(across, 1e-300), 1))
-    mean = (along * (2 * turn - np.pi) + 2 * across * np.sin(turn)) / np.pi
+    turn = arccos(-np.minimum(along / np.maximum(across, 1e-300), 1))
+    mean = (along * (2 * turn - np.pi) + 2 * across * sin(turn)) / np.pi
     square = along**2 + across**2 / 2
-    # To single precision, in which they are the same on every machine.
-    found = ((of * share).sum(axis=1) for of in (mean, square))
-    crossing, bright = (values.astype(np.float32).astype(np.float64) for values in found)
+    crossing, bright = ((of * share).sum(axis=1) for of in (mean, square))
     return cosine[:, 0], crossing, bright / crossing
 
 
@@ -91,7 +92,7 @@ def projection(leaf_angle: str | float, cosine: Floats) -> Floats:
     [0.5, 0.5, 0.5]
     """
     nodes, found, _ = _tables(leaf_angle)
-    return np.interp(cosine, nodes, found)
+    return interp(cosine, nodes, found)
 
 
 def brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
@@ -101,4 +102,4 @@ def brightness(leaf_angle: str | float, cosine: Floats) -> Floats:
     thirds for "spherical", whatever the direction.
     """
     nodes, _, found = _tables(leaf_angle)
-    return np.interp(cosine, nodes, found)
+    return interp(cosine, nodes, found)

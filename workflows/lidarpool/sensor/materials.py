@@ -18,6 +18,7 @@ from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
+from ..base.elementary import exp, power
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from ..base.words import did_you_mean
@@ -413,7 +414,7 @@ def gloss(cosine: Floats, roughness: Floats) -> Floats:
     is the square of the roughness, as in glTF 2.0. With light and receiver in one direction, their
     π D G / (4 cos θ) is what is left here. Multiply it by the reflection at right angles.
     """
-    width, square = roughness**4, cosine**2
+    width, square = np.square(roughness**2), cosine**2
     spread = 1 - square * (1 - width)
     return np.asarray(width / (4 * spread**2 * np.sqrt(square + width * (1 - square))))
 
@@ -424,7 +425,7 @@ def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
     `index` is the refractive index behind the surface over that before it; all light is reflected
     where it is below 1 and the cosine is small.
     """
-    inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / index**2, 0.0))
+    inside = np.sqrt(np.maximum(1 - (1 - cosine**2) / (index * index), 0.0))
     across = (cosine - index * inside) / (cosine + index * inside)
     along = (inside - index * cosine) / (inside + index * cosine)
     return np.asarray((across**2 + along**2) / 2)
@@ -433,8 +434,8 @@ def fresnel(cosine: Floats, index: float | Floats = GLASS_INDEX) -> Floats:
 def at_right_angles(distance: Any, extinction: float = 0.0) -> Any:
     """Energy returned by white surfaces hit at right angles, by distance in metres."""
     distance = np.maximum(distance, NEAREST_M)
-    nearer = (REFERENCE_M / distance) ** 2
-    return nearer * np.exp(-2 * extinction * distance) if extinction else nearer
+    nearer = np.square(REFERENCE_M / distance)
+    return nearer * exp(-2 * extinction * distance) if extinction else nearer
 
 
 def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
@@ -451,5 +452,5 @@ def extinction(visibility_km: float | None, wavelength_nm: float) -> float:
     v = visibility_km
     if v is None:
         return 0.0
-    q = 1.6 if v > 50 else 1.3 if v > 6 else 0.585 * v ** (1 / 3)
-    return float(3.91 / v * (wavelength_nm / 550) ** -q / 1000)
+    q = 1.6 if v > 50 else 1.3 if v > 6 else 0.585 * float(power(v, 1 / 3))
+    return float(3.91 / v * float(power(wavelength_nm / 550, -q)) / 1000)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import fields
 from fractions import Fraction
 from functools import cache
@@ -16,6 +17,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, model_valida
 
 from ..base.allowance import check_fits
 from ..base.arrays import Floats
+from ..base.elementary import log1p
 from ..base.errors import LidarpoolError
 from ..base.validation import checked, sentences
 from ..base.words import did_you_mean
@@ -109,9 +111,9 @@ class Detection(_ModelSection):
     @property
     def threshold_m(self) -> float:
         """Range at which a surface of 10 % reflectance returns half of the pulses."""
-        same = self.range_m * (TARGET_REFLECTANCE / self.reflectance) ** 0.5
+        same = self.range_m * math.sqrt(TARGET_REFLECTANCE / self.reflectance)
         needed = 1 + NormalDist().inv_cdf(self.probability) / THRESHOLD_SIGMAS
-        return float(same * max(needed, 0.0) ** 0.5)
+        return float(same * math.sqrt(max(needed, 0.0)))
 
 
 class Performance(_ModelSection):
@@ -161,7 +163,7 @@ class Performance(_ModelSection):
                 near, far = self._by_energy(self.detection.threshold_m)
                 made |= {"range_m": near, "range_at_threshold_m": far}
         if self.false_alarms is not None:
-            made["false_alarm_hz"] = -float(np.log1p(-self.false_alarms)) / gate_s
+            made["false_alarm_hz"] = -float(log1p(-self.false_alarms)) / gate_s
         return Noise(**made, seed=seed)
 
     def _by_energy(self, threshold_m: float) -> tuple[float, float]:
@@ -169,7 +171,7 @@ class Performance(_ModelSection):
         assert self.precision is not None
         # The threshold over the energy: it grows with the square of the range.
         weak = [
-            TARGET_REFLECTANCE / one.reflectance * (one.range_m / threshold_m) ** 2
+            TARGET_REFLECTANCE / one.reflectance * np.square(one.range_m / threshold_m)
             for one in self.precision
         ]
         (x, y), (s, t) = np.square(weak), np.square([one.sigma_m for one in self.precision])

@@ -24,8 +24,10 @@ from pydantic import Field, Strict
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import Seed, about
+from ..base.elementary import arctan2, exp_of, sin_cos, sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
+from ..base.vectors import applied, hypot, into_axes, length, matmul
 from .noise import Purpose, named_seed, normal
 from .trajectory import AT_CENTRE, CENTRE, Pose, Trajectory, velocities
 
@@ -227,7 +229,7 @@ def imu_samples(survey: Survey, block: int = BLOCK) -> Iterator[ImuSamples]:
         yield ImuSamples(
             np.rint(ends[1:]).astype(np.int64),
             rates + gyroscope.of(samples),
-            np.einsum("nij,ni->nj", halfway, forces) + accelerometer.of(samples),
+            into_axes(forces, halfway) + accelerometer.of(samples),
         )
 
 
@@ -260,18 +262,18 @@ def _moved(path: Trajectory, mount: Pose, times_ns: Floats) -> tuple[Floats, Flo
     if turns is None:
         turns = np.broadcast_to(np.eye(3), (len(times_ns), 3, 3))
     speeds, rates = velocities(path, 0, times_ns)
-    levers = np.einsum("nij,j->ni", turns, np.array(mount.position))
-    return places + levers, turns @ mount.turn, speeds + np.cross(rates, levers)
+    levers = applied(turns, mount.position)
+    return places + levers, matmul(turns, mount.turn), speeds + np.cross(rates, levers)
 
 
 def _rotation_vectors(before: Floats, after: Floats) -> Floats:
     """Rotation vectors (k, 3), radians, from rotations (k, 3, 3) to others, in their axes."""
-    turn = np.einsum("nji,njk->nik", before, after)
+    turn = matmul(before.transpose(0, 2, 1), after)
     sines = np.stack([turn[:, k, j] - turn[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
     sines /= 2
-    sine = np.linalg.norm(sines, axis=1)
-    cosine = (np.einsum("nii->n", turn) - 1) / 2
-    scale = np.where(sine > 1e-9, np.arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
+    sine = length(sines)
+    cosine = (turn[:, 0, 0] + turn[:, 1, 1] + turn[:, 2, 2] - 1) / 2
+    scale = np.where(sine > 1e-9, arctan2(sine, cosine) / np.maximum(sine, 1e-9), 1.0)
     return np.asarray(sines * scale[:, None])
 
 
@@ -293,9 +295,8 @@ class _Errors:
     ) -> None:
         self._seed = seed
         self._white, self._bias, self._walk = white, bias, walk * math.sqrt(step_s)
-        # To single precision, in which an exponential is the same on every machine.
-        self._kept = float(np.float32(math.exp(-step_s / bias_time_s)))
-        self._driven = bias * math.sqrt(1 - self._kept**2)
+        self._kept = exp_of(-step_s / bias_time_s)
+        self._driven = bias * math.sqrt(1 - self._kept * self._kept)
         self._biases: Floats = np.zeros(3)  # of the last sample
         self._walked: Floats = np.zeros(3)
 
@@ -345,22 +346,24 @@ def geodetic(positions: Floats, origin: tuple[float, float, float]) -> Floats:
         Latitude, longitude and height.
     """
     lat, lon = math.radians(origin[0]), math.radians(origin[1])
-    (sp, cp), (sl, cl) = (math.sin(lat), math.cos(lat)), (math.sin(lon), math.cos(lon))
+    (sp, cp), (sl, cl) = sin_cos_of(lat), sin_cos_of(lon)
     wide = _A / math.sqrt(1 - _E2 * sp * sp)
     east, north, up = positions.T
     x = (wide + origin[2]) * cp * cl - sl * east - sp * cl * north + cp * cl * up
     y = (wide + origin[2]) * cp * sl + cl * east - sp * sl * north + cp * sl * up
     z = (wide * (1 - _E2) + origin[2]) * sp + cp * north + sp * up
-    level = np.hypot(x, y)
+    level = hypot(x, y)
     small = _A * math.sqrt(1 - _E2)
-    far = np.hypot(z, level)
+    far = hypot(z, level)
     slope = (small * z) / (_A * level) * (1 + _E2 / (1 - _E2) * small / far)
     cos = 1 / np.sqrt(1 + slope * slope)
     sin = slope * cos
-    bow = np.arctan2(z + _E2 / (1 - _E2) * small * sin**3, level - _E2 * _A * cos**3)
-    across = _A / np.sqrt(1 - _E2 * np.sin(bow) ** 2)
-    height = level * np.cos(bow) + z * np.sin(bow) - _A * _A / across
-    return np.column_stack([np.degrees(bow), np.degrees(np.arctan2(y, x)), height])
+    above = z + _E2 / (1 - _E2) * small * (sin * sin * sin)
+    bow = arctan2(above, level - _E2 * _A * (cos * cos * cos))
+    sin, cos = sin_cos(bow)
+    across = _A / np.sqrt(1 - _E2 * sin * sin)
+    height = level * cos + z * sin - _A * _A / across
+    return np.column_stack([np.degrees(bow), np.degrees(arctan2(y, x)), height])
 
 
 _A, _F = 6378137.0, 1 / 298.257223563  # of WGS 84

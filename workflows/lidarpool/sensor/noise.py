@@ -19,6 +19,7 @@ from pydantic import Field
 
 from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import Seed, UnitShare, about
+from ..base.elementary import exp, log
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .materials import at_right_angles
@@ -223,7 +224,7 @@ class Noise:
         standard deviations before its maximum.
         """
         over = np.maximum(energy / self.threshold, 1)
-        return np.asarray(self.walk_m * np.sqrt(2 * np.log(over)))
+        return np.asarray(self.walk_m * np.sqrt(2 * log(over)))
 
     def false_alarms(
         self, gate_s: float, scan: Integers, ray: Integers
@@ -244,11 +245,11 @@ class Noise:
         while len(rows) or not found:
             # The time until the next one is exponentially distributed.
             left = uniform(self.seed, Purpose.ALARM, scan[rows], ray[rows], number)
-            some = np.flatnonzero(left > np.exp(-self.false_alarm_hz * (gate_s - since)))
+            some = np.flatnonzero(left > exp(-self.false_alarm_hz * (gate_s - since)))
             rows, since, left = rows[some], since[some], left[some]
-            since = np.minimum(since - np.log(left) / self.false_alarm_hz, gate_s)
+            since = np.minimum(since - log(left) / self.false_alarm_hz, gate_s)
             share = 1 - uniform(self.seed, Purpose.PEAK, scan[rows], ray[rows], number)
-            peak = np.sqrt(1 - 2 / THRESHOLD_SIGMAS**2 * np.log(share))
+            peak = np.sqrt(1 - 2 / (THRESHOLD_SIGMAS * THRESHOLD_SIGMAS) * log(share))
             found.append((rows, since, self.threshold * peak))
             number += 1
         row, time, energy = map(np.concatenate, zip(*found, strict=True))
@@ -334,7 +335,6 @@ def normal(
     """Numbers of mean 0 and variance 1, normally distributed: (n,); arguments as of `raw`.
 
     They are quantiles of 65,536 equal shares of the distribution, so none is beyond 4.3.
-    Logarithms and cosines of random numbers would not have the same bits on every machine.
     """
     return quantiles()[raw(seed, purpose, scan, ray, number) >> np.uint64(48)]
 
@@ -345,5 +345,5 @@ def quantiles() -> Floats:
     shares = (np.arange(2**15) + 0.5) / 2**16
     low = np.array([NormalDist().inv_cdf(share) for share in shares])
     table = np.concatenate([low, -low[::-1]])
-    # To single precision, in which logarithms are the same on every machine.
+    # To single precision, in which the logarithms of C libraries are the same.
     return (table / np.sqrt((table**2).mean())).astype(np.float32).astype(np.float64)

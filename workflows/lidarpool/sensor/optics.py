@@ -4,22 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from math import log, pi, sqrt
+from math import pi, sqrt
 from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field
 
 from ..base.declared import about, allowed
+from ..base.elementary import log_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
+from ..base.vectors import hypot
 from .disc import SUBRAYS, Beam, Profile
 
 LIGHT_M_NS = 0.299792458  # in vacuum; in air it is slower by 0.03 %
-FWHM = sqrt(8 * log(2))  # full width at half maximum of a Gaussian, in standard deviations
+FWHM = sqrt(8 * log_of(2.0))  # full width at half maximum of a Gaussian, in standard deviations
 WINDOW_SIGMAS = 10  # that an echo takes in a waveform, to both sides together
 # Standard deviation of the response of a Gaussian receiver times its bandwidth at -3 dB.
-_RESPONSE = sqrt(log(2)) / (2 * pi)
+_RESPONSE = sqrt(log_of(2.0)) / (2 * pi)
 
 Processing = Literal["none", "peaks", "gaussian"]
 Mode = Literal["strongest", "first", "last", "dual", "all"]
@@ -176,7 +178,7 @@ class Returns:
             If the samples are too far apart for it.
         """
         response = 0.0 if self.bandwidth_mhz is None else 1000 * _RESPONSE / self.bandwidth_mhz
-        sigma = sqrt((self.length_ns(optics) / FWHM) ** 2 + response**2)
+        sigma = hypot(self.length_ns(optics) / FWHM, response)
         if not 2 * self.sample_ns <= FWHM * sigma * (1 + 1e-9):
             raise LidarpoolError(
                 f"returns.sample_ns is {self.sample_ns:g}, and the pulse is {FWHM * sigma:.3g} ns "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 
@@ -9,6 +10,7 @@ import numpy as np
 from pydantic import Field
 
 from ..base.arrays import Floats, Ints
+from ..base.elementary import sin_cos, sin_cos_of
 from ..base.errors import LidarpoolError
 from ..base.validation import checked_fields
 from .beams import Beams
@@ -59,10 +61,10 @@ class PrismSensor(Sensor):
             # Reduced to a turn first: the cosine of a large angle loses digits.
             angle = 2 * np.pi * ((prism.rpm * minutes + prism.phase_deg / 360) % 1)
             # Normals along the light's direction; the faces diverge towards the thick edge.
-            wedge = np.radians(prism.wedge_deg)
+            sine, cosine = sin_cos_of(math.radians(prism.wedge_deg))
             inclined = np.empty((3, len(firings), 1))
-            inclined[0] = np.cos(wedge)
-            inclined[1:, :, 0] = np.sin(wedge) * np.stack([np.cos(angle), np.sin(angle)])
+            inclined[0] = cosine
+            inclined[1:, :, 0] = sine * np.stack(sin_cos(angle)[::-1])
             if prism.inclined_first:
                 inclined[1:] *= -1
             faces = (inclined, flat) if prism.inclined_first else (flat, inclined)
@@ -77,7 +79,7 @@ def _refracted(rays: Floats, normals: Floats, ratio: float) -> Floats:
     The normals (3, k, 1), or (3, 1, 1), point along the light's direction.
     """
     along = (rays * normals).sum(axis=0)
-    behind = 1 - ratio**2 * (1 - along**2)
+    behind = 1 - ratio * ratio * (1 - along * along)
     if not (behind >= 0).all():
         raise LidarpoolError(
             "A prism reflects light back at its inner face, so that no ray leaves the sensor: "

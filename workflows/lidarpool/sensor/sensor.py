@@ -13,8 +13,10 @@ from pydantic import Field
 
 from ..base.arrays import Floats, Ints
 from ..base.declared import about
+from ..base.elementary import sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import checked, checked_fields
+from ..base.vectors import turned
 from .beams import CHANNELS_MOST, Beams, Head, Rate, Spin, Step
 from .optics import LIGHT_M_NS, Optics
 
@@ -213,9 +215,8 @@ class Sensor:
     def ahead(self) -> Floats:
         """Unit directions of the beams in the head's axes, at azimuth 0: (channels, 3)."""
         beams = self.beams
-        level = np.cos(beams.elevation)
-        x, y = level * np.cos(beams.azimuth), level * np.sin(beams.azimuth)
-        return np.column_stack([x, y, np.sin(beams.elevation)])
+        (up, level), (sin, cos) = sin_cos(beams.elevation), sin_cos(beams.azimuth)
+        return np.column_stack([level * cos, level * sin, up])
 
     @cached_property
     def centre(self) -> Floats | None:
@@ -232,8 +233,7 @@ class Sensor:
         kind = type(self)
         if kind.directions is not Sensor.directions or kind.origins is not Sensor.origins:
             return None
-        azimuth = self.head.azimuths(firings)
-        return np.stack([np.cos(azimuth), np.sin(azimuth)])
+        return np.stack(sin_cos(self.head.azimuths(firings))[::-1])
 
     @property
     def axes(self) -> Floats | None:
@@ -245,14 +245,15 @@ class Sensor:
 
         Uses products of firing and beam terms, without trigonometry for each ray.
         """
-        azimuth = self.head.azimuths(firings)[:, None]
-        cos, sin = np.cos(azimuth), np.sin(azimuth)
+        sin, cos = sin_cos(self.head.azimuths(firings)[:, None])
         x, y, z = vectors.T
         out = np.empty((len(firings), len(vectors), 3))
         out[..., 0] = cos * x - sin * y
         out[..., 1] = sin * x + cos * y
         out[..., 2] = z
-        return out if self.axes is None else out @ self.axes.T
+        if self.axes is None:
+            return out
+        return turned(out.reshape(-1, 3), self.axes).reshape(out.shape)
 
     def begins_ns(self, firings: Ints) -> Floats:
         """Return the starts of firings (k,), since the start of the station: (k,)."""

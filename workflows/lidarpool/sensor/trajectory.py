@@ -11,8 +11,10 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Bools, Floats, Indices
 from ..base.declared import AngleDeg, Triple, about, short, written_as
+from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarpoolError
 from ..base.validation import as_array, checked_fields, shown
+from ..base.vectors import applied, hypot, length, matmul
 from .spline import knots_of, on_curve
 
 QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
@@ -20,6 +22,7 @@ QUATERNION_SLACK = 1e-3  # tolerance of a quaternion's length, which files round
 # firing are fired a little after its pose.
 CLOCK_S, _FIRING_S = 1e-6, 1e-3
 
+_ROUNDS = 8  # of the power iteration: rotations are rounded by 2e-3 at most
 _STEP_NS = 5e5  # half of what difference quotients are taken over
 
 ALWAYS = (-np.inf, np.inf)
@@ -60,7 +63,7 @@ class Pose:
         if mount == CENTRE:
             return self
         turn = self.turn
-        return Pose.of(self.position + turn @ mount.position, turn @ mount.turn)
+        return Pose.of(self.position + applied(turn, mount.position), matmul(turn, mount.turn))
 
     @classmethod
     def of(cls, position: ArrayLike, rotation: Floats | None) -> Pose:
@@ -68,20 +71,20 @@ class Pose:
         place = tuple(np.asarray(position, np.float64).tolist())
         if rotation is None:
             return cls(place)
-        level = np.hypot(rotation[0, 0], rotation[1, 0])
-        pitch = np.arctan2(-rotation[2, 0], level)
+        level = hypot(rotation[0, 0], rotation[1, 0])
+        pitch = arctan2(-rotation[2, 0], level)
         if level > 1e-9:
-            yaw = np.arctan2(rotation[1, 0], rotation[0, 0])
-            roll = np.arctan2(rotation[2, 1], rotation[2, 2])
+            yaw = arctan2(rotation[1, 0], rotation[0, 0])
+            roll = arctan2(rotation[2, 1], rotation[2, 2])
         else:  # straight up or down: yaw and roll have the same axis
-            yaw, roll = np.arctan2(-rotation[0, 1], rotation[1, 1]), 0.0
+            yaw, roll = arctan2(-rotation[0, 1], rotation[1, 1]), np.zeros(())
         return cls(place, *np.degrees([yaw, pitch, roll]).tolist())
 
 
 def rotations_of(angles_deg: Floats) -> Floats:
     """Rotations (k, 3, 3) of yaw, pitch and roll in degrees (k, 3), as of `Pose`; or of one."""
     angles = np.radians(angles_deg.T)
-    (cy, cp, cr), (sy, sp, sr) = np.cos(angles), np.sin(angles)
+    (sy, sp, sr), (cy, cp, cr) = sin_cos(angles)
     made = np.array(
         [
             [cy * cp, cy * sp * sr - sy * cr, cy * sp * cr + sy * sr],
@@ -182,7 +185,7 @@ def velocities(path: Trajectory, station: int, times_ns: Floats) -> tuple[Floats
     (one, before), (other, after) = (path.poses(station, at) for at in (early, late))
     if before is None or after is None:
         return (other - one) / seconds, np.zeros((len(times_ns), 3))
-    turn = np.einsum("nij,nkj->nik", after, before)
+    turn = matmul(after, before.transpose(0, 2, 1))
     sines = np.stack([turn[:, k, j] - turn[:, j, k] for j, k in ((1, 2), (2, 0), (0, 1))], axis=1)
     return (other - one) / seconds, sines / (2 * seconds)
 
@@ -284,7 +287,7 @@ class Track:
                     f"quaternions are x, y, z and w of each of the {len(times)} poses, not "
                     f"{turns.shape}."
                 )
-        lengths = np.linalg.norm(turns, axis=1)
+        lengths = length(turns)
         # Written so that NaN is an error.
         bad = ~(np.abs(lengths - 1) <= QUATERNION_SLACK)
         _refuse(bad, "the quaternion of pose {} is not of length 1")
@@ -351,7 +354,7 @@ class Track:
         positions = speed.take(segment, axis=1) * since + start.take(segment, axis=1)
         angle = since * rates.take(segment)
         rotations = turn[0].take(segment, axis=1)
-        for factor, table in ((np.sin(angle), turn[1]), (np.cos(angle), turn[2])):
+        for factor, table in zip(sin_cos(angle), turn[1:], strict=True):
             rotations = rotations + factor * table.take(segment, axis=1)
         return positions.T, rotations.reshape(3, 3, -1).transpose(2, 0, 1)
 
@@ -417,9 +420,10 @@ class Track:
         zero = np.zeros_like(x)
         about = np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3)
         start = matrices(turns[:-1])
-        square = start @ about @ about
-        table = np.stack([start + square, start @ about, -square]).reshape(3, -1, 9)
-        spins = (start @ (axis * rates)[..., None])[..., 0]
+        tilted = matmul(start, about)
+        square = matmul(tilted, about)
+        table = np.stack([start + square, tilted, -square]).reshape(3, -1, 9)
+        spins = applied(start, axis * rates)
         parts = self.positions[:-1], speeds, spins
         begin, speed, spin = (np.ascontiguousarray(part.T) for part in parts)
         return begin, speed, np.ascontiguousarray(table.transpose(0, 2, 1)), rates[:, 0], spin
@@ -432,8 +436,8 @@ def _between(quaternions: Floats, times_s: Floats) -> tuple[Floats, Floats]:
     axis = pw * q - qw * p - np.cross(p, q)
     cosine = (p * q).sum(axis=1, keepdims=True) + pw * qw
     axis = np.where(cosine < 0, -axis, axis)  # the shorter rotation
-    sine = np.linalg.norm(axis, axis=1, keepdims=True)
-    rates = 2 * np.arctan2(sine, np.abs(cosine)) / np.diff(times_s)[:, None]
+    sine = length(axis)[:, None]
+    rates = 2 * arctan2(sine, np.abs(cosine)) / np.diff(times_s)[:, None]
     return axis / np.where(sine > 0, sine, 1), rates
 
 
@@ -451,7 +455,8 @@ def matrices(quaternions: Floats) -> Floats:
 def quaternions_of(rotations: Floats) -> Floats:
     """Return unit quaternions x, y, z, w (k, 4) of matrices (k, 3, 3), which may be rounded.
 
-    The eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000).
+    The eigenvector of the greatest eigenvalue (Bar-Itzhack, 2000), by power iteration: plus one,
+    the others are about as small as the matrices are rounded, and zero for exact rotations.
     """
     m = np.moveaxis(rotations, 0, -1)
     table = np.zeros((len(rotations), 4, 4))
@@ -460,8 +465,12 @@ def quaternions_of(rotations: Floats) -> Floats:
         table[:, i, j] = table[:, j, i] = m[i, j] + m[j, i]
         table[:, k, 3] = table[:, 3, k] = m[j, i] - m[i, j]
     table[:, 3, 3] = m[0, 0] + m[1, 1] + m[2, 2]
-    found: Floats = np.linalg.eigh(table)[1][..., -1]
-    return found
+    table += np.eye(4)
+    best = np.diagonal(table, axis1=1, axis2=2).argmax(axis=1)
+    found = table[np.arange(len(table)), best]
+    for _ in range(_ROUNDS):
+        found = applied(table, found / length(found)[:, None])
+    return np.asarray(found / length(found)[:, None])
 
 
 def _along(slopes: Floats) -> Floats:
@@ -470,12 +479,12 @@ def _along(slopes: Floats) -> Floats:
     While it stands it keeps its direction; before it first moves it faces its first direction.
     """
     x, y, _ = slopes
-    moving = np.flatnonzero(np.hypot(x, y) > 1e-9)
+    moving = np.flatnonzero(hypot(x, y) > 1e-9)
     if not len(moving):
         moving = np.zeros(1, np.intp)
     last = moving[np.maximum(np.searchsorted(moving, np.arange(len(x)), "right") - 1, 0)]
-    half = np.arctan2(y[last], x[last]) / 2
-    return np.stack([np.zeros_like(half), np.zeros_like(half), np.sin(half), np.cos(half)], axis=1)
+    half = arctan2(y[last], x[last]) / 2
+    return np.stack([np.zeros_like(half), np.zeros_like(half), *sin_cos(half)], axis=1)
 
 
 def _refuse(bad: Bools, words: str) -> None:

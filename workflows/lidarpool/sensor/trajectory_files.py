@@ -15,6 +15,7 @@ from ..base.allowance import check_fits
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
 from ..base.validation import checked
+from ..base.vectors import determinant, matmul, turned
 from .calibrations import said, text_of
 from .trajectory import Beyond, Track, quaternions_of, rotations_of
 
@@ -109,8 +110,8 @@ def _numbers(text: str, columns: int | None = None, **options: Any) -> Floats:
 
 
 def _rotations(given: Floats) -> Floats:
-    off = np.abs(given @ given.transpose(0, 2, 1) - np.eye(3)).max(axis=(1, 2))
-    if not (off <= 2e-3).all() or (np.linalg.det(given) < 0).any():
+    off = np.abs(matmul(given, given.transpose(0, 2, 1)) - np.eye(3)).max(axis=(1, 2))
+    if not (off <= 2e-3).all() or (determinant(given) < 0).any():
         raise ValueError("it holds matrices that are no rotations")
     return given
 
@@ -220,5 +221,5 @@ def _from_camera(track: Track) -> Track:
     assert track.quaternions is not None  # of every track
     x, y, z, w = track.quaternions.T
     turns = np.stack([z, -x, -y, w], axis=1)  # the axis is rotated, the angle is the same
-    places = track.positions @ _CAMERA.T
+    places = turned(track.positions, _CAMERA)
     return replace(track, positions=places, quaternions=turns)

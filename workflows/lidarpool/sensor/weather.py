@@ -15,7 +15,9 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.declared import about
+from ..base.elementary import exp, exp_of, geomspace, power
 from ..base.validation import checked_fields
+from ..base.vectors import hypot
 from .materials import REFERENCE_M, extinction
 
 # Index of refraction of water, from 905 to 1550 nm (Hale and Querry 1973: 1.328 to 1.318).
@@ -117,14 +119,14 @@ class Particles(NamedTuple):
     @property
     def extinction(self) -> float:
         """Extinction, 1/m: all take light in proportion to their cross-sections."""
-        x = self.slope * self.largest
-        squares = 2 / self.slope**3 * (1 - math.exp(-x) * (1 + x + x * x / 2))
+        slope, x = self.slope, self.slope * self.largest
+        squares = 2 / (slope * slope * slope) * (1 - exp_of(-x) * (1 + x + x * x / 2))
         return LARGE * math.pi / 4 * self.number * squares * 1e-6
 
     def above(self, diameter_mm: Floats) -> Floats:
         """Particles above diameters (n,), 1/m³: (n,)."""
-        some = np.exp(-self.slope * np.minimum(diameter_mm, self.largest))
-        return np.asarray(self.number / self.slope * (some - math.exp(-self.slope * self.largest)))
+        some = exp(-self.slope * np.minimum(diameter_mm, self.largest))
+        return np.asarray(self.number / self.slope * (some - exp_of(-self.slope * self.largest)))
 
 
 def rain(mm_h: float) -> Particles:
@@ -139,9 +141,10 @@ def rain(mm_h: float) -> Particles:
     '1.56'
     """
     n = WATER_INDEX
-    r = ((n - 1) / (n + 1)) ** 2
-    reflectance = (r + r * (1 - r) ** 2 * (n / (2 - n)) ** 2) / 4
-    return Particles(8000.0, 4.1 * mm_h**-0.21, RAIN_LARGEST_MM, reflectance)
+    r = (n - 1) / (n + 1) * ((n - 1) / (n + 1))
+    behind = (1 - r) * (n / (2 - n))
+    reflectance = (r + r * behind * behind) / 4
+    return Particles(8000.0, 4.1 * float(power(mm_h, -0.21)), RAIN_LARGEST_MM, reflectance)
 
 
 def snow(mm_h: float) -> Particles:
@@ -155,8 +158,8 @@ def snow(mm_h: float) -> Particles:
     >>> f"{1000 * snow(1.0).extinction:.2f}"  # 1/km
     '3.34'
     """
-    wider = SNOW_DENSITY ** (-1 / 3)
-    number, slope = 3800.0 * mm_h**-0.87, 2.55 * mm_h**-0.48
+    wider = float(power(SNOW_DENSITY, -1 / 3))
+    number, slope = (a * float(power(mm_h, b)) for a, b in ((3800.0, -0.87), (2.55, -0.48)))
     reflectance = LARGE * math.pi / SNOW_LIDAR_RATIO_SR
     return Particles(number / wider, slope / wider, SNOW_LARGEST_MM, reflectance)
 
@@ -194,13 +197,13 @@ class Air(NamedTuple):
 
     def width(self, distance: Floats) -> Floats:
         """Diameter of the beam, metres."""
-        return np.asarray(np.sqrt(self.exit_m**2 + (self.divergence * distance) ** 2))
+        return np.asarray(hypot(self.exit_m, self.divergence * distance))
 
     def white(self, distance: Any) -> Any:
         """Energy of a white disc that fills the beam."""
         seen = np.maximum(distance, max(self.overlap_m, 1e-3))
-        left = np.exp(-2 * self.extinction * distance)
-        return (REFERENCE_M / seen) ** 2 * np.maximum(left, LEAST_LEFT)
+        left = exp(-2 * self.extinction * distance)
+        return np.square(REFERENCE_M / seen) * np.maximum(left, LEAST_LEFT)
 
     def smallest(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Diameters of particles that return an energy, millimetres; inf if none returns it."""
@@ -210,12 +213,12 @@ class Air(NamedTuple):
 
     def rate(self, particles: Particles, energy: float, distance: Floats) -> Floats:
         """Particles in the beam that return at least an energy, in each metre: 1/m."""
-        area = math.pi / 4 * self.width(distance) ** 2
+        area = math.pi / 4 * np.square(self.width(distance))
         return area * particles.above(self.smallest(particles, energy, distance))
 
     def met(self, particles: Particles, energy: float, begins: float, ends: float) -> float:
         """Particles in a beam between two ranges that return at least an energy, on the average."""
-        distance = np.geomspace(begins, max(ends, begins * 1.001), NODES)
+        distance = geomspace(begins, max(ends, begins * 1.001), NODES)
         return float(np.trapezoid(self.rate(particles, energy, distance), distance))
 
     def cloud(self, backscatter: float, begins: Floats, ends: Floats) -> Floats:

@@ -6,7 +6,6 @@ sensor may detect are drawn: their number is Poisson's, their ranges and diamete
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from functools import cache, lru_cache
 from statistics import NormalDist
@@ -15,6 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices, Ints
+from ..base.elementary import exp, exp_of, expm1, geomspace, interp, log1p
 from ..scene.colours import GREY, packed
 from ..sensor import Survey
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
@@ -200,19 +200,19 @@ def inserted(hits: Hits, planes: Planes | None, drawn: AirHits) -> tuple[Hits, P
 @lru_cache(TABLES_KEPT)
 def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) -> _Seen | None:
     """Make the tables of particles that return at least an energy; None if there are none."""
-    distance = np.geomspace(begins, max(ends, begins * 1.001), NODES)
+    distance = geomspace(begins, max(ends, begins * 1.001), NODES)
     some = np.flatnonzero(air.rate(kind, energy, distance) > 0)
     if not len(some):
         return None
     last = min(some[-1] + 1, NODES - 1)
-    distance = np.geomspace(distance[max(some[0] - 1, 0)], distance[last], NODES)
+    distance = geomspace(distance[max(some[0] - 1, 0)], distance[last], NODES)
     rate = air.rate(kind, energy, distance)
     parts = (rate[1:] + rate[:-1]) / 2 * np.diff(distance)
     sums = np.concatenate([[0.0], np.cumsum(parts)])
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    distance = single(np.interp(shares, sums / sums[-1], distance))
+    distance = single(interp(shares, sums / sums[-1], distance))
     smallest = np.minimum(air.smallest(kind, energy, distance), kind.largest)
-    larger = -np.expm1(-kind.slope * (kind.largest - smallest))
+    larger = -expm1(-kind.slope * (kind.largest - smallest))
     most = kind.reflectance * air.white(distance)
     one = most / (1000 * air.width(distance)) ** 2
     tables = distance, single(smallest), single(larger), single(one), single(most)
@@ -221,7 +221,7 @@ def _seen(air: Air, kind: Particles, energy: float, begins: float, ends: float) 
 
 def _poisson(mean: float) -> Floats:
     """Cumulative probabilities of 0, 1, … events; the last is 1."""
-    sums, term, count = [], math.exp(-mean), 0
+    sums, term, count = [], exp_of(-mean), 0
     total = term
     while count < mean or 1 - total > 1e-9:
         sums.append(total)
@@ -258,7 +258,7 @@ def highest(signals: Floats) -> Floats:
     at = signals[0] + np.linspace(-TAIL_SIGMAS, TAIL_SIGMAS, 241)
     normal = NormalDist()
     below = np.array([[normal.cdf(x - signal) for x in at] for signal in signals])
-    density = np.exp(-((at - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
+    density = exp(-((at - signals[:, None]) ** 2) / 2) / np.maximum(below, 1e-300)
     product = np.ones(len(at))
     for number in range(1, count + 1):
         product = product * below[number - 1]
@@ -269,7 +269,7 @@ def highest(signals: Floats) -> Floats:
 
 
 def single(table: Floats) -> Floats:
-    """Round to single precision, in which exponentials are the same on every machine."""
+    """Round to single precision, in which the error functions of C libraries are the same."""
     return table.astype(np.float32).astype(np.float64)
 
 
@@ -277,4 +277,4 @@ def single(table: Floats) -> Floats:
 def _exponential() -> Floats:
     """Quantiles of the exponential distribution, of equal shares."""
     shares = (np.arange(QUANTILES) + 0.5) / QUANTILES
-    return single(-np.log1p(-shares))
+    return single(-log1p(-shares))

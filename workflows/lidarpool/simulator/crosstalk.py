@@ -11,11 +11,13 @@ import numpy as np
 from raybeam import Pattern
 
 from ..base.arrays import Floats, Indices, Ints, Ints32
+from ..base.elementary import arccos, exp, sin_cos_of
+from ..base.vectors import into_axes, length, products, turned
 from ..sensor import Sensor, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.survey import begin_ns
-from .motion import Clock, Poses, into_axes, products, turned
+from .motion import Clock, Poses
 from .surfaces import Surfaces
 from .world import World
 
@@ -46,7 +48,7 @@ class Crosstalk:
         self._survey, self._world, self._surfaces = survey, world, surfaces
         self._number, self._sensor = number, survey.carried[number].sensor
         wide, _ = survey.returns_each[number].of(self._sensor.optics)
-        self._cosine = np.cos(wide / 2)
+        self._cosine = sin_cos_of(wide / 2)[1]
         nm = self._sensor.optics.wavelength_nm
         self._others = [
             other
@@ -116,15 +118,15 @@ class Crosstalk:
         begins = np.arange(0, len(order), CELL_RAYS)
         ahead = directions[order]
         sums = np.add.reduceat(ahead, begins, axis=0)
-        axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
+        axes = sums / np.maximum(length(sums), 1e-9)[:, None]
         least = np.minimum.reduceat(
             products(axes[np.arange(len(order)) // CELL_RAYS].T, ahead.T), begins
         )
-        opening = np.arccos(np.clip(least, -1, 1)) + np.arccos(self._cosine)
+        opening = arccos(np.clip(least, -1, 1)) + arccos(self._cosine)
         with np.errstate(invalid="ignore", divide="ignore"):
             opening_m = SLACK_NS * LIGHT_M_NS / far  # rays of a cell start at different places
         spot, cell = _expanded(first // CELL_RAYS, np.where(stop > first, -(-stop // CELL_RAYS), 0))
-        off = np.arccos(np.clip(products(axes[cell].T, away[spot].T) / far[spot], -1, 1))
+        off = arccos(np.clip(products(axes[cell].T, away[spot].T) / far[spot], -1, 1))
         seen = ~(off > opening[cell] + opening_m[spot])
         spot, cell = spot[seen], cell[seen]
         low = np.maximum(first[spot], cell * CELL_RAYS)
@@ -174,7 +176,7 @@ class Crosstalk:
         owners, table = surfaces.objects(triangle), surfaces.at(nm)
         # A retro-reflector sends the light of a sensor back to that one alone.
         share = table.reflectance[owners] * ~table.retro[owners]
-        return np.asarray(share * cosine * at_right_angles(far) * np.exp(-both))
+        return np.asarray(share * cosine * at_right_angles(far) * exp(-both))
 
 
 def _expanded(first: Indices, stop: Indices) -> tuple[Indices, Indices]:

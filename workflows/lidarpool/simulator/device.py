@@ -2,9 +2,9 @@
 
 The formulas are those of `BatchReturns`, with the same bits. If a survey has other columns too, its
 kept hits cross the bus as well, and NumPy makes those: energies in haze, azimuths and noise, since
-`exp` and `atan2` of a device differ from NumPy's in the last bit. So it does with the energies of
-hits on actors, for which it needs their poses; `World` finds these hits, and the device merges them
-with its own.
+`exp` and `atan2` of a device differ from those of `elementary` in the last bit. So it does with the
+energies of hits on actors, for which it needs their poses; `World` finds these hits, and the device
+merges them with its own.
 """
 
 from __future__ import annotations

@@ -10,7 +10,8 @@ from __future__ import annotations
 import numpy as np
 
 from ..base.arrays import Floats, Integers, Ints, Ints32
-from .motion import Poses, products
+from ..base.vectors import products
+from .motion import Poses
 from .surfaces import Surfaces
 
 BLOCK_HITS = 1 << 13  # hits that are looked at a time, to fit a cache

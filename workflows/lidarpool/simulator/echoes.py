@@ -12,13 +12,14 @@ import numpy as np
 from raybeam import Pattern, ScanReturns, SubRays
 
 from ..base.arrays import Bytes, Floats, Ints, Ints32, Records, UInts32
+from ..base.vectors import products, turned
 from ..scene.scene import Scene
 from ..sensor import Returns, Sensor, Survey
 from ..sensor.noise import THRESHOLD_SIGMAS
 from .air import AirCaster, inserted
 from .doppler import approach, radial_velocities
 from .hits import NO_SURFACE, Hits, Keys, joined, numbers
-from .motion import Poses, products, turned
+from .motion import Poses
 from .paths import Paths
 from .receiver import Receiver
 from .separation import AirHits, Report, chosen, separated

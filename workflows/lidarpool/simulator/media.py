@@ -17,13 +17,15 @@ from numpy.typing import NDArray
 from raybeam import Pattern, any_axes
 
 from ..base.arrays import AnyArray, Bools, Floats, Indices, Integers, Ints, Ints32
+from ..base.elementary import exp, log, log_of
 from ..base.errors import LidarpoolError
+from ..base.vectors import products
 from ..scene.scene import Scene
 from ..sensor.leaves import brightness, projection
 from ..sensor.materials import MaterialTable, fresnel
 from ..sensor.noise import Purpose
 from .hits import selected
-from .motion import Clock, Poses, products
+from .motion import Clock, Poses
 from .surfaces import Surfaces
 from .ways import Ways
 from .world import World
@@ -128,7 +130,7 @@ class Bundle:
         nearer = distance**2 / np.maximum(area, 1e-12)
         # Where the air takes so much more than the media, its own factor is 0.
         more = np.minimum(2 * (extinction * distance - self.lost), 700.0)
-        return np.asarray(nearer * np.exp(more))
+        return np.asarray(nearer * exp(more))
 
     def turn(
         self, before: Floats, after: Floats, normals: Floats, mirrored: Bools, index: Floats
@@ -437,15 +439,15 @@ def refracted(
 def depths(bits: NDArray[np.uint64]) -> Floats:
     """Exponentially distributed numbers of mean 1, from random bits: (n,).
 
-    The number of halvings and a table of 32,768 logarithms give the same on every machine.
+    By the number of halvings and a table of 32,768 logarithms, which is fast.
     """
     share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
     part, halvings = np.frexp(share)
     row = ((part - 0.5) * (2 * len(_LOGS))).astype(np.intp)
-    return np.asarray(_LOGS[row] - halvings * float(np.float32(np.log(2))))
+    return np.asarray(_LOGS[row] - halvings * float(np.float32(log_of(2.0))))
 
 
-_LOGS = -np.log((np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5).astype(np.float32).astype(np.float64)
+_LOGS = -log((np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5).astype(np.float32).astype(np.float64)
 
 
 def _dots(one: Floats, other: Floats) -> Floats:

@@ -12,6 +12,7 @@ import raybeam.poses
 from raybeam import Motion, Pattern
 
 from ..base.arrays import Floats, Integers, owned
+from ..base.vectors import into_axes, matmul
 from ..sensor import Mounted, Trajectory
 from ..sensor.trajectory import velocities
 from .ways import Ways
@@ -160,9 +161,9 @@ def poses_of_firings(
             seat = np.broadcast_to(mount.position, positions.shape)
             positions = positions + into_axes(seat, turns.transpose(0, 2, 1))
         if mount.rotation is not None:
-            rotations = _product(rotations, mount.rotation)
+            rotations = matmul(rotations, mount.rotation)
         if sensor.axes is not None:
-            rotations = _product(rotations, sensor.axes)
+            rotations = matmul(rotations, sensor.axes)
         rotations = spun(rotations, spins)
     places = positions[:-1]
     if spins is not None and sensor.centre is not None and sensor.centre.any():
@@ -184,26 +185,6 @@ def carried_at(velocity: Floats, rate: Floats, lever: Floats) -> Floats:
     return velocity + np.cross(rate, lever)
 
 
-def turned(vectors: Floats, rotation: Floats | None) -> Floats:
-    """Rotate vectors (n, 3) by a matrix, with a fixed order of rounding, unlike BLAS."""
-    if rotation is None:
-        return vectors
-    x, y, z = vectors.T
-    return np.stack([(x * a + y * b) + z * c for a, b, c in rotation], axis=1)
-
-
-def into_axes(vectors: Floats, rotations: Floats | None) -> Floats:
-    """Rotate vectors (m, 3) from the scene's axes to those of rotations (m, 3, 3), one each."""
-    if rotations is None:
-        return vectors
-    x, y, z = vectors.T
-    out = np.empty(vectors.shape[::-1]).T
-    for axis in range(3):
-        a, b, c = (rotations[:, row, axis] for row in range(3))
-        out[:, axis] = (x * a + y * b) + z * c
-    return out
-
-
 def spun(rotations: Floats, spins: Floats) -> Floats:
     """Products of matrices (k, 3, 3) and turns about z, their cosines and sines (2, k)."""
     (cos, sin), out = spins, np.empty((3, 3, spins.shape[1])).transpose(2, 0, 1)
@@ -212,23 +193,6 @@ def spun(rotations: Floats, spins: Floats) -> Floats:
         out[:, row, 0] = x * cos + y * sin
         out[:, row, 1] = y * cos - x * sin
     out[:, :, 2] = rotations[:, :, 2]
-    return out
-
-
-def products(one: Floats, other: Floats) -> Floats:
-    """Scalar products of vectors (3, ...): (...), in one order of rounding."""
-    (x, y, z), (a, b, c) = one, other
-    product = x * a
-    product += y * b
-    product += z * c
-    return np.asarray(product)
-
-
-def _product(matrices: Floats, matrix: Floats) -> Floats:
-    """Products of matrices (k, 3, 3) and one (3, 3), in one order of rounding, however many."""
-    out = np.empty((3, 3, len(matrices))).transpose(2, 0, 1)
-    for row in range(3):
-        out[:, row] = turned(matrices[:, row], matrix.T)
     return out
 
 

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..base.arrays import Floats, Integers, Ints, Ints32, UInts32
+from ..base.vectors import into_axes, products
 from ..columns.table import COLOURS, VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
@@ -17,7 +18,7 @@ from ..sensor.noise import Purpose, raw
 from .doppler import BLOCK_HITS, approach
 from .hits import Hits, Keys, Planes, joined, selected
 from .media import Media, Rays, Within, depths
-from .motion import Clock, Poses, products
+from .motion import Clock, Poses
 from .surfaces import Surfaces, light_of
 from .world import World
 
@@ -156,7 +157,7 @@ class Paths:
                 velocity = light.growth + index * products(moved.T, light.directions.T)
             hits = Hits(light.ray, distance, triangle, energy, colour, velocity=velocity)
             turns = light.turns
-            looks = normals if turns is None else np.einsum("nji,nj->ni", turns, normals)
+            looks = normals if turns is None else into_axes(normals, turns)
             goes = materials.passes[rows] | materials.mirrors[rows]
             if within is not None:  # optical paths are longer than what was cast
                 crowns = materials.leafy[rows]  # whose surfaces send nothing back
@@ -224,7 +225,7 @@ class Paths:
         ahead = ahead - along[:, None] * mirrored
         turns = light.turns
         if turns is not None:
-            along_turns = np.einsum("ni,nij->nj", normals, turns)
+            along_turns = into_axes(normals, turns)
             turns = turns - mirrored[:, :, None] * along_turns[:, None]
         if within is not None:
             within.turn(light.directions, ahead, normals, mirrors)

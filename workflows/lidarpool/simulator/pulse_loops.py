@@ -302,7 +302,7 @@ def returns(
             for k in range(n):
                 if k:
                     new[k] = far[k] - far[k - 1] > gap_m
-                    number += np.int64(new[k])
+                    number += int(new[k])
                 if hard[k]:  # surfaces can only continue if they are in several returns
                     several |= surface >= 0 and surface != number
                     surface = number

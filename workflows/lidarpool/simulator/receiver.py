@@ -11,6 +11,8 @@ import numpy as np
 from raybeam import Pattern, any_axes
 
 from ..base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
+from ..base.elementary import arccos, arcsin, arctan2, cos
+from ..base.vectors import hypot, into_axes, length, products, turned
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
 from ..sensor import Survey
@@ -18,7 +20,7 @@ from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS
 from .crosstalk import Crosstalk
 from .hits import BLOOMING, CROSSTALK, FALSE_ALARM, NO_SURFACE, Hits, Keys, joined, numbers
-from .motion import Poses, into_axes, products
+from .motion import Poses
 from .paths import Paths
 from .surfaces import Surfaces
 from .world import World
@@ -171,8 +173,8 @@ class Receiver:
         far = np.sqrt(products(centre.T, centre.T))
         radius = retro.radius + cells.moved
         with np.errstate(invalid="ignore", divide="ignore"):
-            wide = np.where(far > radius, np.arcsin(radius / far), np.pi)
-            off = np.arccos(np.clip(products(cells.axes.T, centre.T) / far, -1, 1))
+            wide = np.where(far > radius, arcsin(radius / far), np.pi)
+            off = arccos(np.clip(products(cells.axes.T, centre.T) / far, -1, 1))
         least = np.maximum(far - radius, max(self._sensor.min_range_m, 1e-3))
         reach = np.minimum(self._reach(retro, least), STRAY_MOST) + wide
         near = np.flatnonzero(~(off > cells.opening + reach)[cells.number])
@@ -180,7 +182,7 @@ class Receiver:
         which = cells.number[near]
         centre = retro.middle - cells.starts[near]
         off = products(cells.ahead[near].T, centre.T) / np.sqrt(products(centre.T, centre.T))
-        inside = ~(off < np.cos(np.minimum(reach[which], np.pi)))
+        inside = ~(off < cos(np.minimum(reach[which], np.pi)))
         return near[inside]
 
     def _reach(self, retro: _Retro, distance: Floats) -> Floats:
@@ -214,7 +216,7 @@ class Receiver:
             middle = towards.mean(axis=1)
             point = point + INWARDS * (middle - point)
             distance = np.sqrt(products(point.T, point.T))
-            angle = np.degrees(np.arctan(off))
+            angle = np.degrees(arctan2(off, 1.0))
             some = np.flatnonzero(front & (angle > 0) & (angle < np.degrees(STRAY_MOST)))
             share = np.minimum(self._noise.stray_light / angle[some] ** 2, 1)
             energy = share * self._whole(retro.triangles[which[some]], distance[some])
@@ -242,11 +244,11 @@ class _Cells:
         first = np.arange(0, len(starts), CELL_RAYS)
         self.number = np.arange(len(starts)) // CELL_RAYS  # cells of the rays
         sums = np.add.reduceat(ahead, first, axis=0)
-        self.axes = sums / np.maximum(np.linalg.norm(sums, axis=1), 1e-9)[:, None]
+        self.axes = sums / np.maximum(length(sums), 1e-9)[:, None]
         cosine = np.minimum.reduceat(products(self.axes[self.number].T, ahead.T), first)
-        self.opening = np.arccos(np.clip(cosine, -1, 1))
+        self.opening = arccos(np.clip(cosine, -1, 1))
         self.begins = starts[first]
-        away = np.linalg.norm(starts - self.begins[self.number], axis=1)
+        away = length(starts - self.begins[self.number])
         self.moved = np.maximum.reduceat(away, first)
 
 
@@ -264,7 +266,7 @@ class _Retro:
 
     @cached_property
     def radius(self) -> float:
-        return float(np.linalg.norm(self.corners.reshape(-1, 3) - self.middle, axis=1).max())
+        return float(length(self.corners.reshape(-1, 3) - self.middle).max())
 
 
 def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
@@ -278,7 +280,7 @@ def _retros(scene: Scene, surfaces: Surfaces) -> Iterator[_Retro]:
         for part, matrix, owner in zip(shared.part, shared.transforms, shared.owner, strict=True):
             mesh = shared.parts[part]
             if retro[owner]:
-                vertices = mesh.vertices @ matrix[:, :3].T + matrix[:, 3]
+                vertices = turned(mesh.vertices, matrix[:, :3]) + matrix[:, 3]
                 yield from _clusters(begin + np.arange(len(mesh.faces)), vertices[mesh.faces])
             begin += len(mesh.faces)
     for number, actor in enumerate(scene.actors):
@@ -327,7 +329,7 @@ def _nearest(x: Floats, y: Floats, corners: Floats, depth: Floats) -> tuple[Floa
         inside &= np.stack([turn >= 0, turn <= 0])
         along = -(x[:, one] * dx + y[:, one] * dy) / np.maximum(dx * dx + dy * dy, 1e-300)
         along = np.clip(along, 0, 1)
-        off = np.hypot(x[:, one] + along * dx, y[:, one] + along * dy)
+        off = hypot(x[:, one] + along * dx, y[:, one] + along * dy)
         # A step on the plane is not the same share of the way between the corners.
         far = along * depth[:, one]
         share = far / (far + (1 - along) * depth[:, other])

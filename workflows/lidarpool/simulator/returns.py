@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 from raybeam import Pattern
 
 from ..base.arrays import AnyArray, Bytes, Floats, Ints, Ints32, Records, UInts32
+from ..base.elementary import arcsin, arctan2
+from ..base.vectors import turned
 from ..columns.table import Column
 from ..columns.waveforms import column_type
 from ..scene.colours import unpacked
@@ -21,7 +23,7 @@ from ..sensor.optics import LIGHT_M_NS
 from .doppler import radial_velocities
 from .echoes import Echoes
 from .hits import FALSE_ALARM, NO_SURFACE
-from .motion import Poses, turned
+from .motion import Poses
 from .surfaces import Lit, Surfaces, light_of
 
 LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
@@ -227,12 +229,12 @@ class BatchReturns:
     def azimuth(self) -> Floats:
         """Angle of the ray about the sensor's z axis, degrees, from 0 to 360."""
         x, y, _ = self._sensor_directions.T
-        return np.degrees(np.arctan2(y, x)) % 360
+        return np.degrees(arctan2(y, x)) % 360
 
     @cached_property
     def elevation(self) -> Floats:
         """Angle of the ray above the sensor's xy plane, degrees."""
-        return np.degrees(np.arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
+        return np.degrees(arcsin(np.clip(self._sensor_directions[:, 2], -1, 1)))
 
     # -- the surface -------------------------------------------------------------------------
 

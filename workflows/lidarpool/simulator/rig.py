@@ -13,12 +13,13 @@ from raybeam import Pattern
 
 from ..base.arrays import Floats, Floats32
 from ..base.errors import LidarpoolError
+from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
 from .device import DeviceColumns, DeviceReturns
 from .echoes import EchoCaster
-from .motion import Clock, Poses, check_trajectory, poses_of_firings, turned
+from .motion import Clock, Poses, check_trajectory, poses_of_firings
 from .returns import BatchReturns
 from .surfaces import Surfaces
 from .ways import Ways

@@ -94,11 +94,11 @@ def shine(objects, cosine, distance, reflectance, retro, extinction, out):
 @compiled("(i8[::1], i8, i8, f8[::1], f8[::1], f8[::1])")
 def times(ray, start, subrays, begins, delays, out):
     """Write when rays are fired, of which `subrays` are of a beam, from beam `start` on."""
-    low, firing, each = np.int64(0), np.int64(-1), len(delays)
+    low, firing, each = 0, -1, len(delays)
     for k in range(len(ray)):  # they follow each other
         beam = start + ray[k] // subrays
         if firing < 0 or not low <= beam < low + each:
-            firing = beam // each
+            firing = int(beam // each)
             low = firing * each
         out[k] = begins[firing] + delays[beam - low]
 

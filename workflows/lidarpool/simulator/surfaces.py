@@ -11,13 +11,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Indices, Integers, Ints, Ints32, UInts32, owned
+from ..base.vectors import applied, into_axes, inverse, length
 from ..scene.actors import shapes_of
 from ..scene.colours import GREY, Colours, Lookup, joined, luminance, packed
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
 from ..sensor.materials import NEAR_NM, Material, MaterialTable, at_right_angles
 from ..sensor.trajectory import velocities
-from .motion import carried_at, into_axes
+from .motion import carried_at
 from .voxels import Grids
 from .ways import Ways
 
@@ -156,7 +157,7 @@ class Surfaces:
         rows, objects, which = found
         poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
         if ways:
-            poses, run = ways.runs(objects - np.int64(self._standing), times)
+            poses, run = ways.runs(objects - np.int64(self._standing), owned(times))
         normals = np.empty((3, len(rows)))
         surface_loops.oriented(rows, which, self._turns, run, poses, self.unit_normals, normals)
         return normals
@@ -212,7 +213,7 @@ class Surfaces:
         if len(on):
             assert self._scene.instances is not None
             back = points[on] - self._scene.instances.transforms[which[on], :, 3]
-            points[on] = np.einsum("ni,nij->nj", back, self._turns[which[on]])
+            points[on] = into_axes(back, self._turns[which[on]])
         moving, actor = self._on_actors(triangle, ways)
         if len(moving):
             places, rotations = ways.poses(actor, times[moving].astype(np.float64))
@@ -392,13 +393,13 @@ class Surfaces:
             corners = same[corners.reshape(-1)].reshape(-1, 3)
             a, b, c = places[corners].transpose(1, 0, 2)
             normals = np.cross(b - a, c - a) * (-1 if inwards[number] else 1)
-            normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
+            normals /= np.maximum(length(normals)[:, None], 1e-300)
             # Each vertex goes where all of its triangles are so much further out, or nearly.
             squares, sums = np.zeros((len(places), 3, 3)), np.zeros((len(places), 3))
             np.add.at(squares, corners, (normals[:, :, None] * normals[:, None])[:, None])
             np.add.at(sums, corners, normals[:, None])
             squares += 1e-3 * np.eye(3)
-            step = by_m * np.linalg.solve(squares, sums[..., None])[..., 0]
+            step = by_m * applied(inverse(squares), sums)
             places += np.clip(step, -4 * by_m, 4 * by_m)
             vertices[used] = places[same]
         return vertices
@@ -431,7 +432,7 @@ class Surfaces:
                 block = faces[begin : begin + BLOCK_FACES]
                 a, b, c = vertices[block].transpose(1, 0, 2)
                 normals = np.cross(b - a, c - a)
-                lengths = np.linalg.norm(normals, axis=1, keepdims=True)
+                lengths = length(normals)[:, None]
                 out[:, at : at + len(block)] = (normals / np.maximum(lengths, 1e-300)).T
                 at += len(block)
         return out
@@ -446,7 +447,7 @@ class Surfaces:
 
 def _turns(transforms: Floats) -> Floats:
     """Matrices (n, 3, 3) that take normals of parts to those of instances, but for their length."""
-    return np.ascontiguousarray(np.linalg.inv(transforms[:, :, :3]).transpose(0, 2, 1), np.float64)
+    return np.ascontiguousarray(inverse(transforms[:, :, :3]).transpose(0, 2, 1))
 
 
 def _closed(vertices: Floats, faces: Integers) -> bool:

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..base.arrays import Bools, Floats, Indices
+from ..base.vectors import applied, inverse, matmul
 from ..scene.scene_instances import Instances
 
 BLOCK_RAYS = 1 << 13  # that go through grids at a time, to fit a cache
@@ -46,8 +47,8 @@ class Grids:
         """Find what takes places in the scene to those in the grid of each instance."""
         self._part, to = shared.part, shared.transforms
         matrices = self._matrices[self._part]
-        self._origins = (to[:, :, :3] @ matrices[:, :, 3:])[:, :, 0] + to[:, :, 3]
-        self._back = np.linalg.inv(to[:, :, :3] @ matrices[:, :, :3])
+        self._origins = applied(to[:, :, :3], matrices[:, :, 3]) + to[:, :, 3]
+        self._back = inverse(matmul(to[:, :, :3], matrices[:, :, :3]))
 
     def through(
         self,

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from ..base.arrays import Floats, Ints, Records
+from ..base.elementary import exp, log
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import Purpose, normal, raw
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
@@ -243,7 +244,7 @@ def add_echoes(samples: Floats, shift: Ints, when: Floats, energy: Floats, sigma
     """Add echoes at times `when` (n,) to samples; `shift` (n,) are the places of time 0."""
     first, many = first_samples(when, sigma)
     time = first[:, None] + np.arange(many)
-    height = energy[:, None] * np.exp(-0.5 * ((time - when[:, None]) / sigma) ** 2)
+    height = energy[:, None] * exp(-0.5 * ((time - when[:, None]) / sigma) ** 2)
     place = (time + shift[:, None]).ravel()
     samples += np.bincount(place, height.ravel(), minlength=len(samples))
 
@@ -263,10 +264,10 @@ def _peaks(waves: _Waves, sigma: float) -> tuple[Ints, Ints, _Found]:
     at = at[w[at] >= FAINT * waves.tops[waves.owner(at)]]
     if not len(at):
         return _NONE
-    before, here, behind = (np.log(w[at + step]) for step in (-1, 0, 1))
+    before, here, behind = (log(w[at + step]) for step in (-1, 0, 1))
     curve = np.minimum(before - 2 * here + behind, -1e-12)
     beside = np.clip((before - behind) / (2 * curve), -0.5, 0.5)
-    height = np.exp(here - (behind - before) ** 2 / (8 * curve))
+    height = exp(here - (behind - before) ** 2 / (8 * curve))
     which = np.searchsorted(at, np.arange(len(w)), side="right") - 1
     lowest = np.flatnonzero(w == np.minimum.reduceat(w, at)[which])
     lowest = lowest[which[lowest] >= 0]
@@ -291,7 +292,7 @@ def _gaussians(waves: _Waves, sigma: float) -> tuple[Ints, Ints, _Found]:
     at = np.flatnonzero((middle < bent[:-2]) & (middle <= bent[2:])) + 1
     owner = waves.owner(at)
     top = waves.tops[owner]
-    some = (w[at] >= FAINT * top) & (-bent[at] * sigma**2 >= CURVED * top)
+    some = (w[at] >= FAINT * top) & (-bent[at] * (sigma * sigma) >= CURVED * top)
     at, owner, top = at[some], owner[some], top[some]
     if not len(at):
         return _NONE
@@ -315,7 +316,7 @@ def _gaussians(waves: _Waves, sigma: float) -> tuple[Ints, Ints, _Found]:
         here = np.flatnonzero(number[of_sample] >= 0)
         mine = number[of_sample[here]]
         origin, scale = at[rows[0]], top[rows[0]]
-        high = np.minimum(w[at[rows]], -bent[at[rows]] * sigma**2) / scale
+        high = np.minimum(w[at[rows]], -bent[at[rows]] * (sigma * sigma)) / scale
         guess = np.stack([high, (at[rows] - origin) / sigma, np.ones(rows.shape)])
         fit = fitted((here - origin[mine]) / sigma, w[here] / scale[mine], mine, guess)
         # What is beyond a cut, no sample tells; so energies are those of the piece together.
@@ -368,7 +369,7 @@ def fitted(x: Floats, y: Floats, owner: Ints, guess: Floats) -> Floats:
     def misses(now: Floats) -> tuple[Floats, Floats, Floats]:
         height, place, width = now[:, :, owner]
         z = (x - place) / width
-        bell = np.exp(-0.5 * z * z)
+        bell = exp(-0.5 * z * z)
         rest = y.copy()
         for one in height * bell:
             rest -= one
@@ -502,7 +503,7 @@ def _window(
     when = digitizer.samples(hits.distance[rows])
     first, many = first_samples(when, digitizer.sigma)
     time = first[:, None] + np.arange(many)
-    height = np.exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
+    height = exp(-0.5 * ((time - when[:, None]) / digitizer.sigma) ** 2)
     height *= hits.energy[rows, None] / each
     place = time - begins[mine, None]
     inside = (place >= 0) & (place < count)

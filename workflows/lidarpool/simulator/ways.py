@@ -17,7 +17,7 @@ class _Tracks(NamedTuple):
 
     member: Ints  # (w,): number among the tracks of each trajectory, -1 for others
     first: Ints  # (t,): of each track its first segment
-    count: Ints  # (t,): and how many it has
+    segments: Ints  # (t,): and how many it has
     # (4, t): seconds, start by its clock, first and last time of its poses, and how far outside
     # these a time may be; inf if any.
     limits: Floats

@@ -180,11 +180,11 @@ class World:
         before[found.ray] = found.distance
         on = self.on_actors(scan, poses, before)
         most = len(found.ray) + len(on.ray)
-        merged = np.empty(most, np.int64), np.empty(most), np.empty(most, np.int32)
+        ray, distance = np.empty(most, np.int64), np.empty(most)
+        triangle = np.empty(most, np.int32)
         hits = found.ray, found.distance, found.triangle, on.ray, on.distance, on.triangle
-        count = surface_loops.merge(*hits, *merged)
-        ray, distance, triangle = (column[:count] for column in merged)
-        return ray, distance, triangle
+        count = surface_loops.merge(*hits, ray, distance, triangle)
+        return ray[:count], distance[:count], triangle[:count]
 
     def on_actors(self, scan: Scan, poses: Poses, before: Floats | None = None) -> OtherHits:
         """Find the nearest hits of rays on actors, at less than distances `before` (n,)."""

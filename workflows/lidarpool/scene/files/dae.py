@@ -20,6 +20,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import Bytes, Floats, Ints
+from ...base.vectors import length, matmul
 from ...base.xmlfile import xml_root
 from ..colours import Colours, as_bytes
 from ..masks import MaskError, MaskNotes, Texture, Wrap, read_colours, remembered
@@ -104,7 +105,7 @@ class _Document:
                     "apply it, then export"
                 )
             elif child.tag in _STEPS:
-                matrix = matrix @ _STEPS[child.tag](_numbers(child))
+                matrix = matmul(matrix, _STEPS[child.tag](_numbers(child)))
             elif child.tag == "skew":
                 raise MeshFileError("shears objects by <skew>, which is not supported: apply it")
         name = element.get("name", "") if element.tag == "node" else ""
@@ -317,8 +318,8 @@ def _rotate(numbers: Floats) -> Floats:
 
 def _look_at(numbers: Floats) -> Floats:
     eye, target, up = numbers.reshape(3, 3)
-    z = (eye - target) / np.linalg.norm(eye - target)
-    x = np.cross(up, z) / np.linalg.norm(np.cross(up, z))
+    z = (eye - target) / length(eye - target)
+    x = np.cross(up, z) / length(np.cross(up, z))
     out = np.eye(4)
     out[:3] = np.stack([x, np.cross(z, x), z, eye], axis=1)
     return out

@@ -23,6 +23,8 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import AnyArray, Bytes, Floats, Ints
+from ...base.elementary import sin_cos_of
+from ...base.vectors import applied, inverse, length, matmul
 from ...base.words import plural
 from ...sensor.trajectory import matrices
 from ..colours import LINEAR, Colours, as_srgb
@@ -175,7 +177,10 @@ class _Reader:
             else:
                 meshes = self._bent(found["mesh"], weights, skin)
             if skin is not None:  # its joints place it, not the node
-                copies = np.linalg.inv(self._world(index)).astype(np.float64)[None]
+                world, back = self._world(index), np.eye(4)
+                back[:3, :3] = inverse(world[:3, :3])
+                back[:3, 3] = -applied(back[:3, :3], world[:3, 3])
+                copies = back[None]
             if instancing := found.get("extensions", {}).get(_INSTANCING):
                 copies = self._copies(instancing.get("attributes", {}))
         return Node(name, _matrix(found), meshes, found.get("children", ()), copies)
@@ -219,7 +224,7 @@ class _Reader:
             if at in seen:
                 raise ValueError("nodes contain each other")
             seen.add(at)
-            matrix, at = _matrix(self._part("nodes", at)) @ matrix, self._parents.get(at)
+            matrix, at = matmul(_matrix(self._part("nodes", at)), matrix), self._parents.get(at)
         return matrix
 
     def _read_bent(
@@ -257,7 +262,7 @@ class _Reader:
         worlds = np.array([self._world(joint) for joint in found["joints"]])
         if (bound := found.get("inverseBindMatrices")) is not None:
             columns = self._accessor(bound).astype(np.float64)[: len(worlds)]
-            worlds = worlds @ columns.reshape(-1, 4, 4).transpose(0, 2, 1)
+            worlds = matmul(worlds, columns.reshape(-1, 4, 4).transpose(0, 2, 1))
         return worlds
 
     def _skinned(self, vertices: Floats, at: dict[str, Any], joints: Floats) -> Floats:
@@ -276,7 +281,7 @@ class _Reader:
         blend[loose] = joints[self._accessor(at["JOINTS_0"])[loose, 0].astype(np.int64)]
         total[loose] = 1.0
         blend /= total[:, None, None]
-        moved = np.einsum("vij,vj->vi", blend[:, :3, :3], vertices) + blend[:, :3, 3]
+        moved = applied(blend[:, :3, :3], vertices) + blend[:, :3, 3]
         return np.asarray(moved)
 
     def _primitive(self, primitive: dict[str, Any]) -> Piece:
@@ -430,10 +435,10 @@ class _Reader:
         if moved:
             # Of KHR_texture_transform: scaled, rotated anticlockwise as v grows down, moved.
             turn = float(moved.get("rotation", 0))
-            c, s = np.cos(turn), np.sin(turn)
+            s, c = sin_cos_of(turn)
             self._allowance.take(32 * len(uv))
             uv = uv * np.array(moved.get("scale", (1, 1)), np.float64)
-            uv = uv @ np.array([[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
+            uv = matmul(uv, [[c, -s], [s, c]]) + np.array(moved.get("offset", (0, 0)))
         return uv
 
     def _attribute(self, name: str, primitive: dict[str, Any], mesh: Any) -> AnyArray:
@@ -578,7 +583,7 @@ def _matrices(
         return None
     out = np.tile(np.eye(4), (len(rows), 1, 1))
     if rotation is not None:
-        unit = rotation / np.linalg.norm(rotation, axis=1, keepdims=True)
+        unit = rotation / length(rotation)[:, None]
         out[:, :3, :3] = matrices(unit)
     if scale is not None:
         out[:, :3, :3] *= scale[:, None]

@@ -14,8 +14,10 @@ import numpy as np
 
 from ...base.allowance import check_fits
 from ...base.arrays import Floats
+from ...base.elementary import cbrt
 from ...base.errors import LidarpoolError, prefixed
 from ...base.validation import checked
+from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
 from ...base.words import did_you_mean, plural, printable
 from ...sensor import Track
@@ -367,19 +369,19 @@ def _actor(one: RigidPart, stem: str, upright: Transform, placed: Transform) -> 
     Its mesh has all scales, since a trajectory turns and moves only.
     """
     name = printable(one.name) or printable(stem)
-    unit_m, scale = (np.cbrt(np.linalg.det(place.linear)) for place in (upright, placed))
+    unit_m, scale = (cbrt(determinant(place.linear)) for place in (upright, placed))
     axes, turn = upright.linear / unit_m, placed.linear / scale
-    if np.abs(turn @ turn.T - np.eye(3)).max() > _EVEN:
+    if np.abs(matmul(turn, turn.T) - np.eye(3)).max() > _EVEN:
         raise LidarpoolError(
             f"Object {name!r} moves, and its placement scales it unevenly: give one factor."
         )
     objects = [part.moved(name, scale * upright.linear, np.zeros(3)) for part in one.objects]
-    positions = one.positions @ (placed.linear @ upright.linear).T + placed.offset
+    positions = turned(one.positions, matmul(placed.linear, upright.linear)) + placed.offset
     if not np.abs(positions).max() <= FARTHEST_M:
         raise LidarpoolError(
             f"Object {name!r} moves farther than anything on Earth: check its unit and placement."
         )
-    turns = quaternions_of(turn @ axes @ one.rotations @ axes.T)
+    turns = quaternions_of(matmul(matmul(matmul(turn, axes), one.rotations), axes.T))
     track = Track(one.times_s, positions, turns, start_s=0.0, beyond="hold")
     return Actor(one_mesh(name, objects), track)
 
@@ -395,4 +397,4 @@ def _corners(one: SceneMesh | SceneInstance) -> Floats:
     if isinstance(one, SceneMesh):
         return one.bounds
     box = np.array(list(product(*one.mesh.bounds.T)))
-    return np.asarray(box @ one.matrix[:3, :3].T + one.matrix[:3, 3])
+    return np.asarray(turned(box, one.matrix[:3, :3]) + one.matrix[:3, 3])

@@ -6,6 +6,7 @@ import mapbox_earcut
 import numpy as np
 
 from ...base.arrays import Bools, Floats, Ints
+from ...base.vectors import applied, length, turned
 
 # For an outline that crosses itself everywhere, the clipper's time grows with their cube: 20 s for
 # so many. Larger outlines are probably broken files.
@@ -120,13 +121,10 @@ def _lost(points: Floats, triangles: Floats) -> bool:
     points = points - points[0]
     size = np.abs(points).max()
     normal = _newell(points)
-    off = np.ptp(points @ normal)
+    off = np.ptp(applied(points, normal))
     a, b, c = np.moveaxis(triangles, 1, 0)
     missing = normal - np.cross(b - a, c - a).sum(axis=0)
-    return bool(
-        off > _WARPED * size * np.linalg.norm(normal)
-        and np.linalg.norm(missing) > _WARPED * size**2
-    )
+    return bool(off > _WARPED * size * length(normal) and length(missing) > _WARPED * size * size)
 
 
 def _all_triangles(points: Floats) -> Ints:
@@ -137,15 +135,15 @@ def _all_triangles(points: Floats) -> Ints:
     count = len(points)
     points = points - points[0]
     normal = _newell(points)
-    normal = normal / np.linalg.norm(normal)
+    normal = normal / length(normal)
     across = np.cross(normal, np.eye(3)[np.abs(normal).argmin()])
-    found = _clipped(points @ np.stack([across, np.cross(normal, across)], axis=1), [count])
+    found = _clipped(turned(points, np.stack([across, np.cross(normal, across)])), [count])
     if len(found) == count - 2:
         return found
 
     def area(begin: int) -> float:
         rest = np.roll(points, -begin, axis=0) - points[begin]
-        return float(np.linalg.norm(np.cross(rest[1:-1], rest[2:]), axis=1).sum())
+        return float(length(np.cross(rest[1:-1], rest[2:])).sum())
 
     best = min(range(count), key=area)
     return fanned((best + np.arange(count)) % count)
@@ -173,5 +171,5 @@ def _turns(points: Floats) -> Bools:
     turn = np.cross(into, out_of)
     normal = np.cross(points, np.roll(points, -1, axis=1)).sum(axis=1)
     along = (turn * normal[:, None]).sum(axis=2)
-    scale = np.linalg.norm(into, axis=2) * np.linalg.norm(out_of, axis=2)
-    return np.asarray(along < -_FLAT * scale * np.linalg.norm(normal, axis=1)[:, None])
+    scale = length(into) * length(out_of)
+    return np.asarray(along < -_FLAT * scale * length(normal)[:, None])

@@ -22,6 +22,7 @@ import numpy as np
 
 from ...base.allowance import LEAST, bytes_of, check_fits, memory_share
 from ...base.arrays import AnyArray, Bools, Floats
+from ...base.elementary import decade
 from ...base.vocabulary import UNITS_M
 from ...base.words import plural
 from ..scene_mesh import SceneMesh
@@ -39,7 +40,7 @@ _OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with in
 
 _AT_ONCE = 100_000  # vertices that are reprojected, through lists
 _PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
-_MOST_READ = 10**9  # pixels of which a coarser grid is made, which takes two minutes
+_MOST_READ = 1_000_000_000  # pixels of which a coarser grid is made, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
 Window = tuple[float, float, float, float]  # lowest x and y, highest x and y
@@ -384,8 +385,8 @@ def _check_size(grid: _RasterGrid, columns: PixelRange, rows: PixelRange) -> Non
     step = grid.pixel_m
     while np.prod(np.ceil((high - low) / step) + 1) > 0.9 * most:
         step *= 1.1
-    digits = 2 - math.floor(math.log10(step))
-    step = math.ceil(step * 10**digits) / 10**digits
+    scale = float(f"1e{2 - decade(step)}")
+    step = math.ceil(step * scale) / scale
     coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
         f"has {sides[0]:,} x {sides[1]:,} pixels, a mesh of {bytes_of(count * _PIXEL_BYTES)}, of "

@@ -14,6 +14,7 @@ import numpy as np
 
 from ...base.allowance import Allowance, bytes_of, memory_share
 from ...base.arrays import AnyArray, Floats, Ints
+from ...base.vectors import matmul, rank
 from .. import colours
 from ..colours import Colours
 from ..scene_instances import SceneInstance
@@ -128,9 +129,9 @@ def instances(roots: Iterable[Any], node_of: Callable[[Any], Node], stem: str) -
                 f"has nodes that contain each other, or copies, more than {MOST_NODES:,} in all: "
                 "export it in parts"
             )
-        matrix = above @ node.matrix
+        matrix = matmul(above, node.matrix)
         path = (*path[1 - _NAMES :], node.name) if node.name else path
-        places = [matrix] if node.copies is None else matrix @ node.copies
+        places = [matrix] if node.copies is None else matmul(matrix, node.copies)
         placed += [
             PlacedNode(mesh, place, path[-1] if path else mesh.name or stem, path)
             for place in places
@@ -177,11 +178,11 @@ def settled(placed: Sequence[PlacedNode]) -> Content:
         raise MeshFileError(
             f"places {name[:80]!r} by a matrix that is none of a place: {matrix.tolist()}"
         )
-    ranks = np.linalg.matrix_rank(matrices[:, :3, :3])
-    for (mesh, matrix, name, _), rank in zip(placed, ranks.tolist(), strict=True):
-        if rank < 2:
+    ranks = rank(matrices[:, :3, :3]).tolist()
+    for (mesh, matrix, name, _), dimensions in zip(placed, ranks, strict=True):
+        if dimensions < 2:
             content.skipped.append(name)
-        elif mesh in shared and rank == 3:
+        elif mesh in shared and dimensions == 3:
             objects.append(SceneInstance(mesh, matrix, name))
         else:
             objects.append(mesh.moved(name, matrix[:3, :3], matrix[:3, 3]))

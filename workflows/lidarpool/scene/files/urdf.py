@@ -22,6 +22,7 @@ from ...base.allowance import Allowance, check_fits
 from ...base.arrays import Bytes, Floats
 from ...base.errors import LidarpoolError, prefixed
 from ...base.validation import checked, shown
+from ...base.vectors import length
 from ...base.words import printable
 from ...base.xmlfile import xml_root
 from ...sensor.trajectory import rotations_of
@@ -182,9 +183,9 @@ def _joint(element: Element, links: Collection[str]) -> tuple[str, Joint]:
     axis, limits, mimic = np.array([1.0, 0.0, 0.0]), None, None
     if kind in MOVING:
         axis = _numbers(element.find("axis"), "xyz", 3, "1 0 0")
-        if not (length := np.linalg.norm(axis)) > 1e-9:
+        if not (size := length(axis)) > 1e-9:
             raise LidarpoolError("its axis has no direction.")
-        axis = axis / length
+        axis = axis / size
         limit = element.find("limit")
         if kind != "continuous" and limit is not None:
             low, high = (_numbers(limit, name, 1, "0").item() for name in ("lower", "upper"))

@@ -25,6 +25,7 @@ import numpy as np
 
 from ...base.allowance import Allowance, bytes_of, memory_share
 from ...base.arrays import AnyArray
+from ...base.vectors import inverse, matmul
 from ...base.words import plural
 from ..actors import box
 from ..scene_instances import SceneInstance, scale_of
@@ -226,7 +227,7 @@ def _content(
             if row is not None:
                 return Node("", copies[places][row], (), [copied])
             name, mesh, *_ = nodes[copied]
-            return Node(name, np.eye(4), meshes[mesh], (), copies[places] @ matrices[copied])
+            return Node(name, np.eye(4), meshes[mesh], (), matmul(copies[places], matrices[copied]))
         name, mesh, children, instanced = nodes[key]
         for copied, places in instanced:
             inner = nodes[copied]
@@ -248,7 +249,7 @@ def _content(
             shared = [one.mesh for one in found.meshes if isinstance(one, SceneInstance)]
             # An actor has no instances.
             allowance.take(sum(80 * len(mesh.faces) for mesh in shared))
-            turns = places[:, :, :3] @ np.linalg.inv(stretch)
+            turns = matmul(places[:, :, :3], inverse(stretch))
             times = (motion[:, 0] - frame["start"]) / frame["rate_hz"]
             if not (np.abs(times) < _LATEST_S).all():
                 raise ValueError("its times are not finite, or reach over 30 years")

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...base.allowance import Allowance
 from ...base.arrays import AnyArray, Bools, Floats, Ints
+from ...base.vectors import matmul
 from ..colours import LINEAR, Colours, as_srgb
 from ..masks import (
     FACE_BYTES,
@@ -76,7 +77,7 @@ class Look:
         """Texture coordinates (c, 2) as in glTF, and which of them triangles have, (k, 3)."""
         values, corners = self._at(source["values"], rows, 2)
         matrix = np.array(source.get("matrix", np.eye(3, 2)))
-        u, v = (values @ matrix[:2] + matrix[2]).T
+        u, v = (matmul(values, matrix[:2]) + matrix[2]).T
         return np.stack([u, 1 - v], axis=1), corners
 
     def painted(self, name: str, rows: Ints) -> Colours | None:
