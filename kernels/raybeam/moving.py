@@ -211,11 +211,15 @@ class _Chunk:
         given = cell, number, poses, boxes, shape, pads
         row, pair = loops.through(rays, self._nearest.distance, *given)
         body, number = body[pair], number[pair]
-        if len(late):  # each ray at its own time
+        if len(late):  # each of their rays at its own time
+            straddles = np.zeros(len(cell), np.bool_)
+            straddles[late] = True
             first, last = moving.there[body].T
-            there = (first <= times[row]) & (times[row] <= last)
-            row, body = row[there], body[there]
-            poses, number = moving.poses(body, times[row]), np.arange(len(row))
+            there = np.flatnonzero((first <= times[row]) & (times[row] <= last))
+            row, body, number, pair = row[there], body[there], number[there], pair[there]
+            some = np.flatnonzero(straddles[pair])
+            number[some] = poses.shape[1] + np.arange(len(some))
+            poses = np.concatenate([poses, moving.poses(body[some], times[row[some]])], axis=1)
         limits, shape = (self._scan.t_min, self._scan.t_max), moving.shape[body]
         several = len(moving.shapes) > 1
         for one in np.unique(shape).tolist() if several else [0]:

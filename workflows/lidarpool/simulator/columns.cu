@@ -14,10 +14,9 @@ enum { X, Y, Z, CHANNEL, OBJECT, RAY, TIME, RANGE, INTENSITY, REFLECTIVITY, CLAS
 // Cosine of the angle between a ray and a normal, which `turn` takes to the scene's axes, if it is
 // not 0.
 __device__ __forceinline__ double cosine(
-    const float* normals, Count faces, Count row, const double* turn, const double* direction,
-    Count count)
+    const float* normal, const double* turn, const double* direction, Count count)
 {
-    double x = normals[row], y = normals[faces + row], z = normals[2 * faces + row];
+    double x = normal[0], y = normal[1], z = normal[2];
     if (turn) {
         const double a = (turn[0] * x + turn[1] * y) + turn[2] * z;
         const double b = (turn[3] * x + turn[4] * y) + turn[5] * z;
@@ -33,7 +32,7 @@ __device__ __forceinline__ double cosine(
 // Hits: see `DeviceHits`; origins and directions are (3, count).
 // Rays: `firsts` of the scans, start of each firing after `start_ns` and delay of each beam, ns.
 // Surfaces: of each instance its first triangle, its object or -1 to look that up in `owners`, and
-// the row of its first normal, or -1 where NumPy makes the energies; normals (3, faces); a matrix
+// the row of its first normal, or -1 where NumPy makes the energies; normals (faces, 3); a matrix
 // for the normals of each instance.
 KERNEL columns(
     const unsigned int* __restrict__ ray, const double* __restrict__ distance,
@@ -43,7 +42,7 @@ KERNEL columns(
     const Count* __restrict__ firsts, int scans, const double* __restrict__ begins,
     const double* __restrict__ delays, int channels, Count start_ns,
     const Count* __restrict__ bodies, const int* __restrict__ owners,
-    const float* __restrict__ normals, Count faces, const double* __restrict__ turns,
+    const float* __restrict__ normals, const double* __restrict__ turns,
     const double* __restrict__ reflectance, const unsigned char* __restrict__ retro,
     double retro_gain, double reference, double nearest,
     const unsigned short* __restrict__ classes,
@@ -85,7 +84,7 @@ KERNEL columns(
     if (WANTED(CLASS)) semantic[k] = classes[owner];
     if (body[2] >= 0 && (WANTED(INTENSITY) || WANTED(REFLECTIVITY))) {
         const double* turn = body[1] < 0 ? 0 : turns + 9 * (Count)instance[k];
-        const double along = cosine(normals, faces, body[2] + face, turn, directions + k, count);
+        const double along = cosine(normals + 3 * (body[2] + face), turn, directions + k, count);
         const double scattered = reflectance[owner] * (retro[owner] ? retro_gain : along);
         const double share = reference / fmax(metres, nearest);
         const double lost = share * share;

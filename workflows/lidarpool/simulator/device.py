@@ -163,7 +163,7 @@ class DeviceColumns:
         """Tables of the surfaces for columns.cu, on the caster's device; see there."""
         if self._sent is None:
             surfaces, materials = self._surfaces, self._surfaces.materials
-            normals = surfaces.unit_normals if self.energies else np.zeros((3, 1), np.float32)
+            normals = surfaces.unit_normals if self.energies else np.zeros((1, 3), np.float32)
             tables = (
                 self.bodies, surfaces.owners, normals, materials.reflectance,
                 materials.retro.astype(np.uint8), materials.semantic_class,
@@ -244,7 +244,7 @@ class _Making:
             cupy.asarray(self._groups), np.int32(len(specs)),
             cupy.asarray(sensor.begins_ns(firings)), cupy.asarray(sensor.beams.time_ns),
             np.int32(sensor.channels), np.int64(specs[0].start_ns),
-            bodies, owners, normals, np.int64(normals.shape[1]), turns,
+            bodies, owners, normals, turns,
             reflectance, retro, np.float64(RETRO_GAIN), np.float64(REFERENCE_M),
             np.float64(NEAREST_M), classes,
         )  # fmt: skip

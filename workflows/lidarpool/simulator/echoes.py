@@ -118,7 +118,7 @@ class EchoCaster:
             beam = self._beam
             if len(beam) == 1 and not noise.angle_deg:
                 divided = pattern
-            unit = poses.rays_per_pose or 1
+            unit = poses.rays_per_pose or self._sensor.channels
             size = max(1, CHUNK_RAYS // (len(beam) * unit)) * unit
             chunks = []
             for start in range(0, rays, size):

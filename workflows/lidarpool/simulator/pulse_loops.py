@@ -255,83 +255,102 @@ def returns(
             last += 1
         while last_air < len(air_ray) and air_ray[last_air] < end:
             last_air += 1
-        if last - i + last_air - j > size:
-            size = 2 * (last - i + last_air - j)
-            own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
-        n, least, most = 0, np.inf, -np.inf
-        while i < last or j < last_air:  # what is in the air first
-            if j < last_air and (i == last or air_ray[j] <= ray[i]):
-                sub[n], far[n], light[n], hard[n] = (
-                    air_ray[j],
-                    air_distance[j],
-                    air_energy[j],
-                    False,
-                )
-                own[n, 0] = -1 - j
+        begin, n, least, most, best = count, 0, np.inf, -np.inf, i
+        sum_, mean, drift = 0.0, 0.0, 0.0
+        for k in range(i, last):
+            if energy[k] > 0:
+                least, most = min(least, distance[k]), max(most, distance[k])
+                sum_ += energy[k]
+                mean += energy[k] * distance[k]
                 if moves:
-                    speed[n] = air_velocity[j]
-                j += 1
-            else:
-                sub[n], far[n], light[n], hard[n] = ray[i], distance[i], energy[i], solid[i]
-                own[n, 0] = i
-                if moves:
-                    speed[n] = velocity[i]
-                i += 1
-            if light[n] > 0:
-                least, most = min(least, far[n]), max(most, far[n])
-                n += 1
-        if n == 0:
-            continue
-        new[0], several = True, False
-        if most - least > gap_m:  # few beams hit an edge or graze a surface
-            for k in range(1, n):
-                a, b, c, d, e, f = sub[k], far[k], light[k], hard[k], own[k, 0], speed[k]
-                place = k
-                while place > 0 and far[place - 1] > b:
-                    sub[place], far[place], light[place] = (
-                        sub[place - 1],
-                        far[place - 1],
-                        light[place - 1],
-                    )
-                    hard[place], own[place, 0] = hard[place - 1], own[place - 1, 0]
-                    speed[place] = speed[place - 1]
-                    place -= 1
-                sub[place], far[place], light[place], hard[place] = a, b, c, d
-                own[place, 0], speed[place] = e, f
-            surface, number = -1, 0
-            for k in range(n):
-                if k:
-                    new[k] = far[k] - far[k - 1] > gap_m
-                    number += int(new[k])
-                if hard[k]:  # surfaces can only continue if they are in several returns
-                    several |= surface >= 0 and surface != number
-                    surface = number
-            if several and len(pairs):
-                _joined(
-                    0, n, new, new, sub, far, hard, own, gap_m, each, pairs, normals, directions,
-                    table, changes,
-                )  # fmt: skip
-        else:
-            for k in range(1, n):
-                new[k] = False
-        begin, k = count, 0
-        while k < n:  # a return
-            best, sum_, mean, drift = k, 0.0, 0.0, 0.0
-            while True:
-                sum_ += light[k]
-                mean += light[k] * far[k]
-                if moves:
-                    drift += light[k] * speed[k]
-                if light[k] > light[best]:
+                    drift += energy[k] * velocity[k]
+                if n == 0 or energy[k] > energy[best]:
                     best = k
-                k += 1
-                if k == n or new[k]:
-                    break
-            whole[0, count], whole[1, count] = beam, own[best, 0]
+                n += 1
+        if j == last_air and most - least <= gap_m:  # most beams meet one surface, and no air
+            whole[0, count], whole[1, count] = beam, best
             real[0, count], real[1, count] = mean / sum_, sum_ / each
             if moves:
                 real[2, count] = drift / sum_
-            count += 1
+            i, count = last, count + int(n > 0)
+        else:
+            if last - i + last_air - j > size:
+                size = 2 * (last - i + last_air - j)
+                own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
+            n, least, most = 0, np.inf, -np.inf
+            while i < last or j < last_air:  # what is in the air first
+                if j < last_air and (i == last or air_ray[j] <= ray[i]):
+                    sub[n], far[n], light[n], hard[n] = (
+                        air_ray[j],
+                        air_distance[j],
+                        air_energy[j],
+                        False,
+                    )
+                    own[n, 0] = -1 - j
+                    if moves:
+                        speed[n] = air_velocity[j]
+                    j += 1
+                else:
+                    sub[n], far[n], light[n], hard[n] = ray[i], distance[i], energy[i], solid[i]
+                    own[n, 0] = i
+                    if moves:
+                        speed[n] = velocity[i]
+                    i += 1
+                if light[n] > 0:
+                    least, most = min(least, far[n]), max(most, far[n])
+                    n += 1
+            if n == 0:
+                continue
+            new[0], several = True, False
+            if most - least > gap_m:  # few beams hit an edge or graze a surface
+                for k in range(1, n):
+                    a, b, c, d, e, f = sub[k], far[k], light[k], hard[k], own[k, 0], speed[k]
+                    place = k
+                    while place > 0 and far[place - 1] > b:
+                        sub[place], far[place], light[place] = (
+                            sub[place - 1],
+                            far[place - 1],
+                            light[place - 1],
+                        )
+                        hard[place], own[place, 0] = hard[place - 1], own[place - 1, 0]
+                        speed[place] = speed[place - 1]
+                        place -= 1
+                    sub[place], far[place], light[place], hard[place] = a, b, c, d
+                    own[place, 0], speed[place] = e, f
+                surface, number = -1, 0
+                for k in range(n):
+                    if k:
+                        new[k] = far[k] - far[k - 1] > gap_m
+                        number += int(new[k])
+                    if hard[k]:  # surfaces can only continue if they are in several returns
+                        several |= surface >= 0 and surface != number
+                        surface = number
+                if several and len(pairs):
+                    _joined(
+                        0, n, new, new, sub, far, hard, own, gap_m, each, pairs, normals,
+                        directions, table, changes,
+                    )  # fmt: skip
+            else:
+                for k in range(1, n):
+                    new[k] = False
+            k = 0
+            while k < n:  # a return
+                best, sum_, mean, drift = k, 0.0, 0.0, 0.0
+                while True:
+                    sum_ += light[k]
+                    mean += light[k] * far[k]
+                    if moves:
+                        drift += light[k] * speed[k]
+                    if light[k] > light[best]:
+                        best = k
+                    k += 1
+                    if k == n or new[k]:
+                        break
+                whole[0, count], whole[1, count] = beam, own[best, 0]
+                real[0, count], real[1, count] = mean / sum_, sum_ / each
+                if moves:
+                    real[2, count] = drift / sum_
+                count += 1
         stop = count
         if len(starts):  # those that are detected
             number_row = _scan_of(begins, first + beam, number_row)

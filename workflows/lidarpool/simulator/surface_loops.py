@@ -18,42 +18,58 @@ def _product(x, y, z, a, b, c):
     return (x * a + y * b) + z * c
 
 
-@compiled("(i4[::1], i8[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, i8[::1], i4[::1], i8[::1])")
-def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, objects, which):
-    """Write rows among the triangles that are kept once, objects, and instances, or -1.
+@inlined
+def _found(t, begins, owners, shared, firsts, to_kept, standing):
+    """Row among the triangles that are kept once, object, and instance or -1 of a triangle.
 
     Triangles of instances begin at `begins`, whose last is where those of actors begin; `shared`
     and `firsts` are objects and first rows of instances.
     """
     plain, actors = begins[0], begins[-1]
-    for k in range(len(triangle)):
-        t, which[k] = np.int64(triangle[k]), -1
-        if t < plain:
-            rows[k], objects[k] = t, owners[t]
-        elif t >= actors:
-            owner = owners[t - (actors - plain)]
-            rows[k], objects[k] = t + to_kept[owner - standing], owner
+    if t < plain:
+        return t, owners[t], -1
+    if t >= actors:
+        owner = owners[t - (actors - plain)]
+        return t + to_kept[owner - standing], owner, -1
+    low, high = 0, len(shared)  # the last that begins, by halves
+    while high - low > 1:
+        middle = (low + high) // 2
+        if begins[middle] <= t:
+            low = middle
         else:
-            low, high = 0, len(shared)  # the last that begins, by halves
-            while high - low > 1:
-                middle = (low + high) // 2
-                if begins[middle] <= t:
-                    low = middle
-                else:
-                    high = middle
-            rows[k], objects[k], which[k] = firsts[low] + t - begins[low], shared[low], low
+            high = middle
+    return firsts[low] + t - begins[low], shared[low], low
 
 
-@compiled("(i8[::1], i8[::1], f8[:, :, ::1], i8[::1], f8[:, ::1], f4[:, ::1], f8[:, ::1])")
-def oriented(rows, which, turns, run, poses, normals, out):
-    """Write unit normals (3, n): of instances turned, and of actors by poses (12, m) of `run`."""
-    for k in range(len(rows)):
-        row = rows[k]
-        x = np.float64(normals[0, row])
-        y = np.float64(normals[1, row])
-        z = np.float64(normals[2, row])
-        if which[k] >= 0:  # in one order of rounding, that of columns.cu
-            t = turns[which[k]]
+@compiled("(i4[::1], i8[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, i8[::1], i4[::1], i8[::1])")
+def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, objects, which):
+    """Write what `_found` says of triangles."""
+    for k in range(len(triangle)):
+        rows[k], objects[k], which[k] = _found(
+            np.int64(triangle[k]), begins, owners, shared, firsts, to_kept, standing
+        )
+
+
+@compiled(
+    "(i4[::1], i8[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, f8[:, ::1], f8[:, :, ::1], "
+    "f4[:, ::1], i8[::1], f8[:, ::1], f8[::1], b1[::1], f8[:, ::1], f8[::1], i4[::1], f8[::1])"
+)
+def meet(
+    triangle, begins, owners, shared, firsts, to_kept, standing, directions, turns, table, run,
+    poses, reflectance, retro, normals, along, objects, back,
+):  # fmt: skip
+    """Write unit normals (3, n), their products with directions (3, n), objects, and light.
+
+    Normals in `table` (f, 3) are turned by instances, and by poses (12, m) of each `run`. The light
+    is what surfaces send back that are neither textured nor rough, at a distance of 10 m.
+    """
+    for k in range(len(triangle)):
+        row, owner, which = _found(
+            np.int64(triangle[k]), begins, owners, shared, firsts, to_kept, standing
+        )
+        x, y, z = np.float64(table[row, 0]), np.float64(table[row, 1]), np.float64(table[row, 2])
+        if which >= 0:  # in one order of rounding, that of columns.cu
+            t = turns[which]
             a = _product(t[0, 0], t[0, 1], t[0, 2], x, y, z)
             b = _product(t[1, 0], t[1, 1], t[1, 2], x, y, z)
             c = _product(t[2, 0], t[2, 1], t[2, 2], x, y, z)
@@ -66,29 +82,20 @@ def oriented(rows, which, turns, run, poses, normals, out):
                 _product(poses[6, p], poses[7, p], poses[8, p], x, y, z),
                 _product(poses[9, p], poses[10, p], poses[11, p], x, y, z),
             )
-        out[0, k], out[1, k], out[2, k] = x, y, z
+        cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
+        normals[0, k], normals[1, k], normals[2, k] = x, y, z
+        along[k], objects[k] = cosine, owner
+        back[k] = reflectance[owner] * (RETRO_GAIN if retro[owner] else abs(cosine))
 
 
-@compiled("(f8[:, ::1], f8[:, ::1], f8[::1])")
-def along(normals, directions, out):
-    """Write scalar products of vectors (3, n)."""
-    for k in range(len(out)):
-        out[k] = _product(
-            normals[0, k], normals[1, k], normals[2, k],
-            directions[0, k], directions[1, k], directions[2, k],
-        )  # fmt: skip
-
-
-@compiled("(i4[::1], f8[::1], f8[::1], f8[::1], b1[::1], f8, f8[::1])")
-def shine(objects, cosine, distance, reflectance, retro, extinction, out):
-    """Write energies, see `Surfaces.energy`, of materials that are neither textured nor rough."""
-    for k in range(len(objects)):
-        row = objects[k]
-        back = reflectance[row] * (RETRO_GAIN if retro[row] else cosine[k])
+@compiled("(f8[::1], f8, f8[::1])")
+def fade(distance, extinction, energy):
+    """Multiply energies by what `at_right_angles` says of distances."""
+    for k in range(len(energy)):
         far = max(distance[k], NEAREST_M)
         nearer = REFERENCE_M / far
         nearer = nearer * nearer
-        out[k] = back * (nearer * exp(-2 * extinction * far) if extinction else nearer)
+        energy[k] *= nearer * exp(-2 * extinction * far) if extinction else nearer
 
 
 @compiled("(i8[::1], i8, i8, f8[::1], f8[::1], f8[::1])")
@@ -114,7 +121,7 @@ def merge(
             out[count], out_m[count], out_triangle[count] = ray[i], distance[i], triangle[i]
             i += 1
         else:
-            i += np.int64(i < len(ray) and ray[i] == other_ray[j])
+            i += int(i < len(ray) and ray[i] == other_ray[j])
             out[count], out_m[count] = other_ray[j], other_distance[j]
             out_triangle[count] = other_triangle[j]
             j += 1

@@ -147,20 +147,28 @@ class Surfaces:
 
         Those of actors are rotated by the pose on their ways at the times (n,), nanoseconds.
         """
-        return self._normals(self._find(triangle), times, ways).T
+        return self._met(triangle, np.zeros((len(triangle), 3)), self.materials, times, ways)[0].T
 
-    def _normals(
-        self, found: tuple[Indices, Ints32, Indices], times: Floats | Ints, ways: Ways
-    ) -> Floats:
-        from . import surface_loops
+    def _met(
+        self,
+        triangle: Integers,
+        directions: Floats,
+        table: MaterialTable,
+        times: Floats | Ints,
+        ways: Ways,
+    ) -> tuple[Floats, Floats, Ints32, Floats]:
+        """Return normals (3, n), their products with directions, objects, and light sent back."""
+        from . import surface_loops  # not before: numba takes half a second to import
 
-        rows, objects, which = found
-        poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
+        hits, poses, run = owned(triangle, np.int32), np.zeros((12, 0)), np.zeros(0, np.int64)
         if ways:
-            poses, run = ways.runs(objects - np.int64(self._standing), owned(times))
-        normals = np.empty((3, len(rows)))
-        surface_loops.oriented(rows, which, self._turns, run, poses, self.unit_normals, normals)
-        return normals
+            poses, run = ways.runs(self.objects(hits) - np.int64(self._standing), owned(times))
+        normals, objects = np.empty((3, len(hits))), np.empty(len(hits), np.int32)
+        along, back = np.empty((2, len(hits)))
+        given = self._turns, self.unit_normals, run, poses, table.reflectance, table.retro
+        out = normals, along, objects, back
+        surface_loops.meet(hits, *self._numbers, owned(directions.T), *given, *out)
+        return normals, along, objects, back
 
     def lit(
         self,
@@ -175,11 +183,13 @@ class Surfaces:
         """How rays (n,) with unit directions (n, 3) meet triangles; others as of `energy`."""
         from . import surface_loops
 
-        found = self._find(triangle)
-        normals, along = self._normals(found, times, ways), np.empty(len(triangle))
-        surface_loops.along(normals, owned(directions.T), along)
-        energy = self._energy(found[1], np.abs(along), distance, light, colours)
-        return Lit(normals.T, along, found[1], energy)
+        table = self.at(light.wavelength_nm)
+        normals, along, objects, back = self._met(triangle, directions, table, times, ways)
+        if table.textured or table.roughness.any():
+            bright = luminance(colours) if table.textured and colours is not None else None
+            back = table.scattered(objects, np.abs(along), bright)
+        surface_loops.fade(owned(distance), light.extinction, back)
+        return Lit(normals.T, along, objects, back)
 
     def _on_actors(self, triangle: Integers, ways: Ways) -> tuple[Indices, Integers]:
         """Rows of triangles (n,) that belong to actors, and to which; none without `ways`."""
@@ -310,27 +320,10 @@ class Surfaces:
         retro-reflector, a gain replaces the cosine. Where materials are `textured`, the colours
         (n,) are needed.
         """
-        return self._energy(self.objects(triangle), cosine, distance, light, colours)
-
-    def _energy(
-        self,
-        objects: Ints32,
-        cosine: Floats,
-        distance: Floats,
-        light: Light,
-        colours: UInts32 | None,
-    ) -> Floats:
-        from . import surface_loops
-
         table = self.at(light.wavelength_nm)
-        if table.textured or table.roughness.any():
-            bright = luminance(colours) if table.textured and colours is not None else None
-            scattered = table.scattered(objects, cosine, bright)
-            return np.asarray(scattered * at_right_angles(distance, light.extinction))
-        out = np.empty(len(objects))
-        shares = table.reflectance, table.retro, light.extinction
-        surface_loops.shine(objects, owned(cosine), owned(distance), *shares, out)
-        return out
+        bright = luminance(colours) if table.textured and colours is not None else None
+        scattered = table.scattered(self.objects(triangle), cosine, bright)
+        return np.asarray(scattered * at_right_angles(distance, light.extinction))
 
     @cached_property
     def solids(self) -> tuple[Bools, Bools]:
@@ -423,9 +416,9 @@ class Surfaces:
 
     @cached_property
     def unit_normals(self) -> Floats32:
-        """Unit normals of `_kept`, one row for each axis, the fastest layout: (3, f)."""
+        """Unit normals of `_kept`: (f, 3)."""
         bodies = self._kept
-        out = np.empty((3, sum(len(faces) for _, faces, _ in bodies)), np.float32)
+        out = np.empty((sum(len(faces) for _, faces, _ in bodies), 3), np.float32)
         at = 0
         for vertices, faces, _ in bodies:
             for begin in range(0, len(faces), BLOCK_FACES):
@@ -433,7 +426,7 @@ class Surfaces:
                 a, b, c = vertices[block].transpose(1, 0, 2)
                 normals = np.cross(b - a, c - a)
                 lengths = length(normals)[:, None]
-                out[:, at : at + len(block)] = (normals / np.maximum(lengths, 1e-300)).T
+                out[at : at + len(block)] = normals / np.maximum(lengths, 1e-300)
                 at += len(block)
         return out
 
