@@ -196,10 +196,6 @@ def _near(rays, n, x, y, z, radius, near):  # type: ignore[no-untyped-def]
 )
 def _through(rays, ends, cell, number, poses, boxes, shape, pads, out):  # type: ignore[no-untyped-def]
     found, near, count = 0, np.empty(CELL), rays.shape[1]
-    if count < CELL:  # the loop over a cell has a constant length
-        given, rays = rays, np.zeros((6, CELL))
-        rays[:, :count] = given
-        count = CELL
     for pair in range(len(cell)):
         begin, end = cell[pair] * CELL, min((cell[pair] + 1) * CELL, len(ends))
         sides = sides_of(float64s(boxes.ctypes.data + 48 * shape[pair]))
@@ -239,5 +235,7 @@ def through(
     """
     cell, shape = np.ascontiguousarray(cell), np.ascontiguousarray(shape)
     pairs = np.empty((2, len(cell) * CELL), np.int64)
+    if len(ends) < CELL:  # the loop over a cell has a constant length
+        rays = np.concatenate([rays, np.zeros((6, CELL - len(ends)))], axis=1)
     found = _through(rays, ends, cell, number, poses, boxes, shape, pads, pairs)
     return pairs[0, :found], pairs[1, :found]

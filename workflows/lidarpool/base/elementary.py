@@ -19,7 +19,7 @@ from numpy.typing import ArrayLike
 
 from .arrays import Floats
 
-_FEW = 128  # numbers
+_FEW = 1 << 12  # numbers: some 20 ms
 _TWO = np.ldexp(1.0, np.arange(-539, 514))  # powers of 2
 
 

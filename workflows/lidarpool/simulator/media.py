@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -443,11 +444,15 @@ def depths(bits: NDArray[np.uint64]) -> Floats:
     """
     share = ((bits >> np.uint64(11)).astype(np.float64) + 0.5) * 2.0**-53
     part, halvings = np.frexp(share)
-    row = ((part - 0.5) * (2 * len(_LOGS))).astype(np.intp)
-    return np.asarray(_LOGS[row] - halvings * float(np.float32(log_of(2.0))))
+    row = ((part - 0.5) * (2 * len(_logs()))).astype(np.intp)
+    return np.asarray(_logs()[row] - halvings * float(np.float32(log_of(2.0))))
 
 
-_LOGS = -log((np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5).astype(np.float32).astype(np.float64)
+@cache
+def _logs() -> Floats:
+    """Logarithms of equal steps from 1/2 to 1, with the sign changed, in single precision."""
+    steps = (np.arange(1 << 15) + 0.5) / (1 << 16) + 0.5
+    return -log(steps).astype(np.float32).astype(np.float64)
 
 
 def _dots(one: Floats, other: Floats) -> Floats:

@@ -218,6 +218,17 @@ def reported(ray, energy, mode, there):
 
 
 @stage
+def _most(ray, each):
+    """Return how many hits a beam has at most."""
+    most, begin = 0, 0
+    for k in range(len(ray)):
+        if ray[k] // each != ray[begin] // each:
+            begin = k
+        most = max(most, k + 1 - begin)
+    return most
+
+
+@stage
 def _room(size, each):
     """Make scratch memory for hits of a beam."""
     numbers, flags = np.int64, np.bool_
@@ -243,7 +254,7 @@ def returns(
     velocities to `real` (3, k).
     """
     i, j, count, number_row, moves = 0, 0, 0, 0, len(velocity) > 0
-    size = 64
+    size = _most(ray, each) + _most(air_ray, each)
     own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
     while i < len(ray) or j < len(air_ray):
         beam = ray[i] // each if i < len(ray) else air_ray[j] // each
@@ -274,9 +285,6 @@ def returns(
                 real[2, count] = drift / sum_
             i, count = last, count + int(n > 0)
         else:
-            if last - i + last_air - j > size:
-                size = 2 * (last - i + last_air - j)
-                own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
             n, least, most = 0, np.inf, -np.inf
             while i < last or j < last_air:  # what is in the air first
                 if j < last_air and (i == last or air_ray[j] <= ray[i]):

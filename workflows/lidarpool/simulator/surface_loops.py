@@ -41,7 +41,7 @@ def _found(t, begins, owners, shared, firsts, to_kept, standing):
     return firsts[low] + t - begins[low], shared[low], low
 
 
-@compiled("(i4[::1], i8[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, i8[::1], i4[::1], i8[::1])")
+@compiled()
 def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, objects, which):
     """Write what `_found` says of triangles."""
     for k in range(len(triangle)):
@@ -50,10 +50,7 @@ def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, obje
         )
 
 
-@compiled(
-    "(i4[::1], i8[::1], i4[::1], i4[::1], i8[::1], i8[::1], i8, f8[:, ::1], f8[:, :, ::1], "
-    "f4[:, ::1], i8[::1], f8[:, ::1], f8[::1], b1[::1], f8[:, ::1], f8[::1], i4[::1], f8[::1])"
-)
+@compiled()
 def meet(
     triangle, begins, owners, shared, firsts, to_kept, standing, directions, turns, table, run,
     poses, reflectance, retro, normals, along, objects, back,
@@ -88,7 +85,7 @@ def meet(
         back[k] = reflectance[owner] * (RETRO_GAIN if retro[owner] else abs(cosine))
 
 
-@compiled("(f8[::1], f8, f8[::1])")
+@compiled()
 def fade(distance, extinction, energy):
     """Multiply energies by what `at_right_angles` says of distances."""
     for k in range(len(energy)):
@@ -98,7 +95,7 @@ def fade(distance, extinction, energy):
         energy[k] *= nearer * exp(-2 * extinction * far) if extinction else nearer
 
 
-@compiled("(i8[::1], i8, i8, f8[::1], f8[::1], f8[::1])")
+@compiled()
 def times(ray, start, subrays, begins, delays, out):
     """Write when rays are fired, of which `subrays` are of a beam, from beam `start` on."""
     low, firing, each = 0, -1, len(delays)
@@ -110,7 +107,7 @@ def times(ray, start, subrays, begins, delays, out):
         out[k] = begins[firing] + delays[beam - low]
 
 
-@compiled("i8(u4[::1], f8[::1], i4[::1], u4[::1], f8[::1], i4[::1], i8[::1], f8[::1], i4[::1])")
+@compiled()
 def merge(
     ray, distance, triangle, other_ray, other_distance, other_triangle, out, out_m, out_triangle
 ):
@@ -129,7 +126,7 @@ def merge(
     return count
 
 
-@compiled("i8(i8[::1], f8[::1], i8[::1], i8[::1])")
+@compiled()
 def runs(number, times, first, run):
     """Write for each actor's time its run, and the first of each; returns how many runs.
 
@@ -147,10 +144,7 @@ def runs(number, times, first, run):
     return count
 
 
-@compiled(
-    "i8(i8[::1], f8[::1], i8[::1], i8[::1], i8[::1], f8[:, ::1], f8[::1], f8[:, ::1], f8[:, ::1], "
-    "f8[:, :, ::1], f8[::1], f8[:, ::1])"
-)
+@compiled()
 def on_tracks(
     number, times_ns, member, first, count, limits, times, start, speed, turn, rates, out
 ):

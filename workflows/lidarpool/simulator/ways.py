@@ -70,6 +70,8 @@ class Ways(tuple[Trajectory, ...]):
         from . import surface_loops  # not before: numba takes half a second to import
 
         tracks, out = self._tracks, np.empty((12, len(number)))
+        if not len(number):
+            return out
         given = owned(number, np.int64), owned(times_ns)
         outside = surface_loops.on_tracks(*given, *tracks, out)
         if outside >= 0:  # which raises the error
