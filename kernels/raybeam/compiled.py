@@ -2,15 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 try:
+    import fcntl
+except ImportError:  # Windows: each process compiles for itself
+    fcntl = None  # type: ignore[assignment]
+
+try:
     from llvmlite.binding import add_symbol
     from numba import njit
     from numba.core.ccallback import CFunc
+    from numba.core.compiler_lock import global_compiler_lock
     from numba.types import ExternalFunction
 except ImportError:
     njit = None
@@ -37,11 +45,53 @@ def _stamp(folder: Path) -> tuple[int, ...]:
     return tuple(number for f in found for number in (f.stat().st_mtime_ns, f.stat().st_size))
 
 
+_WAIT_S = 60.0  # for a process that compiles: it may have been stopped
+_held = [0]  # how often the lock is held, by the thread that has numba's lock
+
+
+@contextmanager
+def _in_turn(folder: str) -> Iterator[None]:
+    """Let one process compile at a time: the others, on any machine, then load what it kept.
+
+    A hundred workers that start with an empty folder compile each loop once.
+    """
+    with global_compiler_lock:  # of the threads; compiling one loop may compile another
+        file = None
+        try:
+            if fcntl is not None and not _held[0]:
+                Path(folder).mkdir(parents=True, exist_ok=True)
+                file = (Path(folder) / "raybeam.lock").open("a")
+                until = time.monotonic() + _WAIT_S
+                while time.monotonic() < until:
+                    try:
+                        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                        break
+                    except BlockingIOError:
+                        time.sleep(0.02)
+        except OSError:  # a file system without locks
+            pass
+        _held[0] += 1
+        try:
+            yield
+        finally:
+            _held[0] -= 1
+            if file is not None:
+                file.close()  # which releases it
+
+
 def _kept(made: Any, function: Any) -> Any:
     """Let compiled code be loaded if this very version of the package had compiled it."""
-    if _KEEPS:
-        made.enable_caching()
-        made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+    if not _KEEPS:
+        return made
+    made.enable_caching()
+    made._cache._cache_file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+    alone, folder = made.compile, made._cache._cache_path
+
+    def compile_in_turn(*signature: Any) -> Any:
+        with _in_turn(folder):
+            return alone(*signature)
+
+    made.compile = compile_in_turn
     return made
 
 

@@ -48,3 +48,14 @@ def test_a_change_of_another_file_compiles_again(run):
     assert run("2.0") == ["3.0", "1"]
     assert run() == ["3.0", "0"]
     assert run("30.0") == ["31.0", "1"]
+
+
+def test_processes_that_start_together_compile_once(run, tmp_path):
+    """The others wait, and load what the first has kept."""
+    (tmp_path / "loops/numbers.py").write_text("MORE = 2.0\n")
+    command = [sys.executable, "-m", "loops.more"]
+    started = [
+        subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, text=True) for _ in range(8)
+    ]
+    printed = sorted(one.communicate()[0].split() for one in started)
+    assert printed == [["3.0", "0"]] * 7 + [["3.0", "1"]]
