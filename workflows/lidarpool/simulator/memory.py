@@ -14,7 +14,7 @@ from ..sensor import Sensor, Survey
 from .device import needs_hits
 from .echoes import CHUNK_RAYS
 from .rig import rays_repeat
-from .waveform import BLOCK_HITS, BLOCK_SAMPLES
+from .waveform import BLOCK_SAMPLES
 
 MB = 1_000_000
 
@@ -42,9 +42,6 @@ RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3
 AIR, AIR_HIT = 110, 170  # of a sub-ray where the air returns light; a hit in the air
 POINT, POINT_BYTE = 64, 3.2  # a point, and each byte of its columns: their sources are float64
 COLOUR = 16  # of a ray, where its colour is its reflectance
-# A hit of those whose waveforms are searched at a time, by how returns are found; up to twice the
-# whole where no beam is.
-SEARCHED = {"none": 0, "peaks": 850, "gaussian": 2400}
 # A byte of recorded waveforms, of all returns, and a sample of those made at a time.
 RECORDED, SAMPLED = 2.3, 40
 # Copies of what a device has made: CuPy rounds page-locked memory up to powers of two, and columns
@@ -122,7 +119,6 @@ def cast_bytes(scene: Scene, survey: Survey, scans: int = 1, *, on_device: bool 
                 found += CROSSED * _others(survey, sensor) * chunk / subrays
             if survey.returns_light:
                 found += AIR * chunk + AIR_HIT * in_air * chunk / subrays
-            found += SEARCHED[reported.waveform] * min(chunk, BLOCK_HITS) * (subrays > 1)
             every = RETURN_ALL * returns + RETURN_KEPT * points
             if recorded:
                 found += SAMPLED * min(chunk * survey.waveform_samples, BLOCK_SAMPLES)

@@ -128,7 +128,13 @@ def _joined(
     begin, stop, new, still, ray, distance, solid, row, gap_m, each, pairs, normals, directions,
     table, changes,
 ):  # fmt: skip
-    """Unmark in `still` where a surface of a beam continues, by returns that begin at `new`."""
+    """Unmark in `still` where a surface of a beam continues, by returns that begin at `new`.
+
+    Two neighbouring sub-rays hit one surface if the planes through the two hits meet half-way
+    between them, within the gap or half of the distance between the hits. The inverse range of a
+    plane is linear in the ray's direction, so two hits on one plane always meet, whatever the
+    angle; half of the distance allows for rough ground. Hits are in the order of distances.
+    """
     count = stop - begin
     panes = 0
     for k in range(count * each):
@@ -165,26 +171,6 @@ def _joined(
         inside += changes[k - begin]
         if inside > 0:
             still[k] = False
-
-
-@compiled()
-def continues(new, still, ray, distance, solid, gap_m, each, pairs, normals, directions):
-    """Unmark in `still` where surfaces continue, of the beams of hits: see `continued`."""
-    row, begin = np.empty((len(ray), 2), np.int64), 0
-    table, changes = np.empty(each, np.int64), np.empty(2, np.int64)
-    while begin < len(ray):
-        stop, beam = begin, ray[begin] // each
-        while stop < len(ray) and ray[stop] // each == beam:
-            row[stop, 0] = stop
-            stop += 1
-        if (stop - begin) * each > len(table):
-            table = np.empty(2 * (stop - begin) * each, np.int64)
-            changes = np.empty(2 * (stop - begin) + 1, np.int64)
-        _joined(
-            begin, stop, new, still, ray, distance, solid, row, gap_m, each, pairs, normals,
-            directions, table, changes,
-        )  # fmt: skip
-        begin = stop
 
 
 @stage

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..base.arrays import AnyArray, Bools, Floats, Ints
+from ..base.arrays import AnyArray, Bools, Floats, Ints, owned
 from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
@@ -57,9 +57,6 @@ def separated(
 
     air = air or AirHits(np.zeros(0, np.int64), _NONE, _NONE)
     mode, noise, keys, first = report or Report()
-    normals, directions, pairs = np.zeros((0, 3)), np.zeros((0, 3)), np.zeros((0, 2), np.int64)
-    if planes is not None and each > 1:
-        (normals, directions), pairs = planes, neighbours(each)
     begun, table, limits = np.zeros(0, np.uint64), _NONE, (0.0, 0.0, THRESHOLD_SIGMAS)
     if noise is not None and noise.loses:
         begun, table = starts(noise.seed, Purpose.LOSS, Purpose.DETECTION), quantiles()
@@ -70,11 +67,11 @@ def separated(
     whole, real = np.empty((2, most), np.int64), np.empty((3, most))
     count = pulse_loops.returns(
         each, gap_m, _MODES.index(mode),
-        _own(hits.ray, np.int64), _own(hits.distance), _own(hits.energy),
-        hits.triangle != NO_SURFACE, _own(speeds),
-        _own(air.ray, np.int64), _own(air.distance), _own(air.energy), _own(air.velocity),
-        _own(pairs, np.int64), _own(normals.T), _own(directions.T),
-        *map(float, limits), begun, table, scan, _own(begins, np.int64), first, whole, real,
+        owned(hits.ray, np.int64), owned(hits.distance), owned(hits.energy),
+        hits.triangle != NO_SURFACE, owned(speeds),
+        owned(air.ray, np.int64), owned(air.distance), owned(air.energy), owned(air.velocity),
+        *surfaces_of(each, planes), *map(float, limits), begun, table, scan,
+        owned(begins, np.int64), first, whole, real,
     )  # fmt: skip
     beam, row = whole[:, :count].copy()
     distance, energy, velocity = real[:, :count].copy()
@@ -100,30 +97,12 @@ def _unknown(hits: Hits, count: int) -> Hits:
     return Hits._make(columns)
 
 
-def _own(array: AnyArray, kind: type = np.float64) -> AnyArray:
-    """Give an array as the loops are compiled for: of one type, contiguous and not read-only."""
-    return np.require(array, kind, ["C", "W"])
-
-
-def continued(
-    hits: Hits, new: Bools, gap_m: float, each: int, normal: Floats, direction: Floats
-) -> Bools:
-    """Whether a surface continues from before each hit to behind it: no return begins, (n,).
-
-    Two neighbouring sub-rays hit one surface if the planes through the two hits meet half-way
-    between them, within the gap or half of the distance between the hits. The inverse range of a
-    plane is linear in the ray's direction, so two hits on one plane always meet, whatever the
-    angle; half of the distance allows for rough ground.
-
-    The hits of each beam are sorted by distance; `new` are the returns by distances alone.
-    """
-    from . import pulse_loops
-
-    still, solid = np.ones(len(new), np.bool_), hits.triangle != NO_SURFACE
-    pairs, planes = _own(neighbours(each), np.int64), (_own(normal.T), _own(direction.T))
-    where = _own(hits.ray, np.int64), _own(hits.distance), solid
-    pulse_loops.continues(_own(new, np.bool_), still, *where, gap_m, each, pairs, *planes)
-    return ~still
+def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:
+    """Return neighbours among sub-rays, and planes of hits, as loops take them; or none."""
+    pairs, normals, directions = np.zeros((0, 2), np.int64), np.zeros((0, 3)), np.zeros((0, 3))
+    if planes is not None and each > 1:
+        (normals, directions), pairs = planes, neighbours(each)
+    return owned(pairs, np.int64), owned(normals.T), owned(directions.T)
 
 
 def chosen(returns: Hits, mode: Mode) -> Bools:
@@ -131,5 +110,5 @@ def chosen(returns: Hits, mode: Mode) -> Bools:
     from . import pulse_loops
 
     there, number = np.empty(len(returns.ray), np.bool_), _MODES.index(mode)
-    pulse_loops.reported(_own(returns.ray, np.int64), _own(returns.energy), number, there)
+    pulse_loops.reported(owned(returns.ray, np.int64), owned(returns.energy), number, there)
     return there

@@ -1,0 +1,392 @@
+"""Loops over pulses that sample their waveforms and find returns in them: see waveform.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from raybeam.compiled import compiled, stage
+
+from ..base.elementary_loops import exp, log
+from ..sensor.optics import WINDOW_SIGMAS
+from .pulse_loops import _joined, _most
+
+# All in standard deviations of the system waveform.
+CUT = WINDOW_SIGMAS / 2  # beyond that an echo is 0; it is 4e-6 of its height there
+# Hits within this are one echo in closed form: position and height err by 1e-3 at most.
+NARROW = 0.25
+MEET = 1.0  # planes of neighbouring hits that meet as closely are one surface, see `_joined`
+APART = 6.0  # Gaussians that are farther apart are fitted separately
+CLOSE = 1.0  # Gaussians that are nearer are one return
+
+FAINT = 0.01  # of the strongest echo around: weaker ones are not found
+CURVED = 0.005  # of the greatest curvature of that, likewise for Gaussians
+TOGETHER = 4  # Gaussians that are fitted together at most
+STEPS = 10  # of Levenberg and Marquardt at most
+GAIN, ENOUGH = 1e-3, 1e-9  # share of the squares that a step must gain, and squares that are none
+MOVES = 2.0  # standard deviations that a fit may move from its first guess
+HIGHEST = 1.2  # of the highest sample: a Gaussian between two samples may be higher
+_AREA = math.sqrt(2 * math.pi)
+
+
+@stage
+def _sampled(when, share, begin, stop, sigma, many, low, w, length):
+    """Write the sum of echoes `begin` to `stop` to samples from `low` on; returns the highest."""
+    for s in range(length):
+        w[s] = 0.0
+    for k in range(begin, stop):
+        first = np.int64(math.ceil(when[k] - CUT * sigma))
+        for s in range(first - low, first - low + many):
+            z = (s + low - when[k]) / sigma
+            w[s] += share[k] * exp(-0.5 * (z * z))
+    top = w[0]
+    for s in range(length):
+        top = max(top, w[s])
+    return top
+
+
+@stage
+def _peaks(w, length, low, top, sigma, until, found):
+    """Find local maxima: the last sample of each times 1024, and the echoes; returns how many.
+
+    Their times and heights are those of the Gaussian through three samples, their energies the
+    areas between the lowest samples to both sides. Rows of `found` are times, energies and widths.
+    """
+    count, begin, s = 0, 0, 1
+    while s < length - 1:
+        if not (w[s] > w[s - 1] and w[s] >= w[s + 1] and w[s] >= FAINT * top):
+            s += 1
+            continue
+        at, last = s, s
+        s += 1
+        while s < length:  # to the next, or the end
+            if w[s] < w[last]:
+                last = s
+            if s < length - 1 and w[s] > w[s - 1] and w[s] >= w[s + 1] and w[s] >= FAINT * top:
+                break
+            s += 1
+        area = 0.0
+        for k in range(begin, last + 1):
+            area += w[k]
+        height, beside = w[at], 0.0
+        if w[at - 1] > 0 and w[at + 1] > 0:
+            before, here, behind = log(w[at - 1]), log(w[at]), log(w[at + 1])
+            curve = min(before - 2 * here + behind, -1e-12)
+            beside = min(max((before - behind) / (2 * curve), -0.5), 0.5)
+            height = exp(here - (behind - before) * (behind - before) / (8 * curve))
+        energy = area / (sigma * _AREA)
+        until[count] = 1024 * last
+        found[0, count], found[1, count], found[2, count] = (
+            at + low + beside,
+            energy,
+            energy / height,
+        )
+        begin, count = last + 1, count + 1
+    return count
+
+
+@stage
+def _misses(x, y, samples, peaks, count, rest, slopes):
+    """Write what a sum of Gaussians misses of samples, and its slopes; returns the squares."""
+    for s in range(samples):
+        rest[s] = y[s]
+    for k in range(count):
+        height, place, width = peaks[0, k], peaks[1, k], peaks[2, k]
+        for s in range(samples):
+            z = (x[s] - place) / width
+            bell = exp(-0.5 * (z * z))
+            rest[s] -= height * bell
+            slope = height * bell * z / width
+            slopes[k, s], slopes[count + k, s], slopes[2 * count + k, s] = bell, slope, slope * z
+    cost = 0.0
+    for s in range(samples):
+        cost += rest[s] * rest[s]
+    return cost
+
+
+@stage
+def _step(rest, slopes, samples, count, damping, lower, step):
+    """Solve the equations of a step of Levenberg and Marquardt, by Cholesky's method."""
+    size = 3 * count
+    for row in range(size):
+        towards = 0.0
+        for s in range(samples):
+            towards += slopes[row, s] * rest[s]
+        step[row] = towards
+        for column in range(row + 1):
+            left = 0.0
+            for s in range(samples):
+                left += slopes[row, s] * slopes[column, s]
+            if row == column:
+                left = left * (1 + damping) + 1e-12
+            for k in range(column):
+                left -= lower[row, k] * lower[column, k]
+            if row == column:
+                lower[row, row] = math.sqrt(max(left, 1e-30))
+            else:
+                lower[row, column] = left / lower[column, column]
+    for row in range(size):
+        for k in range(row):
+            step[row] -= lower[row, k] * step[k]
+        step[row] /= lower[row, row]
+    for back in range(size):
+        row = size - 1 - back
+        for k in range(row + 1, size):
+            step[row] -= lower[k, row] * step[k]
+        step[row] /= lower[row, row]
+
+
+@stage
+def _fitted(x, y, samples, best, count, rest, slopes, new_rest, new_slopes, lower, step):
+    """Fit a sum of Gaussians by least squares: heights, places and widths (3, count).
+
+    The method is that of Levenberg and Marquardt; it ends when a step gains nothing, or after
+    `STEPS`. Heights are `HIGHEST` at most, places within `MOVES` of the guess, and widths, standard
+    deviations, at least 1. `best` holds the guess, and receives the fit.
+    """
+    guess, trial = best.copy(), best.copy()
+    widest, damping = max((x[samples - 1] - x[0]) / (4 * count), 1.5), 1e-3
+    cost = _misses(x, y, samples, best, count, rest, slopes)
+    for _ in range(STEPS):
+        _step(rest, slopes, samples, count, damping, lower, step)
+        for k in range(count):
+            place = best[1, k] + step[count + k]
+            trial[0, k] = min(max(best[0, k] + step[k], 0.0), HIGHEST)
+            trial[1, k] = min(max(place, guess[1, k] - MOVES), guess[1, k] + MOVES)
+            trial[2, k] = min(max(best[2, k] + step[2 * count + k], 1.0), widest)
+        now = _misses(x, y, samples, trial, count, new_rest, new_slopes)
+        better = now < cost
+        ends = better and cost - now <= GAIN * cost
+        ends = ends or now <= ENOUGH or damping >= 1e6
+        if better:
+            for k in range(count):
+                best[0, k], best[1, k], best[2, k] = trial[0, k], trial[1, k], trial[2, k]
+            rest, new_rest, slopes, new_slopes = new_rest, rest, new_slopes, slopes
+            cost = now
+        if ends:
+            break
+        damping = damping / 10 if better else damping * 10
+
+
+@stage
+def _gaussians(w, length, low, top, sigma, until, found):
+    """Decompose a waveform into Gaussians; as `_peaks`.
+
+    There is one for each minimum of the second derivative (after Hofton et al. 2000, who take the
+    points of inflection around them), none narrower than the system waveform.
+    """
+    bent, at = np.zeros(length), np.empty(length, np.int64)
+    for s in range(1, length - 1):
+        bent[s] = w[s - 1] - 2 * w[s] + w[s + 1]
+    count = 0
+    for s in range(1, length - 1):
+        low_point = bent[s] < bent[s - 1] and bent[s] <= bent[s + 1]
+        if low_point and w[s] >= FAINT * top and -bent[s] * (sigma * sigma) >= CURVED * top:
+            at[count] = s
+            count += 1
+    time, height, width = np.empty(count), np.empty(count), np.empty(count)
+    x, y, rest, other = np.empty(length), np.empty(length), np.empty(length), np.empty(length)
+    slopes, others = np.empty((3 * TOGETHER, length)), np.empty((3 * TOGETHER, length))
+    fit, lower = np.empty((3, TOGETHER)), np.empty((3 * TOGETHER, 3 * TOGETHER))
+    step = np.empty(3 * TOGETHER)
+    begin, first = 0, 0  # of a piece that is fitted by itself: its first Gaussian and sample
+    while begin < count:
+        stop = begin + 1
+        while stop < count and stop - begin < TOGETHER and at[stop] - at[stop - 1] <= APART * sigma:
+            stop += 1
+        end = (at[stop] + at[stop - 1]) // 2 + 1 if stop < count else length
+        origin, sums, whole = at[begin], 0.0, 0.0
+        for s in range(first, end):
+            x[s - first], y[s - first] = (s - origin) / sigma, w[s] / top
+            sums += w[s]
+        for k in range(begin, stop):
+            fit[0, k - begin] = min(w[at[k]], -bent[at[k]] * (sigma * sigma)) / top
+            fit[1, k - begin], fit[2, k - begin] = (at[k] - origin) / sigma, 1.0
+        given = fit, stop - begin, rest, slopes, other, others, lower, step
+        _fitted(x, y, end - first, *given)
+        for k in range(stop - begin):
+            whole += fit[0, k] * fit[2, k]
+        for k in range(begin, stop):
+            # What is beyond a cut, no sample tells; so energies are those of the piece together.
+            height[k] = fit[0, k - begin] * (sums / whole / (sigma * _AREA))
+            time[k], width[k] = fit[1, k - begin] * sigma + (origin + low), fit[2, k - begin]
+        begin, first = stop, end
+    # Each by its time, also where a fit went beyond its piece; those that are close are one.
+    kept = 0
+    for k in range(count):
+        if not height[k] >= FAINT * top:
+            continue
+        a, b, c, place = time[k], height[k], width[k], kept
+        while place > 0 and time[place - 1] > a:
+            time[place], height[place] = time[place - 1], height[place - 1]
+            width[place] = width[place - 1]
+            place -= 1
+        time[place], height[place], width[place] = a, b, c
+        kept += 1
+    out, begin = 0, 0
+    while begin < kept:
+        stop, energy, position, spread = begin, 0.0, 0.0, 0.0
+        while stop == begin or (stop < kept and time[stop] - time[stop - 1] < CLOSE * sigma):
+            energy += height[stop] * width[stop]
+            position += height[stop] * width[stop] * time[stop]
+            stop += 1
+        position /= energy
+        for k in range(begin, stop):
+            off = (time[k] - position) / sigma
+            spread += height[k] * width[k] * (width[k] * width[k] + off * off)
+        found[0, out], found[1, out], found[2, out] = position, energy, math.sqrt(spread / energy)
+        if out:
+            middle = (found[0, out - 1] + position) / 2
+            until[out - 1] = np.int64(np.rint(middle * 1024)) - 1024 * low
+        until[out] = 1024 * length
+        begin, out = stop, out + 1
+    return out
+
+
+@stage
+def _searched(far, light, begin, stop, each, digits, echo, before, found, until):
+    """Find the echoes of hits `begin` to `stop`, after `before` others; returns how many."""
+    sigma, per_m, decomposes = digits
+    when, share = np.empty(stop), np.empty(stop)
+    for k in range(begin, stop):
+        when[k], share[k] = far[k] * per_m, light[k] / each
+    many = np.int64(2 * CUT * sigma) + 1
+    low = np.int64(math.ceil(when[begin] - CUT * sigma)) - 1
+    length = np.int64(math.ceil(when[stop - 1] - CUT * sigma)) + many - low + 1
+    w, rows = np.empty(length), np.empty((3, length))
+    marks = np.empty(length, np.int64)
+    top = _sampled(when, share, begin, stop, sigma, many, low, w, length)
+    if decomposes:
+        count = _gaussians(w, length, low, top, sigma, marks, rows)
+    else:
+        count = _peaks(w, length, low, top, sigma, marks, rows)
+    count = min(count, found.shape[1] - before)
+    for row in range(3):
+        for k in range(count):
+            found[row, before + k] = rows[row, k]
+    for k in range(begin, stop):
+        key, number = np.int64(np.rint(when[k] * 1024)) - 1024 * low, 0
+        while number < count - 1 and marks[number] < key:
+            number += 1
+        echo[k] = before + number if count else -1
+    return count
+
+
+@compiled()
+def returns(
+    each, sigma_m, digits, ray, distance, energy, solid, velocity, pairs, normals, directions,
+    whole, real,
+):  # fmt: skip
+    """Make the returns of waveforms of beams, see `waveform.returns_in`; returns how many.
+
+    `digits` are the standard deviation of the system waveform in samples, samples a metre, and
+    whether waveforms are decomposed into Gaussians. Writes beams and rows of the strongest hits to
+    `whole` (2, k); distances, energies, velocities, and widths, of the system waveform's, to `real`
+    (4, k).
+    """
+    i, count, moves, narrow = 0, 0, len(velocity) > 0, NARROW * sigma_m
+    size = _most(ray, each)
+    far, light, speed = np.empty(size), np.empty(size), np.zeros(size)
+    hard, new, still = np.empty(size, np.bool_), np.empty(size, np.bool_), np.empty(size, np.bool_)
+    sub, echo, own = (
+        np.empty(size, np.int64),
+        np.empty(size, np.int64),
+        np.empty((size, 2), np.int64),
+    )
+    part = np.empty(size, np.int64)
+    part_sub, part_own = np.empty(size, np.int64), np.empty((size, 2), np.int64)
+    part_far, part_hard = np.empty(size), np.empty(size, np.bool_)
+    every = np.ones(size, np.bool_)
+    table, changes = np.empty(size * each, np.int64), np.empty(size + 1, np.int64)
+    found, until = np.empty((3, 8 * size)), np.empty(8 * size, np.int64)
+    while i < len(ray):
+        beam, n = ray[i] // each, 0
+        end = (beam + 1) * each
+        while i < len(ray) and ray[i] < end:  # in the order of distances
+            if energy[i] > 0:
+                place = n
+                while place > 0 and far[place - 1] > distance[i]:
+                    far[place], light[place] = far[place - 1], light[place - 1]
+                    speed[place], hard[place] = speed[place - 1], hard[place - 1]
+                    sub[place], own[place, 0] = sub[place - 1], own[place - 1, 0]
+                    place -= 1
+                far[place], light[place], hard[place] = distance[i], energy[i], solid[i]
+                sub[place], own[place, 0] = ray[i], i
+                if moves:
+                    speed[place] = velocity[i]
+                n += 1
+            i += 1
+        if n == 0:
+            continue
+        for k in range(n):
+            new[k] = k == 0 or far[k] - far[k - 1] > 2 * CUT * sigma_m
+            echo[k] = -1
+        if far[n - 1] - far[0] > narrow:
+            chosen, begin = 0, 0  # hits that are together, and yet not narrow
+            for k in range(1, n + 1):
+                if k < n and not new[k]:
+                    continue
+                if far[k - 1] - far[begin] > narrow:
+                    for number in range(begin, k):
+                        part[chosen], still[chosen] = number, True
+                        part_sub[chosen], part_own[chosen, 0] = sub[number], own[number, 0]
+                        part_far[chosen], part_hard[chosen] = far[number], hard[number]
+                        chosen += 1
+                begin = k
+            if chosen and len(pairs):
+                _joined(
+                    0, chosen, every, still, part_sub, part_far, part_hard, part_own,
+                    MEET * sigma_m, each, pairs, normals, directions, table, changes,
+                )  # fmt: skip
+            echoes, begin = 0, 0
+            while begin < chosen:
+                stop, apart = begin + 1, False
+                while stop < chosen and not new[part[stop]]:
+                    apart |= still[stop]
+                    stop += 1
+                if apart:  # no single surface
+                    echoes += _searched(
+                        far, light, part[begin], part[stop - 1] + 1, each, digits, echo, echoes,
+                        found, until,
+                    )  # fmt: skip
+                    for k in range(begin + 1, stop):
+                        new[part[k]] = echo[part[k]] != echo[part[k] - 1]
+                begin = stop
+            if len(pairs):
+                several = False
+                for k in range(1, n):
+                    several |= new[k]
+                if several:
+                    _joined(
+                        0, n, new, new, sub, far, hard, own, MEET * sigma_m, each, pairs, normals,
+                        directions, table, changes,
+                    )  # fmt: skip
+        begin = 0
+        for k in range(1, n + 1):
+            if k < n and not new[k]:
+                continue
+            best, sum_, mean, drift, spread = begin, 0.0, 0.0, 0.0, 0.0
+            for number in range(begin, k):
+                sum_ += light[number]
+                mean += light[number] * far[number]
+                if moves:
+                    drift += light[number] * speed[number]
+                if light[number] > light[best]:
+                    best = number
+            mean /= sum_
+            for number in range(begin, k):
+                off = (far[number] - mean) / sigma_m
+                spread += light[number] * (off * off)
+            whole[0, count], whole[1, count] = beam, own[best, 0]
+            real[0, count], real[1, count], real[2, count] = mean, sum_ / each, drift / sum_
+            real[3, count] = math.sqrt(1 + spread / sum_)
+            what = echo[begin]
+            if what >= 0 and what == echo[k - 1]:  # no surface joins it with anything else
+                real[0, count] = found[0, what] / digits[1]
+                real[1, count], real[3, count] = found[1, what], found[2, what]
+            count += 1
+            begin = k
+    return count
