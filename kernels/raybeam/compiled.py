@@ -129,7 +129,7 @@ def external(name: str, made: Any) -> Any:
 
 def inlined(function: Any) -> Any:
     """Let a function become part of compiled ones."""
-    return function if njit is None else njit(forceinline=True, error_model="numpy")(function)
+    return function if njit is None else njit(forceinline=True, error_model="numpy", no_cfunc_wrapper=True)(function)
 
 
 def stage(function: Any) -> Any:
@@ -137,4 +137,4 @@ def stage(function: Any) -> Any:
 
     As a part of a longer function they do not.
     """
-    return function if njit is None else njit(error_model="numpy")(function)
+    return function if njit is None else njit(error_model="numpy", no_cfunc_wrapper=True)(function)
