@@ -110,10 +110,3 @@ def runs(ray: Ints) -> tuple[Ints, Ints]:
     """Find starts and lengths of runs of equal numbers."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     return begins, np.diff(begins, append=len(ray))
-
-
-def strongest(energy: Floats, begins: Ints, counts: Ints) -> Indices:
-    """Row of the strongest entry of each run, of equally strong ones of the first."""
-    rows = np.flatnonzero(energy == np.repeat(np.maximum.reduceat(energy, begins), counts))
-    run = np.repeat(np.arange(len(begins)), counts)[rows]
-    return rows[np.diff(run, prepend=-1) != 0]
