@@ -129,7 +129,9 @@ def external(name: str, made: Any) -> Any:
 
 def inlined(function: Any) -> Any:
     """Let a function become part of compiled ones."""
-    return function if njit is None else njit(forceinline=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+    if njit is None:
+        return function
+    return njit(forceinline=True, error_model="numpy", no_cfunc_wrapper=True)(function)
 
 
 def stage(function: Any) -> Any:
