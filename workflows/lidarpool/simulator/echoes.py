@@ -78,7 +78,7 @@ class EchoCaster:
         # across it and towards it.
         axis = turned(np.array([[0.0, 0, 1]]), self._sensor.axes)
         self._axis = turned(axis, survey.carried[number].mount.rotation)[0]
-        self._receiver = Receiver(number, survey, caster, scene, surfaces, self._paths)
+        self._receiver = Receiver(number, survey, caster, scene, surfaces)
 
     def divided(self, pattern: Pattern, *, by_head: bool = False) -> Pattern | None:
         """Give a repeated pattern its sub-rays, if they are always the same.

@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cached_property
+from itertools import groupby
 
 import numpy as np
 
-from raybeam import Pattern, any_axes
+from raybeam import Pattern
 
-from ..base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32
-from ..base.elementary import arccos, arcsin, arctan2, cos
-from ..base.vectors import hypot, into_axes, length, products, turned
+from ..base.arrays import Bools, Floats, Indices, Integers, Ints, Ints32, owned
+from ..base.vectors import into_axes, length, products, turned
 from ..scene.colours import GREY, packed
 from ..scene.scene import Scene
 from ..sensor import Survey
@@ -21,16 +21,11 @@ from ..sensor.optics import LIGHT_M_NS
 from .crosstalk import Crosstalk
 from .hits import BLOOMING, CROSSTALK, FALSE_ALARM, NO_SURFACE, Hits, Keys, joined, numbers
 from .motion import Poses
-from .paths import Paths
-from .surfaces import Surfaces
+from .surfaces import Surfaces, light_of
 from .world import World
 
-CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
-TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
 CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
-STRAY_MOST = np.radians(30.0)  # no stray light comes from farther aside
 FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
-INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
 
 
 def unreal(
@@ -65,12 +60,12 @@ class Receiver:
         world: World,
         scene: Scene,
         surfaces: Surfaces,
-        paths: Paths,
     ) -> None:
         self._noise = noise = survey.noise_each[number]
         self._sensor = survey.carried[number].sensor
         _, self._gap_m = survey.returns_each[number].of(self._sensor.optics)
-        self._world, self._surfaces, self._paths = world, surfaces, paths
+        self._world, self._surfaces = world, surfaces
+        self._light = light_of(survey, self._sensor)
         self._alarms = noise.false_alarm_hz > 0
         self._retros = [*_retros(scene, surfaces)] if noise.stray_light else []
         self._others: Crosstalk | None = None
@@ -138,91 +133,42 @@ class Receiver:
         keys: Keys,
     ) -> tuple[Indices, Floats, Floats]:
         """Stray light of retro-reflectors that is detected: rows of rays, distances, energies."""
-        best = np.zeros(len(rays))
-        ends = np.zeros((len(rays), 3))  # seen from the origins
-        cells: _Cells | None = None
-        actor, turns = None, None
-        for retro in self._retros:  # those of an actor follow each other
-            if cells is None or retro.actor != actor:
-                actor, turns, places = retro.actor, None, np.zeros(3)
-                if actor is not None:
-                    places, turns = poses.ways[actor].poses(0, times)
-                cells = _Cells(into_axes(origins - places, turns), into_axes(directions, turns))
-            near = self._near(retro, cells)
-            if not len(near):
-                continue
-            energy, towards = self._leaks(retro, cells.starts[near], cells.ahead[near])
+        from . import stray_loops  # not before: numba takes half a second to import
+
+        best, ends = np.zeros(len(rays)), np.zeros((len(rays), 3))  # seen from the origins
+        noise, extinction = self._noise, self._light.extinction
+        limits = self._sensor.min_range_m, noise.stray_light, FAINTEST * noise.threshold, extinction
+        for actor, retros in groupby(self._retros, key=lambda retro: retro.actor):
+            turns, places = None, np.zeros(3)
+            if actor is not None:
+                places, turns = poses.ways[actor].poses(0, times)
+            seen = into_axes(origins - places, turns), into_axes(directions, turns)
+            beams = [owned(vectors.T) for vectors in seen]
+            cells = np.empty((-(-len(rays) // stray_loops.CELL_RAYS), 5))
+            stray_loops.cones(*beams, cells)
+            new = np.zeros(len(rays), np.bool_)
+            for retro in retros:
+                given = retro.corners, retro.middle, retro.radius, self._back(retro.triangles)
+                stray_loops.leaks(*beams, cells, *given, *limits, best, ends, new)
             if turns is not None:  # back to the axes of the scene
-                towards = into_axes(towards, turns[near].transpose(0, 2, 1))
-            more = energy > best[near]
-            best[near[more]], ends[near[more]] = energy[more], towards[more]
+                rows = np.flatnonzero(new)
+                ends[rows] = into_axes(ends[rows], turns[rows].transpose(0, 2, 1))
         row = np.flatnonzero(best > FAINTEST * self._noise.threshold)
         row = row[self._noise.passes(Purpose.STRAY, best[row], *keys.of(rays[row]))]
         distance = np.sqrt(products(ends[row].T, ends[row].T))
         low, high = self._sensor.min_range_m, self._sensor.max_range_m
         within = (distance >= low) & (distance <= high)
         row, distance = row[within], distance[within]
-        seen = self._world.free(origins[row], ends[row], distance, times[row], poses.ways)
-        seen &= ~self._beside(returns, rays[row], distance)
-        row = row[seen]
-        return row, distance[seen], best[row]
+        free = self._world.free(origins[row], ends[row], distance, times[row], poses.ways)
+        free &= ~self._beside(returns, rays[row], distance)
+        row = row[free]
+        return row, distance[free], best[row]
 
-    def _near(self, retro: _Retro, cells: _Cells) -> Indices:
-        """Rays that may receive enough of the light of a retro-reflector, and perhaps others."""
-        centre = retro.middle - cells.begins
-        far = np.sqrt(products(centre.T, centre.T))
-        radius = retro.radius + cells.moved
-        with np.errstate(invalid="ignore", divide="ignore"):
-            wide = np.where(far > radius, arcsin(radius / far), np.pi)
-            off = arccos(np.clip(products(cells.axes.T, centre.T) / far, -1, 1))
-        least = np.maximum(far - radius, max(self._sensor.min_range_m, 1e-3))
-        reach = np.minimum(self._reach(retro, least), STRAY_MOST) + wide
-        near = np.flatnonzero(~(off > cells.opening + reach)[cells.number])
-        # Of those cells, the rays themselves.
-        which = cells.number[near]
-        centre = retro.middle - cells.starts[near]
-        off = products(cells.ahead[near].T, centre.T) / np.sqrt(products(centre.T, centre.T))
-        inside = ~(off < cos(np.minimum(reach[which], np.pi)))
-        return near[inside]
-
-    def _reach(self, retro: _Retro, distance: Floats) -> Floats:
-        """Angles at which the light of a retro-reflector becomes too faint, radians: (n,)."""
-        whole = self._whole(np.repeat(retro.triangles[:1], len(distance)), distance)
-        share = FAINTEST * self._noise.threshold / np.maximum(whole, 1e-300)
-        return np.radians(np.sqrt(self._noise.stray_light / share))
-
-    def _whole(self, triangle: Ints32, distance: Floats) -> Floats:
-        """Energies of beams that hit a retro-reflector: (n,)."""
-        white = np.full(len(distance), 0xFFFFFFFF, np.uint32)
-        return self._paths.energy(triangle, np.ones(len(distance)), distance, white)
-
-    def _leaks(self, retro: _Retro, starts: Floats, ahead: Floats) -> tuple[Floats, Floats]:
-        """Energies of stray light in rays (n,), and where it is from, seen from there: (n, 3).
-
-        The light comes from the point of the triangles that is nearest to the ray by angle.
-        """
-        across, up = (axis.T for axis in any_axes(ahead.T))
-        best, ends = np.zeros(len(starts)), np.zeros((len(starts), 3))
-        nearest = _first_few(retro, starts, ahead)
-        for which in nearest.T:
-            towards = retro.corners[which] - starts[:, None]  # (n, 3 corners, 3)
-            depth = (towards * ahead[:, None]).sum(axis=2)
-            front = (depth > 0).all(axis=1)
-            with np.errstate(invalid="ignore", divide="ignore"):
-                # On a plane across the ray, at a distance of 1, angles from it are lengths.
-                x = (towards * across[:, None]).sum(axis=2) / depth
-                y = (towards * up[:, None]).sum(axis=2) / depth
-                off, point = _nearest(x, y, towards, depth)
-            middle = towards.mean(axis=1)
-            point = point + INWARDS * (middle - point)
-            distance = np.sqrt(products(point.T, point.T))
-            angle = np.degrees(arctan2(off, 1.0))
-            some = np.flatnonzero(front & (angle > 0) & (angle < np.degrees(STRAY_MOST)))
-            share = np.minimum(self._noise.stray_light / angle[some] ** 2, 1)
-            energy = share * self._whole(retro.triangles[which[some]], distance[some])
-            more = energy > best[some]
-            best[some[more]], ends[some[more]] = energy[more], point[some[more]]
-        return best, ends
+    def _back(self, triangle: Ints32) -> Floats:
+        """Return what retro-reflectors return of a beam that hits them at a distance of 10 m."""
+        surfaces, count = self._surfaces, len(triangle)
+        table = surfaces.at(self._light.wavelength_nm)
+        return table.scattered(surfaces.objects(triangle), np.ones(count), np.ones(count))
 
     def _beside(self, returns: Hits, ray: Ints, distance: Floats) -> Bools:
         """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""
@@ -234,22 +180,6 @@ class Receiver:
             own = returns.distance[first[some] + number]
             beside[some] |= np.abs(own - distance[some]) <= self._gap_m
         return beside
-
-
-class _Cells:
-    """Rays that are fired one after the other, with a cone around those of each cell."""
-
-    def __init__(self, starts: Floats, ahead: Floats) -> None:
-        self.starts, self.ahead = starts, ahead
-        first = np.arange(0, len(starts), CELL_RAYS)
-        self.number = np.arange(len(starts)) // CELL_RAYS  # cells of the rays
-        sums = np.add.reduceat(ahead, first, axis=0)
-        self.axes = sums / np.maximum(length(sums), 1e-9)[:, None]
-        cosine = np.minimum.reduceat(products(self.axes[self.number].T, ahead.T), first)
-        self.opening = arccos(np.clip(cosine, -1, 1))
-        self.begins = starts[first]
-        away = length(starts - self.begins[self.number])
-        self.moved = np.maximum.reduceat(away, first)
 
 
 @dataclass(frozen=True)
@@ -300,41 +230,3 @@ def _clusters(triangles: Integers, corners: Floats, actor: int | None = None) ->
     for number in range(int(which.max()) + 1):
         some = np.flatnonzero(which == number)
         yield _Retro(triangles[some].astype(np.int32), corners[some], actor)
-
-
-def _first_few(retro: _Retro, starts: Floats, ahead: Floats) -> Indices:
-    """Find some triangles whose middles are nearest to rays (n,) by angle: (n, k)."""
-    count = len(retro.triangles)
-    if count <= TRIANGLES_NEAR:
-        return np.broadcast_to(np.arange(count), (len(starts), count))
-    middles = retro.corners.mean(axis=1)
-    towards = middles[:, None] - starts  # (triangles, n, 3)
-    towards = towards.transpose(2, 0, 1)
-    cosine = products(towards, ahead.T[:, None]) / np.sqrt(products(towards, towards))
-    return np.argsort(-cosine, axis=0, kind="stable")[:TRIANGLES_NEAR].T
-
-
-def _nearest(x: Floats, y: Floats, corners: Floats, depth: Floats) -> tuple[Floats, Floats]:
-    """Distances from 0 of triangles with corners x, y (n, 3) in a plane, and the points there.
-
-    The points are between the `corners` (n, 3, 3), which are seen at x and y, at depths (n, 3). A
-    distance is 0 if the triangle lies around 0.
-    """
-    best = np.full(len(x), np.inf)
-    points = np.zeros((len(x), 3))
-    inside = np.ones((2, len(x)), np.bool_)
-    for one, other in ((0, 1), (1, 2), (2, 0)):
-        dx, dy = x[:, other] - x[:, one], y[:, other] - y[:, one]
-        turn = x[:, one] * dy - y[:, one] * dx
-        inside &= np.stack([turn >= 0, turn <= 0])
-        along = -(x[:, one] * dx + y[:, one] * dy) / np.maximum(dx * dx + dy * dy, 1e-300)
-        along = np.clip(along, 0, 1)
-        off = hypot(x[:, one] + along * dx, y[:, one] + along * dy)
-        # A step on the plane is not the same share of the way between the corners.
-        far = along * depth[:, one]
-        share = far / (far + (1 - along) * depth[:, other])
-        point = corners[:, one] + share[:, None] * (corners[:, other] - corners[:, one])
-        less = off < best
-        best[less], points[less] = off[less], point[less]
-    best[inside.any(axis=0)] = 0.0
-    return best, points

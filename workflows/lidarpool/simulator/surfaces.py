@@ -290,6 +290,8 @@ class Surfaces:
 
     def objects(self, triangle: Integers) -> Ints32:
         """Objects of triangles (n,); -1 of no surface."""
+        if self._scene.instances is None:
+            return self.owners[triangle]
         return self._find(triangle)[1]
 
     def instances(self, triangle: Integers) -> Indices:

@@ -1,0 +1,155 @@
+"""Loops over rays beside retro-reflectors, whose light they receive: see receiver.py."""
+
+# mypy: disable-error-code="no-untyped-def"
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from raybeam.compiled import compiled, inlined, stage
+from raybeam.embree_rays import any_axes
+
+from ..base.elementary_loops import arctan2, exp, sin_cos
+from ..sensor.materials import NEAREST_M, REFERENCE_M
+
+CELL_RAYS = 1 << 8  # consecutive rays that are compared with retro-reflectors at a time
+TRIANGLES_NEAR = 4  # of a cluster are asked where a ray is nearest to them
+STRAY_MOST = math.radians(30.0)  # no stray light comes from farther aside
+INWARDS = 0.02  # of the way to the middle of a triangle: rays to its edge end there, to hit it
+
+
+@inlined
+def _lost(distance, extinction):
+    """As `at_right_angles`."""
+    far = max(distance, NEAREST_M)
+    nearer = REFERENCE_M / far
+    nearer = nearer * nearer
+    return nearer * exp(-2 * extinction * far) if extinction else nearer
+
+
+@inlined
+def _angle(cosine):
+    """Angle with a cosine, which may be rounded."""
+    cosine = min(max(cosine, -1.0), 1.0)
+    return arctan2(math.sqrt((1 - cosine) * (1 + cosine)), cosine)
+
+
+@compiled()
+def cones(starts, ahead, out):
+    """Write cones around cells of rays (3, n), (c, 5): axis, half angle, and how far they move."""
+    count = starts.shape[1]
+    for c in range(len(out)):
+        begin, end = c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)
+        x = y = z = far = 0.0
+        for k in range(begin, end):
+            x, y, z = x + ahead[0, k], y + ahead[1, k], z + ahead[2, k]
+            a, b = starts[0, k] - starts[0, begin], starts[1, k] - starts[1, begin]
+            d = starts[2, k] - starts[2, begin]
+            far = max(far, (a * a + b * b) + d * d)
+        length = max(math.sqrt((x * x + y * y) + z * z), 1e-9)
+        x, y, z, least = x / length, y / length, z / length, 1.0
+        for k in range(begin, end):
+            least = min(least, (x * ahead[0, k] + y * ahead[1, k]) + z * ahead[2, k])
+        out[c, 0], out[c, 1], out[c, 2] = x, y, z
+        out[c, 3], out[c, 4] = _angle(least), math.sqrt(far)
+
+
+@stage
+def _nearest(corners, t, ray, point):
+    """Write where a triangle is nearest to a ray by angle, seen from its start; its tangent.
+
+    -1 if the triangle is not in front of the ray.
+    """
+    ox, oy, oz, dx, dy, dz = ray
+    (a, b, c, d, e, f), best = any_axes(dx, dy, dz), np.inf
+    left = right = True
+    for one in range(3):
+        other = one + 1 if one < 2 else 0
+        # Of the two corners: seen from the start, depth, and place on a plane at a distance of 1.
+        px, py, pz = corners[t, one, 0] - ox, corners[t, one, 1] - oy, corners[t, one, 2] - oz
+        qx, qy, qz = corners[t, other, 0] - ox, corners[t, other, 1] - oy, corners[t, other, 2] - oz
+        p, q = (px * dx + py * dy) + pz * dz, (qx * dx + qy * dy) + qz * dz
+        if not (p > 0 and q > 0):
+            return -1.0
+        x, y = ((px * a + py * b) + pz * c) / p, ((px * d + py * e) + pz * f) / p
+        u, v = ((qx * a + qy * b) + qz * c) / q - x, ((qx * d + qy * e) + qz * f) / q - y
+        turn = x * v - y * u
+        left, right = left and turn >= 0, right and turn <= 0
+        along = min(max(-(x * u + y * v) / max(u * u + v * v, 1e-300), 0.0), 1.0)
+        off = math.sqrt((x + along * u) * (x + along * u) + (y + along * v) * (y + along * v))
+        if off < best:
+            # A step on the plane is not the same share of the way between the corners.
+            share = along * p / (along * p + (1 - along) * q)
+            point[0], point[1] = px + share * (qx - px), py + share * (qy - py)
+            point[2], best = pz + share * (qz - pz), off
+    return 0.0 if left or right else best
+
+
+@compiled()
+def leaks(starts, ahead, cells, corners, middle, radius, back, nearest_m, share, faintest,
+          extinction, best, ends, new):  # fmt: skip
+    """Keep where rays (3, n) receive more light of near triangles than `best` (n,), and mark them.
+
+    `back` (t,) is what triangles at a distance of 10 m return of a beam. The light comes from the
+    point of the triangles that is nearest to a ray by angle, which is written to `ends` (n, 3).
+    """
+    count, triangles = starts.shape[1], len(corners)
+    middles = np.zeros((triangles, 3))
+    for t in range(triangles):
+        for axis in range(3):
+            middles[t, axis] = (corners[t, 0, axis] + corners[t, 1, axis] + corners[t, 2, axis]) / 3
+    point, few = np.zeros(3), np.zeros(TRIANGLES_NEAR, np.int64)
+    for c in range(len(cells)):
+        begin, end = c * CELL_RAYS, min((c + 1) * CELL_RAYS, count)
+        x, y = middle[0] - starts[0, begin], middle[1] - starts[1, begin]
+        z, size = middle[2] - starts[2, begin], radius + cells[c, 4]
+        far = math.sqrt((x * x + y * y) + z * z)
+        wide, off = math.pi, 0.0
+        if far > size:
+            sine = size / far
+            wide = arctan2(sine, math.sqrt((1 - sine) * (1 + sine)))
+            off = _angle(((cells[c, 0] * x + cells[c, 1] * y) + cells[c, 2] * z) / far)
+        # The angle at which the light becomes too faint.
+        whole = back[0] * _lost(max(far - size, max(nearest_m, 1e-3)), extinction)
+        reach = math.radians(math.sqrt(share / (faintest / max(whole, 1e-300))))
+        reach = min(reach, STRAY_MOST) + wide
+        if off > cells[c, 3] + reach:
+            continue
+        _, cosine = sin_cos(min(reach, math.pi))
+        for k in range(begin, end):
+            x, y, z = middle[0] - starts[0, k], middle[1] - starts[1, k], middle[2] - starts[2, k]
+            ox, oy, oz = starts[0, k], starts[1, k], starts[2, k]
+            dx, dy, dz = ahead[0, k], ahead[1, k], ahead[2, k]
+            if (x * dx + y * dy) + z * dz < cosine * math.sqrt((x * x + y * y) + z * z):
+                continue
+            chosen = min(triangles, TRIANGLES_NEAR)
+            for number in range(chosen):
+                few[number] = number
+            if triangles > chosen:  # those whose middles are nearest
+                for number in range(chosen):
+                    most = -2.0
+                    for t in range(triangles):
+                        taken = False
+                        for before in range(number):
+                            taken |= few[before] == t
+                        x, y, z = middles[t, 0] - ox, middles[t, 1] - oy, middles[t, 2] - oz
+                        towards = (x * dx + y * dy) + z * dz
+                        towards = towards / math.sqrt((x * x + y * y) + z * z)
+                        if not taken and towards > most:
+                            most, few[number] = towards, t
+            for number in range(chosen):
+                t = few[number]
+                off = _nearest(corners, t, (ox, oy, oz, dx, dy, dz), point)
+                angle = math.degrees(arctan2(off, 1.0))
+                if not 0 < angle < math.degrees(STRAY_MOST):
+                    continue
+                x = point[0] + INWARDS * ((middles[t, 0] - ox) - point[0])
+                y = point[1] + INWARDS * ((middles[t, 1] - oy) - point[1])
+                z = point[2] + INWARDS * ((middles[t, 2] - oz) - point[2])
+                distance = math.sqrt((x * x + y * y) + z * z)
+                energy = min(share / (angle * angle), 1.0) * (back[t] * _lost(distance, extinction))
+                if energy > best[k]:
+                    best[k], new[k] = energy, True
+                    ends[k, 0], ends[k, 1], ends[k, 2] = x, y, z
