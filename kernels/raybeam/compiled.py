@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -45,8 +45,9 @@ def _stamp(folder: Path) -> tuple[int, ...]:
     return tuple(number for f in found for number in (f.stat().st_mtime_ns, f.stat().st_size))
 
 
-_WAIT_S = 60.0  # for a process that compiles: it may have been stopped
+_WAIT_S, _STEP_S = 60.0, 0.02  # in all, for processes that compile: one may have been stopped
 _held = [0]  # how often the lock is held, by the thread that has numba's lock
+_patience = [_WAIT_S]  # which a process that was waited for in vain has used up
 
 
 @contextmanager
@@ -61,13 +62,13 @@ def _in_turn(folder: str) -> Iterator[None]:
             if fcntl is not None and not _held[0]:
                 Path(folder).mkdir(parents=True, exist_ok=True)
                 file = (Path(folder) / "raybeam.lock").open("a")
-                until = time.monotonic() + _WAIT_S
-                while time.monotonic() < until:
+                while _patience[0] > 0:
                     try:
                         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                         break
                     except BlockingIOError:
-                        time.sleep(0.02)
+                        time.sleep(_STEP_S)
+                        _patience[0] -= _STEP_S
         except OSError:  # a file system without locks
             pass
         _held[0] += 1
@@ -76,7 +77,9 @@ def _in_turn(folder: str) -> Iterator[None]:
         finally:
             _held[0] -= 1
             if file is not None:
-                file.close()  # which releases it
+                with suppress(OSError):
+                    fcntl.flock(file, fcntl.LOCK_UN)  # also of a child that was forked meanwhile
+                file.close()
 
 
 def _kept(made: Any, function: Any) -> Any:

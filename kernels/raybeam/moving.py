@@ -203,7 +203,8 @@ class _Chunk:
         new = (np.diff(body, prepend=-1) != 0) | (np.diff(begins, prepend=np.nan) != 0)
         number = np.cumsum(new) - 1  # several cells of a body may begin at one time
         poses = moving.poses(body[new], begins[new])
-        pads, late = np.full(len(cell), loops.PADS_M), np.flatnonzero(ends > begins)
+        pads, straddles = np.full(len(cell), loops.PADS_M), spans[1] > spans[0]
+        late = np.flatnonzero(straddles)
         if len(late):  # the box is larger by what happens until the cell's end
             change = np.abs(moving.poses(body[late], ends[late]) - poses[:, number[late]])
             size = np.abs(moving.boxes).max(axis=(1, 2))[shape[late]]
@@ -211,9 +212,7 @@ class _Chunk:
         given = cell, number, poses, boxes, shape, pads
         row, pair = loops.through(rays, self._nearest.distance, *given)
         body, number = body[pair], number[pair]
-        if len(late):  # each of their rays at its own time
-            straddles = np.zeros(len(cell), np.bool_)
-            straddles[late] = True
+        if len(late):  # each of their rays at its own time, when the body may not be there
             first, last = moving.there[body].T
             there = np.flatnonzero((first <= times[row]) & (times[row] <= last))
             row, body, number, pair = row[there], body[there], number[there], pair[there]

@@ -101,6 +101,16 @@ def check_scan(
             f"{count:,} rays are more than the {_MOST_RAYS:,} that one call can number: "
             "scan smaller windows."
         )
+    if rays_out is not None and not (
+        rays_out.shape == (6, count)
+        and rays_out.dtype == np.float64
+        and rays_out.flags.c_contiguous
+        and rays_out.flags.writeable
+    ):
+        raise ValueError(
+            f"rays_out must be a contiguous array of float64 (6, {count}) that can be written to; "
+            f"given: {rays_out.dtype} {rays_out.shape}."
+        )
     if index(keep_every) < 1:
         raise ValueError(f"keep_every is {keep_every}: it must be at least 1, to keep all hits.")
     return Scan(

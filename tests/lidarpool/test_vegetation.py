@@ -45,6 +45,20 @@ def gap(found, rays=MANY, leaves=0):
     return 1 - (found["object"] == leaves).sum() / rays
 
 
+def test_leaves_that_no_ray_meets_change_nothing():
+    """Neither where surfaces continue from sub-ray to sub-ray, some beyond the sensor's range."""
+    scene = [box("F", (-500, -500, -2), (500, 500, -1.5)), box("Leaves", (-20, 0, -1), (-19, 1, 1))]
+    beams = Beams(np.radians(np.linspace(-0.6, -4, 200)))
+    sensor = Sensor(beams, Spin(1, 360), max_range_m=60)
+    options = {"returns": Returns("all", subrays=19, divergence_mrad=20)}
+    leaves = Material("Leaves", leaf_area_density=1.0)
+    bare = cast(scene[:1], sensor, (0, 0, 0), materials=[GROUND], **options)
+    found = cast(scene, sensor, (0, 0, 0), materials=[GROUND, leaves], **options)
+    assert len(bare["range"]) > 150
+    for column in ("range", "intensity", "ray"):
+        assert np.array_equal(bare[column], found[column])
+
+
 # -- leaf angles ---------------------------------------------------------------------------------
 
 

@@ -64,3 +64,19 @@ def test_there_may_be_none():
     positions, rotations = Ways().poses(np.zeros(0, np.intp), np.zeros(0))
     assert positions.shape == (0, 3) and rotations.shape == (0, 3, 3)
     assert Ways().presence_ns.shape == (0, 2)
+
+
+@pytest.mark.parametrize("as_lists", [False, True])
+def test_a_trajectory_may_give_lists_or_one_pose_for_all(as_lists):
+    """As NumPy would take them."""
+
+    class Still:
+        stations, moves, duration_ns = 1, True, np.inf
+
+        def poses(self, station, times_ns):
+            if as_lists:
+                return [[1.0, 2.0, 3.0]] * len(times_ns), [np.eye(3).tolist()] * len(times_ns)
+            return np.array([1.0, 2.0, 3.0]), np.eye(3)
+
+    places, turns = Ways([Still()]).poses(np.zeros(2, int), np.array([0.0, 1.0]))
+    assert places.tolist() == [[1, 2, 3]] * 2 and np.array_equal(turns, [np.eye(3)] * 2)

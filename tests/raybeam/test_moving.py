@@ -199,6 +199,26 @@ def test_most_rays_are_not_looked_at(monkeypatch):
     assert len(rays_of(hits)) <= sum(asked) < 12 * len(rays_of(hits))
 
 
+@pytest.mark.parametrize("there", [(2.0, 5.0), (0.0, 1.0)])
+@pytest.mark.parametrize("backend", ["embree", "numpy"])
+def test_rays_beside_the_moment_when_a_body_is_there_miss_it(backend, there):
+    """Also where they are compared together with rays of that very moment."""
+
+    def below(bodies, times):
+        return table(
+            np.tile([0.0, 0, -3], (len(bodies), 1)), np.tile(np.eye(3), (len(bodies), 1, 1))
+        )
+
+    floor = RayCaster(FLAT[0] * 50, FLAT[1], backend, threads=1)
+    boxes = np.array([[[-50.0, -50, 0], [50, 50, 0]]])
+    moving = Moving((floor,), boxes, np.zeros(1, int), np.array([there]), below)
+    directions = np.tile([0.0, 0.01, -1], (128, 1))
+    directions[:, 0] = np.linspace(-0.1, 0.1, 128)
+    times = np.repeat([1.0, 2.0], [80, 48])
+    found = hits_on(moving, check_scan(Pattern(directions), [0, 0, 0]), lambda ray: times[ray])
+    assert np.array_equal(found.body >= 0, (there[0] <= times) & (times <= there[1]))
+
+
 def test_no_loop_is_compiled_with_fast_mathematics():
     """Functions that such a loop calls would inherit that, and round otherwise."""
     sources = [path.read_text() for path in Path(module.__file__).parent.glob("*.py")]

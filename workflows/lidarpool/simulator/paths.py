@@ -192,7 +192,7 @@ class Paths:
             hits, normals = hits.take(order), np.concatenate(seen)[order]
         if each == 1:
             return hits, None
-        if parts[1:]:
+        if parts[1:] or len(hits.ray) != len(ray):  # some light ends beyond the range
             directions = rays[3:].take(hits.ray, axis=1).T
         return hits, (normals, directions)
 

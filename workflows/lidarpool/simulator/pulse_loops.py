@@ -239,7 +239,7 @@ def returns(
     strongest hits to `whole` (2, k), those of the air as -1, -2, …, and distances, energies and
     velocities to `real` (3, k).
     """
-    i, j, count, number_row, moves = 0, 0, 0, 0, len(velocity) > 0
+    i, j, count, number_row, moves = 0, 0, 0, 0, len(velocity) + len(air_velocity) > 0
     size = _most(ray, each) + _most(air_ray, each)
     own, sub, far, light, speed, hard, new, there, table, changes = _room(size, each)
     while i < len(ray) or j < len(air_ray):
@@ -265,11 +265,14 @@ def returns(
                     best = k
                 n += 1
         if j == last_air and most - least <= gap_m:  # most beams meet one surface, and no air
+            i = last
+            if n == 0:
+                continue
             whole[0, count], whole[1, count] = beam, best
             real[0, count], real[1, count] = mean / sum_, sum_ / each
             if moves:
                 real[2, count] = drift / sum_
-            i, count = last, count + int(n > 0)
+            count += 1
         else:
             n, least, most = 0, np.inf, -np.inf
             while i < last or j < last_air:  # what is in the air first

@@ -80,8 +80,10 @@ class Ways(tuple[Trajectory, ...]):
         for one in np.unique(number[others]).tolist():
             rows = others[number[others] == one]
             places, turns = self[one].poses(0, times_ns[rows])
-            turns = np.broadcast_to(np.eye(3), (len(rows), 3, 3)) if turns is None else turns
-            out[:3, rows], out[3:, rows] = places.T, turns.transpose(1, 2, 0).reshape(9, -1)
+            turns = np.eye(3) if turns is None else np.asarray(turns)
+            out[:3, rows] = np.broadcast_to(np.asarray(places), (len(rows), 3)).T
+            turns = np.broadcast_to(turns, (len(rows), 3, 3))
+            out[3:, rows] = turns.transpose(1, 2, 0).reshape(9, -1)
         return out
 
     def poses(self, number: Integers, times_ns: Floats) -> tuple[Floats, Floats]:
