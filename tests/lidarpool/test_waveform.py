@@ -67,6 +67,14 @@ def test_decomposition_gives_both_echoes_back(apart):
     assert width == pytest.approx([5, 5], rel=1e-4)
 
 
+@pytest.mark.parametrize(("apart", "weak"), [(2.3, 0.5), (2.5, 0.45), (3.0, 0.33), (3.5, 0.2)])
+def test_a_weak_echo_beside_a_strong_one_is_given_back(apart, weak):
+    """It takes the fit more steps."""
+    place, energy, _ = found(apart, decomposes=True, energies=(2.0, weak))
+    assert place == pytest.approx([0, apart], abs=1e-3)
+    assert energy == pytest.approx([2.0, weak], rel=1e-2)
+
+
 def test_hits_close_together_are_one_echo_in_closed_form():
     for decomposes in (False, True):
         place, energy, width = found(0.2, decomposes)
