@@ -19,57 +19,56 @@ def _product(x, y, z, a, b, c):
 
 
 @inlined
-def _found(t, begins, owners, shared, firsts, to_kept, standing):
-    """Row among the triangles that are kept once, object, and instance or -1 of a triangle.
-
-    Triangles of instances begin at `begins`, whose last is where those of actors begin; `shared`
-    and `firsts` are objects and first rows of instances.
-    """
-    plain, actors = begins[0], begins[-1]
-    if t < plain:
-        return t, owners[t], -1
-    if t >= actors:
-        owner = owners[t - (actors - plain)]
-        return t + to_kept[owner - standing], owner, -1
-    low, high = 0, len(shared)  # the last that begins, by halves
+def _instance(t, begins):
+    """Find the last instance whose triangles begin at or before one, by halves."""
+    low, high = 0, len(begins) - 1
     while high - low > 1:
         middle = (low + high) // 2
         if begins[middle] <= t:
             low = middle
         else:
             high = middle
-    return firsts[low] + t - begins[low], shared[low], low
+    return low
 
 
 @compiled()
 def find(triangle, begins, owners, shared, firsts, to_kept, standing, rows, objects, which):
-    """Write what `_found` says of triangles."""
+    """Write rows among the triangles that are kept once, objects, and instances or -1.
+
+    Triangles of instances begin at `begins`, whose last is where those of actors begin; `shared`
+    and `firsts` are objects and first rows of instances.
+    """
+    plain, actors = begins[0], begins[-1]
     for k in range(len(triangle)):
-        rows[k], objects[k], which[k] = _found(
-            np.int64(triangle[k]), begins, owners, shared, firsts, to_kept, standing
-        )
+        t, which[k] = np.int64(triangle[k]), -1
+        if t < plain:
+            rows[k], objects[k] = t, owners[t]
+        elif t >= actors:
+            owner = owners[t - (actors - plain)]
+            rows[k], objects[k] = t + to_kept[owner - standing], owner
+        else:
+            low = _instance(t, begins)
+            rows[k], objects[k], which[k] = firsts[low] + t - begins[low], shared[low], low
 
 
 @compiled()
 def meet(
-    triangle, begins, owners, shared, firsts, to_kept, standing, directions, turns, table, run,
-    poses, reflectance, retro, normals, along, objects, back,
+    rows, objects, which, directions, turns, table, run, poses, reflectance, retro,
+    normals, along, back,
 ):  # fmt: skip
-    """Write unit normals (3, n), their products with directions (3, n), objects, and light.
+    """Write unit normals (3, n), their products with directions (3, n), and light sent back.
 
     Normals in `table` (f, 3) are turned by instances, and by poses (12, m) of each `run`. The light
-    is what surfaces send back that are neither textured nor rough, at a distance of 10 m.
+    is what surfaces send back that are neither textured nor rough, at a distance of 10 m. No view
+    of an array is made: it would be counted, which takes five times as long as all the rest.
     """
-    for k in range(len(triangle)):
-        row, owner, which = _found(
-            np.int64(triangle[k]), begins, owners, shared, firsts, to_kept, standing
-        )
+    for k in range(len(rows)):
+        row, i, owner = rows[k], which[k], objects[k]
         x, y, z = np.float64(table[row, 0]), np.float64(table[row, 1]), np.float64(table[row, 2])
-        if which >= 0:  # in one order of rounding, that of columns.cu
-            t = turns[which]
-            a = _product(t[0, 0], t[0, 1], t[0, 2], x, y, z)
-            b = _product(t[1, 0], t[1, 1], t[1, 2], x, y, z)
-            c = _product(t[2, 0], t[2, 1], t[2, 2], x, y, z)
+        if i >= 0:  # in one order of rounding, that of columns.cu
+            a = _product(turns[i, 0, 0], turns[i, 0, 1], turns[i, 0, 2], x, y, z)
+            b = _product(turns[i, 1, 0], turns[i, 1, 1], turns[i, 1, 2], x, y, z)
+            c = _product(turns[i, 2, 0], turns[i, 2, 1], turns[i, 2, 2], x, y, z)
             length = np.sqrt((a * a + b * b) + c * c)
             x, y, z = a / length, b / length, c / length
         if len(run) and run[k] >= 0:
@@ -81,7 +80,7 @@ def meet(
             )
         cosine = _product(x, y, z, directions[0, k], directions[1, k], directions[2, k])
         normals[0, k], normals[1, k], normals[2, k] = x, y, z
-        along[k], objects[k] = cosine, owner
+        along[k] = cosine
         back[k] = reflectance[owner] * (RETRO_GAIN if retro[owner] else abs(cosine))
 
 

@@ -160,14 +160,14 @@ class Surfaces:
         """Return normals (3, n), their products with directions, objects, and light sent back."""
         from . import surface_loops  # not before: numba takes half a second to import
 
-        hits, poses, run = owned(triangle, np.int32), np.zeros((12, 0)), np.zeros(0, np.int64)
+        poses, run = np.zeros((12, 0)), np.zeros(0, np.int64)
+        rows, objects, which = self._find(triangle)
         if ways:
-            poses, run = ways.runs(self.objects(hits) - np.int64(self._standing), owned(times))
-        normals, objects = np.empty((3, len(hits))), np.empty(len(hits), np.int32)
-        along, back = np.empty((2, len(hits)))
+            poses, run = ways.runs(objects - np.int64(self._standing), owned(times))
+        normals, (along, back) = np.empty((3, len(rows))), np.empty((2, len(rows)))
         given = self._turns, self.unit_normals, run, poses, table.reflectance, table.retro
-        out = normals, along, objects, back
-        surface_loops.meet(hits, *self._numbers, owned(directions.T), *given, *out)
+        hits = rows, objects, which, owned(directions.T)
+        surface_loops.meet(*hits, *given, normals, along, back)
         return normals, along, objects, back
 
     def lit(
