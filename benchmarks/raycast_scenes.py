@@ -156,7 +156,8 @@ def jobs(
         name = f"city-{triangles:.0e}".replace("e+0", "e")
         out[name] = lambda triangles=triangles: city_job(triangles, rays)  # type: ignore[misc]
     for place in ("street", "inside"):
-        out[place] = partial(positions_job, cities[0], rays, inside=place == "inside")
+        most = max(cities[0], 20_000)  # smaller ones have no rooms
+        out[place] = partial(positions_job, most, rays, inside=place == "inside")
     out[f"terrain-{hills:.0e}".replace("e+0", "e")] = lambda: terrain_job(hills, rays)
     for path in meshes:
         out[path.stem] = lambda path=path: mesh_job(path, rays)  # type: ignore[misc]

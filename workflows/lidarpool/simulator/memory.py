@@ -32,11 +32,11 @@ RAY_AMONG_BODIES = 70  # in a scene with instances or actors
 POSE, POSE_KEPT = 140, 100  # of a firing that has its own: while it is made, and after that
 # Of those cast at a time; if light passes or is reflected; if it is refracted.
 SUBRAY, SUBRAY_PASSING, SUBRAY_REFRACTED = 200, 650, 1350
-SUBRAY_MOVING = 110  # more of each, with radial velocities
+SUBRAY_MOVING = 200  # more of each, with radial velocities
 # Of a ray that is cast at a time: false alarms and stray light, and each pulse of another sensor.
 # Each return has a cause then.
 RECEIVED, CROSSED, RETURN_CAUSED = 120, 370, 10
-RETURN, RETURN_ALL, RETURN_KEPT = 30, 85, 40  # meanwhile; then, when all are counted and thinned
+RETURN, RETURN_ALL, RETURN_KEPT = 30, 110, 40  # meanwhile; then, when all are counted and thinned
 RETURNS = 1.5  # of a pulse, where all or two are reported; 1.1 to 1.6 in generated woods
 RETURNS_LEAFY = 4  # where all are, and each sub-ray meets a leaf by itself; 3.3 in a high canopy
 AIR, AIR_HIT = 110, 170  # of a sub-ray where the air returns light; a hit in the air

@@ -24,8 +24,9 @@ from .doppler import radial_velocities
 from .echoes import Echoes
 from .hits import FALSE_ALARM, NO_SURFACE
 from .motion import Poses
-from .surfaces import Lit, Surfaces, light_of
+from .surfaces import Surfaces, light_of
 
+BLOCK_HITS = 1 << 16  # that are looked at a time
 LEAST_LEFT = 1e-30  # of the light, so that what is divided by it is finite in single precision
 
 
@@ -254,27 +255,27 @@ class BatchReturns:
 
         It means nothing where there is no surface.
         """
-        return np.abs(self._lit.along)
+        return np.abs(self._lit[0])
 
     @cached_property
-    def _lit(self) -> Lit:
-        light = light_of(self.survey, self.sensor)
-        return self._surfaces.lit(
-            self.found.triangle,
-            self.directions,
-            self.found.distance,
-            light,
-            self._times,
-            self._poses.ways,
-            self._colours if self._surfaces.materials.textured else None,
-        )
+    def _lit(self) -> tuple[Floats, Floats]:
+        """Cosines of incidence, of either sign, and energies; in blocks, for normals take room."""
+        light, (along, energy) = light_of(self.survey, self.sensor), np.empty((2, len(self)))
+        colours = self._colours if self._surfaces.materials.textured else None
+        for begin in range(0, len(self), BLOCK_HITS):
+            some = slice(begin, begin + BLOCK_HITS)
+            found = self.found.triangle[some], self.directions[some], self.found.distance[some]
+            more = None if colours is None else colours[some]
+            lit = self._surfaces.lit(*found, light, self._times[some], self._poses.ways, more)
+            along[some], energy[some] = lit.along, lit.energy
+        return along, energy
 
     @cached_property
     def intensity(self) -> Floats:
         """Received energy, see `Surfaces.energy`."""
         if self.found.energy is not None:
             return self.found.energy
-        return self._lit.energy
+        return self._lit[1]
 
     @cached_property
     def _colours(self) -> UInts32:
