@@ -65,7 +65,6 @@ class EchoCaster:
         # Whether each ray that hits something has one return.
         self._finds = self._returns.waveform != "none"  # returns in waveforms
         self._records = survey.waveform_samples  # of each return
-        self._mode = self._returns.mode
         waves = self._finds or self._records > 0
         self._digitizer = digitizer_of(self._returns, self._sensor) if waves else None
         several = self._returns.subrays > 1 or self._noise.loses or waves
@@ -131,7 +130,7 @@ class EchoCaster:
                 window = (row, row + (stop - start) * len(beam))
                 here = poses.part(start, stop, len(beam))
                 hits, planes = self._paths.hits(beams, here, window, keys, start, len(beam))
-                air, mode = self._in_air(hits, (start, stop), keys, beams, here, row), self._mode
+                air = self._in_air(hits, (start, stop), keys, beams, here, row)
                 if self._digitizer is not None and air is not None:
                     (hits, planes), air = inserted(hits, planes, air), None
                 if self._finds:
@@ -139,16 +138,15 @@ class EchoCaster:
                     returns = returns_in(hits, self._digitizer, len(beam), planes)
                     returns = self._detected(returns._replace(ray=start + returns.ray), keys)
                 else:
-                    report = Report(
-                        "all" if self._receiver.adds else mode, self._noise, keys, start
-                    )
+                    shown = "all" if self._receiver.adds else self._returns.mode  # more come below
+                    report = Report(shown, self._noise, keys, start)
                     returns = separated(hits, self._gap_m, len(beam), planes, air, report)
                 if self._receiver.adds:
                     every = np.arange(start, stop)
                     middles = (every - start) * len(beam)
                     returns = self._receiver.added(returns, keys, every, beams, here, middles, row)
                 if self._receiver.adds or self._finds:
-                    returns = returns.take(chosen(self._heights(returns), mode))
+                    returns = returns.take(chosen(self._heights(returns), self._returns.mode))
                 if self._records:
                     returns = self._with_waveforms(returns, hits, start, keys)
                 chunks.append(returns)

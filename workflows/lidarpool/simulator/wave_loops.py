@@ -11,11 +11,10 @@ import numpy as np
 from raybeam.compiled import compiled, stage
 
 from ..base.elementary_loops import exp, log
-from ..sensor.optics import WINDOW_SIGMAS
 from .pulse_loops import _joined, _most
+from .waveform import CUT
 
 # All in standard deviations of the system waveform.
-CUT = WINDOW_SIGMAS / 2  # beyond that an echo is 0; it is 4e-6 of its height there
 # Hits within this are one echo in closed form: position and height err by 1e-3 at most.
 NARROW = 0.25
 MEET = 1.0  # planes of neighbouring hits that meet as closely are one surface, see `_joined`

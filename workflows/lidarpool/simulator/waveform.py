@@ -22,7 +22,7 @@ from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
 from .hits import NO_SURFACE, Hits, Keys, Planes, numbers
 from .separation import surfaces_of
 
-CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0
+CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0 (4e-6)
 BLOCK_SAMPLES = 1 << 20  # of recorded waveforms that are made at a time
 
 
@@ -49,9 +49,14 @@ class Digitizer:
         """Samples before and behind an echo that it reaches."""
         return int(np.ceil(CUT * self.sigma))
 
+    @property
+    def per_m(self) -> float:
+        """Samples in a metre of range."""
+        return 2 / LIGHT_M_NS / self.sample_ns
+
     def samples(self, distance: Floats) -> Floats:
         """Return when light comes back, samples after the pulse."""
-        return distance * (2 / LIGHT_M_NS / self.sample_ns)
+        return distance * self.per_m
 
     def amplitude(self, energy: Floats, width: Floats) -> Floats:
         """Heights of echoes (n,) by energy and full width at half maximum, ns; 0 is unknown."""
@@ -70,16 +75,14 @@ def returns_in(
     """
     from . import wave_loops  # not before: numba takes half a second to import
 
-    surfaces, speeds = surfaces_of(each, planes), np.zeros(0)
-    if hits.velocity is not None:
-        speeds = hits.velocity
+    speeds = np.zeros(0) if hits.velocity is None else hits.velocity
     most = len(hits.ray)
     whole, real = np.empty((2, most), np.int64), np.empty((4, most))
-    per_m = 2 / LIGHT_M_NS / digitizer.sample_ns
     count = wave_loops.returns(
-        each, digitizer.sigma_m, (digitizer.sigma, per_m, digitizer.decomposes),
+        each, digitizer.sigma_m, (digitizer.sigma, digitizer.per_m, digitizer.decomposes),
         owned(hits.ray, np.int64), owned(hits.distance), owned(hits.energy),
-        hits.triangle != NO_SURFACE, owned(speeds), *surfaces, whole, real,
+        hits.triangle != NO_SURFACE, owned(speeds),
+        *surfaces_of(each, planes), whole, real,
     )  # fmt: skip
     beam, row = whole[:, :count].copy()
     distance, energy, velocity, width = real[:, :count].copy()
