@@ -14,9 +14,10 @@ from lidarpool import Beams, Material, Noise, Optics, Returns, Scene, Sensor, Sp
 from lidarpool.sensor.disc import Beam
 from lidarpool.sensor.noise import Purpose, named_seed, raw
 from lidarpool.sensor.optics import FWHM
-from lidarpool.simulator.air import AirCaster
+from lidarpool.simulator.air import Weather
 from lidarpool.simulator.hits import AIR, NO_SURFACE, Hits, Keys
-from lidarpool.simulator.separation import AirHits, Report, separated
+from lidarpool.simulator.separation import Report, separated
+from lidarpool.simulator.step import Setup
 from lidarpool.simulator.surfaces import Light, Surfaces
 from lidarpool.simulator.waveform import Digitizer, returns_in
 
@@ -126,7 +127,7 @@ def test_returns_are_those_of_the_twin(each, airy, planes):
     solid = hits.triangle != NO_SURFACE
     ground, flies = hits.take(solid), hits.take(~solid)
     given = tuple(one[solid] for one in normals) if planes else None
-    air = AirHits(flies.ray, flies.distance, flies.energy, flies.velocity) if airy else None
+    air = flies if airy else None
     found = separated(ground, GAP, each, given, air)
     expected = {k: twin.separated(own, GAP, each, planes) for k, own in pulses.items()}
     counts = same_returns(found, expected)
@@ -209,7 +210,7 @@ def test_what_the_air_returns_is_as_in_the_twin(weather, each):
     survey = Survey(sensor, poses=[(0, 0, 0)], steps=1, materials=materials, **options)
     corners = (0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0)
     scene = Scene.from_meshes([quad(name, *corners) for name in ("Wall", "Pane")])
-    caster = AirCaster(0, survey, Surfaces(scene, survey.materials))
+    caster = Weather(Setup(scene, survey, 0), None, Surfaces(scene, survey.materials))
     # Sub-rays hit nothing, a wall, a pane, or a pane a metre before a wall.
     rng, count = np.random.default_rng(7), 1500
     what, place = rng.integers(0, 4, count * each), rng.uniform(1, 60, count * each)

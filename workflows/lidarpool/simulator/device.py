@@ -25,9 +25,9 @@ from ..columns.table import AXES, CHANNEL, OBJECT, TABLE, Column
 from ..scene.scene import Scene
 from ..sensor import ScanSpec, Survey
 from ..sensor.materials import NEAREST_M, REFERENCE_M, RETRO_GAIN
-from .echoes import Echoes
-from .hits import SURFACE
+from .hits import SURFACE, Hits
 from .motion import Poses
+from .pulses import Found
 from .returns import BatchReturns
 from .surfaces import Surfaces
 from .world import World
@@ -145,11 +145,7 @@ class DeviceColumns:
         finally:  # else the device would write to memory that goes back to the pool
             columns, (ray, distance, triangle) = making.done()
         assert tally is not None
-        one, none = np.ones(len(ray), np.uint8), np.zeros(len(ray), np.int32)
-        found = Echoes(
-            ray, distance, triangle, hits, None, none,
-            energy=None, number=one, returns=one, reported=distance,
-        )  # fmt: skip
+        found = Found(Hits.one_each(ray, distance, triangle), hits, None)
         returns = BatchReturns(
             self._scene, survey, self._surfaces, specs, found, pattern, window[0], poses
         )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -21,6 +21,9 @@ from ..base.arrays import (
     UInts32,
 )
 from ..columns.table import CAUSES
+from ..scene.colours import GREY, packed
+
+T = TypeVar("T")
 
 NO_SURFACE = -1  # triangle and object of what is no surface
 SURFACE, AIR, FALSE_ALARM, CROSSTALK, BLOOMING = range(len(CAUSES))
@@ -31,22 +34,45 @@ def selected(columns: Iterable[Any], rows: Any) -> Iterator[Any]:
     return (None if column is None else column[rows] for column in columns)
 
 
-class Hits(NamedTuple):
-    """Points that light returned from, in the order of rays: arrays (n,).
+# Columns of whatever comes back.
+OF_RETURNS = "ray", "distance", "triangle", "energy", "colour", "cause"
 
+
+class Hits(NamedTuple):
+    """What comes back of pulses, in the order of rays and distances: arrays (n,).
+
+    Columns that no step of a survey makes are None. Before hits become returns, a ray is a sub-ray.
     What is no surface has the triangle `NO_SURFACE`.
     """
 
-    ray: Ints
-    distance: Floats
+    ray: Integers
+    distance: Floats  # metres, without noise
     triangle: Ints32
-    energy: Floats
-    colour: UInts32 | None = None  # packed, see `Surfaces.colours`
-    cause: Bytes | None = None  # None if all are surfaces
-    velocity: Floats | None = None  # radial, m/s, if a column has it; NaN if unknown
-    # Full width at half maximum in the waveform, ns; None if returns are made without.
+    # Received, see `Surfaces.energy`; None if it is that of the rays as reported.
+    energy: Floats | None = None
+    # Packed, see `Surfaces.colours`; None if they are those of the rays' ends, or not needed.
+    colour: UInts32 | None = None
+    cause: Bytes | None = None  # why they are there; None if all are surfaces
+    # Radial, m/s, if a column has it; NaN if unknown.
+    velocity: Floats | None = None
+    # Full width at half maximum in the waveform, ns, and height; None if returns are made without.
     width: Floats | None = None
-    waveform: Records | None = None  # of returns: recorded, see `recorded`
+    amplitude: Floats | None = None
+    waveform: Records | None = None  # recorded, but for the location
+    number: Bytes | None = None  # among the reported returns of its pulse, from 1
+    returns: Bytes | None = None  # how many these are
+    reported: Floats | None = None  # distance with noise
+
+    @classmethod
+    def none(cls) -> Hits:
+        """Make none."""
+        return cls(np.zeros(0, np.int64), np.zeros(0), np.zeros(0, np.int32))
+
+    @classmethod
+    def one_each(cls, ray: Integers, distance: Floats, triangle: Ints32) -> Hits:
+        """Make the only return of each ray, without noise."""
+        one = np.ones(len(ray), np.uint8)
+        return cls(ray, distance, triangle, number=one, returns=one, reported=distance)
 
     def take(self, rows: Bools | Indices) -> Hits:
         """Select some of them."""
@@ -54,38 +80,67 @@ class Hits(NamedTuple):
             rows = np.flatnonzero(rows)
         return Hits(*selected(self, rows))
 
+    @property
+    def height(self) -> Floats:
+        """Heights of echoes; without waveforms their energies."""
+        return made(self.energy if self.amplitude is None else self.amplitude)
+
 
 # Normals of the surfaces of hits, as they are seen in mirrors, and directions of their rays:
 # (n, 3) each.
 Planes = tuple[Floats, Floats]
 
 
-def joined(parts: list[Hits]) -> Hits:
-    """Concatenate hits; all have colours, or none.
+def made(column: T | None) -> T:
+    """Return a column that an earlier step has made."""
+    assert column is not None
+    return column
 
-    If some have a cause, those without are surfaces; if some have a velocity, that of those without
-    is unknown; those without a width have the width 0.
-    """
+
+# Values of a column where some have it, and others do not.
+_LACKING: dict[str, Any] = {"cause": np.uint8(SURFACE), "velocity": np.nan, "width": 0.0}
+
+
+def joined(parts: list[Hits]) -> Hits:
+    """Concatenate hits. Other columns than `_LACKING` are in all parts, or in none."""
     if len(parts) == 1:
         return parts[0]
-    *own, colours, causes, velocities, widths, waveforms = zip(*parts, strict=True)
-    return Hits(*map(np.concatenate, own))._replace(
-        colour=None if parts[0].colour is None else np.concatenate(colours),
-        cause=_filled(parts, causes, np.uint8(SURFACE)),
-        velocity=_filled(parts, velocities, np.float64(np.nan)),
-        width=_filled(parts, widths, np.float64(0)),
-        waveform=None if parts[0].waveform is None else np.concatenate(waveforms),
-    )
+    return Hits._make(_column(name, parts) for name in Hits._fields)
 
 
-def _filled(parts: list[Hits], columns: tuple[Any, ...], value: np.generic) -> AnyArray | None:
-    """Concatenate a column that some parts lack, with a value for those; None if all lack it."""
+def _column(name: str, parts: list[Hits]) -> AnyArray | None:
+    """Concatenate a column; None if all parts lack it."""
+    columns = [getattr(part, name) for part in parts]
     if all(column is None for column in columns):
         return None
-    lacking = (np.full(len(part.ray), value) for part in parts)
     return np.concatenate(
-        [full if one is None else one for one, full in zip(columns, lacking, strict=True)]
+        [
+            np.full(len(part.ray), _LACKING[name]) if column is None else column
+            for part, column in zip(parts, columns, strict=True)
+        ]
     )
+
+
+def unreal(returns: Hits, ray: Ints, distance: Floats, energy: Floats, cause: int) -> Hits:
+    """Make returns that are from no surface, with the columns that others have."""
+    count = len(ray)
+    return Hits(
+        ray,
+        distance,
+        np.full(count, NO_SURFACE, np.int32),
+        energy,
+        None if returns.colour is None else np.full(count, packed(GREY[0])[0]),
+        np.full(count, cause, np.uint8),
+        amplitude=None if returns.amplitude is None else energy,
+    )
+
+
+def merged(returns: Hits, more: Hits) -> Hits:
+    """Add returns to others; the result is in the order of rays and distances."""
+    if not len(more.ray):
+        return returns
+    hits = joined([returns, more])
+    return hits.take(np.lexsort((hits.distance, hits.ray)))
 
 
 @dataclass(frozen=True)
@@ -101,12 +156,12 @@ class Keys:
         return self.scan + number, ray - self.begins[number]
 
 
-def numbers(ray: Ints) -> Ints:
+def numbers(ray: Integers) -> Ints:
     """Count the entries of each ray, which are consecutive, from 0: (n,)."""
     return np.arange(len(ray)) - np.repeat(*runs(ray))
 
 
-def runs(ray: Ints) -> tuple[Ints, Ints]:
+def runs(ray: Integers) -> tuple[Ints, Ints]:
     """Find starts and lengths of runs of equal numbers."""
     begins = np.flatnonzero(np.diff(ray, prepend=-1))
     return begins, np.diff(begins, append=len(ray))

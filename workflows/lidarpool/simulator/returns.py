@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from functools import cached_property
 
 import numpy as np
@@ -21,9 +20,9 @@ from ..sensor import ScanSpec, Survey
 from ..sensor.materials import at_right_angles
 from ..sensor.optics import LIGHT_M_NS
 from .doppler import radial_velocities
-from .echoes import Echoes
-from .hits import FALSE_ALARM, NO_SURFACE
+from .hits import FALSE_ALARM, NO_SURFACE, made
 from .motion import Poses
+from .pulses import Found
 from .surfaces import Surfaces, light_of
 
 BLOCK_HITS = 1 << 16  # that are looked at a time
@@ -43,7 +42,7 @@ class BatchReturns:
         survey: Survey,
         surfaces: Surfaces,
         specs: list[ScanSpec],  # the firings of each follow those of the one before
-        found: Echoes,  # rays are numbered from 0 at the first firing
+        found: Found,  # rays are numbered from 0 at the first firing
         pattern: Pattern,
         start: int,  # number of ray 0 within the pattern
         poses: Poses,
@@ -57,18 +56,13 @@ class BatchReturns:
         hits = np.zeros(0, np.int64) if found.tally is None else found.tally
         triangles = np.flatnonzero(hits)
         self.tally = triangles, hits[triangles]
-        self.found = replace(found, tally=None)
+        self.found, self.hits = found.returns, found.hits  # (scans,): of each, kept or not
         self._surfaces = surfaces
         self._pattern, self._start = pattern, start
         self._poses = poses
 
     def __len__(self) -> int:
         return len(self.found.ray)
-
-    @property
-    def hits(self) -> Ints:
-        """Returns of each scan, kept or not: (scans,)."""
-        return self.found.hits
 
     def column(self, column: Column) -> AnyArray:
         """Values of a column."""
@@ -160,7 +154,7 @@ class BatchReturns:
     @property
     def range(self) -> Floats:
         """Distance from the start of the ray, metres, with noise."""
-        return self.found.reported
+        return made(self.found.reported)
 
     @cached_property
     def positions(self) -> Floats:
@@ -348,25 +342,23 @@ class BatchReturns:
     @property
     def waveform(self) -> Records:
         """Recorded waveform, see `lidarpool.columns.waveforms.record`."""
-        made = self.found.waveform
-        assert made is not None  # or there would be no such column
-        made = made.copy()
-        begin_ps = made["begin"] * made["sample_ps"].astype(np.float64)
-        made["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
+        table = made(self.found.waveform).copy()
+        begin_ps = table["begin"] * table["sample_ps"].astype(np.float64)
+        table["location_ps"] = self.range * (2000 / LIGHT_M_NS) - begin_ps
         world = self.survey.coordinates == "world"
         ahead = self.directions if world else self._sensor_directions
-        made["toward"] = -ahead * (LIGHT_M_NS / 2000)
-        return made.view(column_type(made.dtype["samples"].shape[0]))
+        table["toward"] = -ahead * (LIGHT_M_NS / 2000)
+        return table.view(column_type(table.dtype["samples"].shape[0]))
 
     @property
     def return_number(self) -> Bytes:
         """Number among the reported returns of its pulse."""
-        return self.found.number
+        return made(self.found.number)
 
     @property
     def returns(self) -> Bytes:
         """Number of reported returns of its pulse."""
-        return self.found.returns
+        return made(self.found.returns)
 
     @property
     def cause(self) -> Bytes:

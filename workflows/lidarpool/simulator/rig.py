@@ -18,8 +18,8 @@ from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
 from .device import DeviceColumns, DeviceReturns
-from .echoes import EchoCaster
 from .motion import Clock, Poses, check_trajectory, poses_of_firings
+from .pulses import PulseCaster
 from .returns import BatchReturns
 from .surfaces import Surfaces
 from .ways import Ways
@@ -90,7 +90,7 @@ class Rig:
             if by_head:
                 origin = sensor.beams.origin if sensor.centre is None else None
                 pattern = Pattern(sensor.ahead, origin)
-                subrays = self._echoes[number].divided(pattern, by_head=True)
+                subrays = self._pulses[number].emitter.repeated(pattern, by_head=True)
                 made = _Rays(pattern, subrays, by_head=True)
             elif repeats:
                 made = self._rays_of(number, 0, sensor.period or 0)
@@ -142,10 +142,10 @@ class Rig:
     def _see(self) -> None:
         """Make what depends on where the surfaces are."""
         given = self._world, self.scene, self.survey, self._surfaces
-        self._echoes = [EchoCaster(number, *given) for number in range(len(self.survey.carried))]
+        self._pulses = [PulseCaster(number, *given) for number in range(len(self.survey.carried))]
         if self._device is not None:
             self._device = self._device.moved(self.scene, self._surfaces)
-        elif all(echoes.plain for echoes in self._echoes) and self._world.caster.on_device:
+        elif self._world.caster.on_device and not any(pulses.steps for pulses in self._pulses):
             self._device = DeviceColumns(*given)
 
     @property
@@ -214,9 +214,10 @@ class Rig:
         groups = np.array([spec.firings[0] - first for spec in specs]) * channels
         if self._device is not None:
             return self._device.returns(specs, pattern, poses, window, groups)
-        echoes = self._echoes[number]
         scan = specs[0].scan + specs[0].ahead
-        found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=tally)
+        found = self._pulses[number].scan(
+            scan, pattern, subrays, poses, window, groups, tally=tally
+        )
         return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
@@ -258,8 +259,9 @@ class Rig:
             groups = (rays * np.arange(count)[:, None] + begin_rays).reshape(-1)
             scan = specs[0].scan + specs[0].ahead + begin * len(specs)
             window = (0, len(image))
-            echoes = self._echoes[number]
-            found = echoes.scan(scan, pattern, subrays, poses, window, groups, tally=False)
+            caster = self._pulses[number]
+            found = caster.scan(scan, pattern, subrays, poses, window, groups, tally=False).returns
+            assert found.reported is not None  # of kept returns
             nearest = found.number == 1
             image[found.ray[nearest]] = found.reported[nearest]
         return out.reshape(len(positions), -1, sensor.channels)
@@ -274,6 +276,6 @@ class Rig:
             pattern = self.pattern(number, first, stop)
             if len(self._firings) >= KEPT:
                 self._firings.clear()
-            rays = _Rays(pattern, self._echoes[number].divided(pattern))
+            rays = _Rays(pattern, self._pulses[number].emitter.repeated(pattern))
             made = self._firings[number, first, stop] = rays
         return made
