@@ -48,7 +48,7 @@ class Crosstalk(Step):
     """
 
     effects = ("Crosstalk",)
-    reads = ("ray",)
+    reads = "ray", "distance"
     writes = OF_RETURNS
     purposes = (Purpose.OTHER,)
 

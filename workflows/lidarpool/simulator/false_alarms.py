@@ -14,7 +14,7 @@ class FalseAlarms(Step):
     """Adds false alarms to the returns of pulses."""
 
     effects = ("False alarms",)
-    reads = ("ray",)
+    reads = "ray", "distance"
     writes = OF_RETURNS
     purposes = Purpose.ALARM, Purpose.PEAK
 
