@@ -46,7 +46,7 @@ def footprint(returns: Returns, distance: float) -> NDArray[np.float64]:
     beams = rig._pulses[0].emitter.repeated(rig.pattern(0, 0, 1))
     assert beams is not None
     starts, directions = beams.rays(np.arange(len(beams)), (0, 0, 0))
-    hits = rig._world.caster.cast(starts, directions)
+    hits = rig._caster.caster.cast(starts, directions)
     ends = starts + hits.distance[:, None] * directions
     return np.asarray(ends[:, 1:])
 

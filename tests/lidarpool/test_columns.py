@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from lidarpool import Cloud, Column, LidarpoolError, save_cloud
 from lidarpool.columns.table import ALWAYS, OPTIONAL, TABLE, chosen, stored
-from lidarpool.simulator.returns import BatchReturns
+from lidarpool.simulator.points import BatchPoints
 
 # -- the table ------------------------------------------------------------------------------------
 
@@ -21,7 +21,7 @@ def test_the_table_describes_every_column():
     assert next(iter(TABLE)) == "scan" and set(TABLE) >= {"time", "intensity", "class"}
     for name, column in TABLE.items():
         assert column.name == name and column.meaning and not column.meaning.endswith(".")
-        assert name == "scan" or hasattr(BatchReturns, column.source or name), name
+        assert name == "scan" or hasattr(BatchPoints, column.source or name), name
     assert len({column.in_files for column in TABLE.values()}) == len(TABLE)
 
 

@@ -39,7 +39,7 @@ from lidarpool.scene.scene_mesh import SceneMesh
 from lidarpool.scene.shapes import seed_objects
 from lidarpool.sensor.materials import extinction, fresnel
 from lidarpool.sensor.noise import Purpose, raw
-from lidarpool.simulator.hits import Hits
+from lidarpool.simulator.returns import PulseReturns
 from lidarpool.simulator.rig import Rig
 from lidarpool.simulator.selection import chosen
 from lidarpool.simulator.separation import separated
@@ -132,7 +132,7 @@ MODES = {
 
 @pytest.mark.parametrize("mode", MODES)
 def test_modes(mode):
-    hits = Hits(
+    hits = PulseReturns(
         np.array([1, 4, 4, 4, 4]),
         np.array([2.0, 9.0, 3.0, 7.0, 5.0]),
         np.arange(5, dtype=np.int32),

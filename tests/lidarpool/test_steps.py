@@ -11,7 +11,7 @@ import pytest
 from lidarpool import Material, Mounted, Noise, Returns, Scene, Survey, load_sensor
 from lidarpool.sensor.noise import Purpose
 from lidarpool.sensor.survey import OPTIONAL_NAMES
-from lidarpool.simulator.hits import Hits
+from lidarpool.simulator.returns import PulseReturns
 from lidarpool.simulator.rig import Rig
 from lidarpool.simulator.steps import STEPS
 
@@ -52,8 +52,8 @@ def test_effects_of_steps_are_those_of_the_documentation():
 
 
 def test_random_numbers_belong_to_one_step():
-    """`Detection` takes the place of a part of `Separation`; they never apply together."""
-    used = [purpose for step in STEPS for purpose in step.purposes if step.__name__ != "Detection"]
+    """`DetectionStep` takes the place of a part of `SeparationStep`; they never apply together."""
+    used = [purpose for step in STEPS for purpose in step.purposes if step.__name__ != "DetectionStep"]
     assert len(used) == len(set(used))
     assert {*used, *OF_OTHERS} == set(Purpose)
 
@@ -80,16 +80,16 @@ class Watched:
         new -= {name for name, one in returns._asdict().items() if one is not None}
         assert new <= {*step.writes}, (type(step), new)
         if len(made.ray) == len(returns.ray):
-            for name in {*Hits._fields} - {*step.writes}:
+            for name in {*PulseReturns._fields} - {*step.writes}:
                 assert same(getattr(made, name), getattr(returns, name)), (type(step), name)
-        for name in {*Hits._fields} - {*step.reads, "ray"}:
+        for name in {*PulseReturns._fields} - {*step.reads, "ray"}:
             if getattr(returns, name) is None:
                 continue
             changed = returns._replace(**{name: np.zeros_like(getattr(returns, name))})
             batch.hits, batch.planes, batch.air = before
             again = step.apply(changed, batch)
             batch.hits, batch.planes, batch.air = after
-            for column in {*Hits._fields} - {name}:
+            for column in {*PulseReturns._fields} - {name}:
                 one, other = getattr(made, column), getattr(again, column)
                 assert same(one, other), (type(step), name, column)
         return made

@@ -47,7 +47,7 @@ from ..sensor import Sensor, Survey
 from ..sensor.beams import Beams
 from ..simulator.memory import MB, cast_bytes, scans_that_fit
 from ..simulator.rig import PATTERN_RAYS, Rig
-from ..simulator.world import check_backend_here
+from ..simulator.scene_caster import check_backend_here
 from .run_command import no_hits
 from .terminal import Terminal
 

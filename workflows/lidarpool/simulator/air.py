@@ -19,10 +19,10 @@ from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, named_seed, starts
 from ..sensor.weather import FAINTEST, FARTHEST_M, NODES, Air, Particles
 from ..sensor.weather import reach as reach_of
 from .doppler import approach
-from .hits import AIR, OF_RETURNS, Hits, Keys, Planes, joined, numbers, unreal
-from .step import Batch, Memory, Setup, Sizes, Step
+from .returns import AIR, OF_RETURNS, Keys, Planes, PulseReturns, joined, numbers, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces
-from .world import World
 
 QUANTILES = 1 << 16
 TABLES_KEPT = 32  # as a scanner makes its casters again whenever an object is moved
@@ -52,7 +52,7 @@ class _Fog(NamedTuple):
     peaks: Floats
 
 
-class Weather(Step):
+class WeatherStep(PulseStep):
     """Finds where rain, snow, fog and dust return light to one sensor.
 
     Raises
@@ -69,8 +69,8 @@ class Weather(Step):
         Purpose.PARTICLE_SUBRAY, Purpose.PARTICLE_DIAMETER,
     )  # fmt: skip
 
-    def __init__(self, setup: Setup, world: World, surfaces: Surfaces) -> None:
-        super().__init__(setup, world, surfaces)
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
         sensor, noise, survey = setup.sensor, setup.noise, setup.survey
         self._seed, self._wavelength_nm = noise.seed, sensor.optics.wavelength_nm
         air, least = survey.air(setup.number), FAINTEST * noise.threshold
@@ -83,22 +83,22 @@ class Weather(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.survey.returns_light
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """See `Step.added`."""
+        """See `PulseStep.added`."""
         scatters = setup.survey.scatters(setup.sensor.optics.wavelength_nm)
         return setup.survey.met(setup.number) + bool(scatters)
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `Step.memory`."""
-        return Memory(casting=110 * sizes.subrays + 170 * Weather.added(setup) * sizes.beams)
+        """See `PulseStep.memory`."""
+        return Memory(casting=110 * sizes.subrays + 170 * WeatherStep.added(setup) * sizes.beams)
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """Leave hits in the air for `Separation`, or insert them for waveforms."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """Leave hits in the air for `SeparationStep`, or insert them for waveforms."""
         drawn = self.found(returns, (batch.start, batch.stop), batch.keys, batch.each)
         if drawn is None:
             return returns
@@ -111,7 +111,9 @@ class Weather(Step):
         batch.hits, batch.planes = inserted(returns, batch.planes, drawn)
         return batch.hits
 
-    def found(self, hits: Hits, rays: tuple[int, int], keys: Keys, each: int) -> Hits | None:
+    def found(
+        self, hits: PulseReturns, rays: tuple[int, int], keys: Keys, each: int
+    ) -> PulseReturns | None:
         """Find hits in the air, of beams `rays` with `each` sub-rays, before those of surfaces.
 
         Hits are in the order of rays, numbered from the first beam's.
@@ -138,7 +140,7 @@ class Weather(Step):
             drawn = drawn.take(np.argsort(drawn.ray, kind="stable"))
         return drawn
 
-    def _reach(self, hits: Hits, count: int) -> Floats:
+    def _reach(self, hits: PulseReturns, count: int) -> Floats:
         """How far the light of sub-rays gets, (count,): inf if no surface ends it."""
         materials = self.surfaces.at(self._wavelength_nm)
         ends = hits.distance
@@ -149,14 +151,14 @@ class Weather(Step):
         reach[hits.ray] = ends  # of several, the last
         return reach
 
-    def _bent(self, hits: Hits) -> Indices:
+    def _bent(self, hits: PulseReturns) -> Indices:
         """Rows of hits where light is refracted; of each ray the first, third, … are entries."""
         refracts = self.surfaces.at(self._wavelength_nm).refracts
         if not refracts.any():
             return np.zeros(0, np.intp)
         return np.flatnonzero(refracts[self.surfaces.objects(hits.triangle)])
 
-    def _within(self, hits: Hits, ray: Ints, distance: Floats) -> Bools:
+    def _within(self, hits: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether places on rays are within water or glass, where nothing falls: (n,)."""
         rows = self._bent(hits)
         bent, where = hits.ray[rows], hits.distance[rows]
@@ -167,7 +169,7 @@ class Weather(Step):
             count[some] += where[first[some] + number] < distance[some]
         return np.asarray(count % 2 == 1)
 
-    def _clouded(self, hits: Hits, reach: Floats) -> Floats:
+    def _clouded(self, hits: PulseReturns, reach: Floats) -> Floats:
         """How far fog goes: to surfaces, and to what light is refracted into, but for panes."""
         rows = self._bent(hits)
         if not len(rows):
@@ -216,7 +218,9 @@ def _in_fog(
     return out[0][:count], out[1][:count], out[2][:count]
 
 
-def inserted(hits: Hits, planes: Planes | None, drawn: Hits) -> tuple[Hits, Planes | None]:
+def inserted(
+    hits: PulseReturns, planes: Planes | None, drawn: PulseReturns
+) -> tuple[PulseReturns, Planes | None]:
     """Insert hits in the air before the others of their rays."""
     order = np.argsort(np.concatenate([drawn.ray, hits.ray]), kind="stable")
     if planes is not None:

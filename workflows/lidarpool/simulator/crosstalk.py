@@ -18,11 +18,11 @@ from ..sensor.materials import at_right_angles
 from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS
 from ..sensor.survey import begin_ns
-from .hits import CROSSTALK, OF_RETURNS, Hits, merged, numbers, unreal
 from .motion import Clock, Poses
-from .step import Batch, Memory, Setup, Sizes, Step
+from .returns import CROSSTALK, OF_RETURNS, PulseReturns, merged, numbers, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces
-from .world import World
 
 CELL_RAYS = 1 << 6  # rays that are compared with a spot at a time
 FILTER_NM = 20.0  # wavelengths that differ by more do not pass a receiver's filter
@@ -39,7 +39,7 @@ class _Spots(NamedTuple):
     distance: Floats  # from that sensor
 
 
-class Crosstalk(Step):
+class CrosstalkStep(PulseStep):
     """Adds the pulses of other sensors that a sensor receives.
 
     A pulse of another sensor lights a spot. A ray receives its light if the spot is in the field of
@@ -52,8 +52,8 @@ class Crosstalk(Step):
     writes = OF_RETURNS
     purposes = (Purpose.OTHER,)
 
-    def __init__(self, setup: Setup, world: World, surfaces: Surfaces) -> None:
-        super().__init__(setup, world, surfaces)
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
         self._survey, self._sensor = setup.survey, setup.sensor
         wide, _ = setup.reporting.of(self._sensor.optics)
         self._cosine = sin_cos_of(wide / 2)[1]
@@ -66,17 +66,17 @@ class Crosstalk(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.noise.crosstalk
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `Step.memory`."""
+        """See `PulseStep.memory`."""
         others = _pulses_meanwhile(setup.survey, setup.sensor)
         return Memory(kept=10 * sizes.returns, casting=(120 + 370 * others) * sizes.beams)
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         rays = np.arange(batch.start, batch.stop)
         row, distance, energy = self.received(batch.keys.scan, rays, *batch.middles, batch.here)
         order = np.lexsort((distance, row))
@@ -119,7 +119,7 @@ class Crosstalk(Step):
             some = np.flatnonzero(seen & (far > 0))
             when = fired[row[some]] + spec.start_ns
             given = origins[row[some]], towards[some], far[some], when, poses.ways
-            some = some[self.world.free(*given)]
+            some = some[self.caster.free(*given)]
             energy = self._energy(spots, spot[some], towards[some], far[some])
             found.append((row[some], distance[some], energy))
         if not found:
@@ -185,7 +185,7 @@ class Crosstalk(Step):
         starts = starts + np.repeat(places, sensor.channels, axis=0)
         now = Poses(np.zeros(3), clock=Clock(fired + start_ns, np.zeros(1), poses.ways))
         low, high = sensor.min_range_m, sensor.max_range_m
-        found = self.world.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
+        found = self.caster.scan(Pattern(ahead, starts), now, t_min=low, t_max=high)
         ray, distance = found.ray.astype(np.int64), found.distance
         times = fired[ray] + start_ns
         return _Spots(

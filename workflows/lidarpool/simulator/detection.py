@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from ..sensor.noise import Purpose
-from .hits import Hits, numbers
-from .step import Batch, Setup, Step
+from .returns import PulseReturns, numbers
+from .step import PulseBatch, PulseStep, Setup
 
 
-class Detection(Step):
-    """Loses weak returns of waveforms, and a share of all; `Separation` does that itself."""
+class DetectionStep(PulseStep):
+    """Loses weak returns of waveforms, and a share of all; `SeparationStep` does that itself."""
 
     reads = "ray", "amplitude"
     writes = ()
@@ -16,10 +16,10 @@ class Detection(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.noise.loses and setup.in_waveforms
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         key = *batch.keys.of(returns.ray), numbers(returns.ray)
         return returns.take(self.setup.noise.detected(returns.height, *key))

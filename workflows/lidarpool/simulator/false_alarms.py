@@ -6,11 +6,11 @@ import numpy as np
 
 from ..sensor.noise import Purpose
 from ..sensor.optics import LIGHT_M_NS
-from .hits import FALSE_ALARM, OF_RETURNS, Hits, merged, unreal
-from .step import Batch, Memory, Setup, Sizes, Step
+from .returns import FALSE_ALARM, OF_RETURNS, PulseReturns, merged, unreal
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 
 
-class FalseAlarms(Step):
+class FalseAlarmStep(PulseStep):
     """Adds false alarms to the returns of pulses."""
 
     effects = ("False alarms",)
@@ -20,21 +20,21 @@ class FalseAlarms(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.noise.false_alarm_hz > 0
 
     @staticmethod
     def added(setup: Setup) -> float:
-        """See `Step.added`."""
+        """See `PulseStep.added`."""
         return setup.noise.false_alarm_hz * setup.sensor.gate_s
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `Step.memory`."""
+        """See `PulseStep.memory`."""
         return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         noise, sensor = self.setup.noise, self.setup.sensor
         rays = np.arange(batch.start, batch.stop)
         row, since, energy = noise.false_alarms(sensor.gate_s, *batch.keys.of(rays))

@@ -16,21 +16,21 @@ from ..base.vectors import products
 from ..scene.scene import Scene
 from ..sensor import Survey
 from .doppler import radial_velocities
-from .hits import NO_SURFACE, Hits, Keys, joined, numbers
 from .motion import Poses
-from .step import Batch, Emitter, Setup, Step
+from .returns import NO_SURFACE, Keys, PulseReturns, joined, numbers
+from .scene_caster import SceneCaster
+from .step import Emitter, PulseBatch, PulseStep, Setup
 from .steps import steps_of
 from .surfaces import Surfaces, light_of
-from .world import World
 
 CHUNK_RAYS = 1 << 17  # sub-rays that are cast at a time
 
 
 @dataclass(frozen=True)
-class Found:
+class Scanned:
     """What scans give: kept returns, and counts of all."""
 
-    returns: Hits
+    returns: PulseReturns
     hits: Ints  # (scans,): returns of each, kept or not
     tally: Ints | None  # (counters,): hits by `Surfaces.counter`, kept or not, if asked for
 
@@ -39,12 +39,12 @@ class PulseCaster:
     """Casts the scans of one sensor."""
 
     def __init__(
-        self, number: int, caster: World, scene: Scene, survey: Survey, surfaces: Surfaces
+        self, number: int, caster: SceneCaster, scene: Scene, survey: Survey, surfaces: Surfaces
     ) -> None:
         self._setup = setup = Setup(scene, survey, number)
         self._caster, self._surfaces = caster, surfaces
         self.emitter = Emitter(setup)
-        self.steps: list[Step] = [step(setup, caster, surfaces) for step in steps_of(setup)]
+        self.steps: list[PulseStep] = [step(setup, caster, surfaces) for step in steps_of(setup)]
 
     def scan(
         self,
@@ -56,7 +56,7 @@ class PulseCaster:
         groups: Ints,
         *,
         tally: bool = True,
-    ) -> Found:
+    ) -> Scanned:
         """Cast scans from number `scan` on: hits in the sensor's range, counted and thinned out.
 
         `divided` are sub-rays of the pattern, if they were made before; the others are arguments
@@ -66,9 +66,9 @@ class PulseCaster:
         if len(self.emitter) == 1 and not self._setup.noise.angle_deg:
             divided = pattern
 
-        def batch(start: int, stop: int) -> Batch:
+        def batch(start: int, stop: int) -> PulseBatch:
             keys = Keys(scan, groups)
-            return Batch(keys, start, stop, pattern, first, poses, self.emitter, divided)
+            return PulseBatch(keys, start, stop, pattern, first, poses, self.emitter, divided)
 
         whole = batch(0, rays)
         if self._setup.several:
@@ -83,22 +83,22 @@ class PulseCaster:
         for step in self.steps:
             if step.of_kept:
                 returns = step.apply(returns, whole)
-        return Found(returns, found.hits, found.tally)
+        return Scanned(returns, found.hits, found.tally)
 
-    def _pulses(self, batch: Batch) -> Hits:
+    def _pulses(self, batch: PulseBatch) -> PulseReturns:
         """Take the pulses of a batch through all steps."""
-        returns = Hits.none()
+        returns = PulseReturns.none()
         for step in self.steps:
             if not step.of_kept:
                 returns = step.apply(returns, batch)
         return returns
 
-    def _once(self, batch: Batch, groups: Ints, tally: bool) -> Found:
+    def _once(self, batch: PulseBatch, groups: Ints, tally: bool) -> Scanned:
         """Cast rays with one return each; compute energies only for kept ones, and if needed."""
         setup, poses = self._setup, batch.poses
         for step in self.steps:
             if not step.of_kept:  # noise of angles
-                step.apply(Hits.none(), batch)
+                step.apply(PulseReturns.none(), batch)
         found = self._caster.scan(
             batch.beams,
             poses,
@@ -109,12 +109,12 @@ class PulseCaster:
             groups=groups,
             tally=tally,
         )
-        returns = Hits.one_each(found.ray, found.distance, found.triangle)
+        returns = PulseReturns.one_each(found.ray, found.distance, found.triangle)
         if batch.offsets is not None:  # else it is made of the reported directions, if it is needed
             returns = self._lit(returns, batch)
-        return Found(returns, found.hits, found.tally)
+        return Scanned(returns, found.hits, found.tally)
 
-    def _lit(self, returns: Hits, batch: Batch) -> Hits:
+    def _lit(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Make what depends on the directions in which rays were cast."""
         surfaces, setup, poses = self._surfaces, self._setup, batch.poses
         origins, directions = rays = poses.rays(batch.beams, returns.ray, batch.window[0])
@@ -141,7 +141,7 @@ class PulseCaster:
         some = triangle[triangle != NO_SURFACE]
         return np.bincount(surfaces.counter(some), minlength=surfaces.counters)
 
-    def _kept(self, returns: Hits, groups: Ints, tally: bool) -> Found:
+    def _kept(self, returns: PulseReturns, groups: Ints, tally: bool) -> Scanned:
         """Count the returns of each scan and thin them out."""
         ray = returns.ray
         cuts = np.searchsorted(ray, np.append(groups, np.iinfo(np.int64).max))
@@ -156,4 +156,4 @@ class PulseCaster:
             returns=np.minimum(each[kept], 255).astype(np.uint8),
             reported=thinned.distance,
         )
-        return Found(thinned, np.diff(cuts), self._tally(returns.triangle) if tally else None)
+        return Scanned(thinned, np.diff(cuts), self._tally(returns.triangle) if tally else None)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from ..sensor.noise import Purpose
-from .hits import Hits, made
-from .step import Batch, Setup, Step
+from .returns import PulseReturns, made
+from .step import PulseBatch, PulseStep, Setup
 
 
-class RangeNoise(Step):
+class RangeNoiseStep(PulseStep):
     """Moves the ranges of the returns that are kept."""
 
     effects = ("Weak returns and range walk",)
@@ -18,11 +18,11 @@ class RangeNoise(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.noise.moves_ranges
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         height = returns.energy if returns.amplitude is None else returns.amplitude
         key = *batch.keys.of(returns.ray), made(returns.number)
         return returns._replace(reported=self.setup.noise.ranges(returns.distance, height, *key))

@@ -9,14 +9,14 @@ from ..base.arrays import Floats, Ints, Records
 from ..base.elementary import exp
 from ..columns.waveforms import SILENT, ZERO, record
 from ..sensor.noise import THRESHOLD_SIGMAS, Purpose, normal, raw
-from .hits import Hits, Keys, made, numbers
-from .step import Batch, Memory, Setup, Sizes, Step
+from .returns import Keys, PulseReturns, made, numbers
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .waveform import CUT, Digitizer
 
 BLOCK_SAMPLES = 1 << 20  # that are made at a time
 
 
-class Recording(Step):
+class RecordingStep(PulseStep):
     """Records the waveforms of returns, with the noise of the receiver."""
 
     effects = ("Waveforms",)
@@ -26,18 +26,18 @@ class Recording(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.recorded > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `Step.memory`."""
+        """See `PulseStep.memory`."""
         recorded = record(setup.recorded).itemsize * sizes.returns
         made = 40 * min(sizes.subrays * setup.recorded, BLOCK_SAMPLES)
         return Memory(casting=made + recorded, counting=2.3 * recorded)
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         assert batch.hits is not None  # as there are sub-rays
         noise, given = None, returns._replace(ray=returns.ray - batch.start)
         if self.setup.noise.threshold:
@@ -55,8 +55,8 @@ def first_samples(when: Floats, sigma: float) -> tuple[Ints, int]:
 
 
 def recorded(
-    hits: Hits,
-    returns: Hits,
+    hits: PulseReturns,
+    returns: PulseReturns,
     digitizer: Digitizer,
     each: int,
     count: int,
@@ -112,7 +112,13 @@ def recorded(
 
 
 def _window(
-    hits: Hits, digitizer: Digitizer, each: int, begins: Ints, low: Ints, high: Ints, count: int
+    hits: PulseReturns,
+    digitizer: Digitizer,
+    each: int,
+    begins: Ints,
+    low: Ints,
+    high: Ints,
+    count: int,
 ) -> Floats:
     """Sample the waveforms of some windows, of the hits from `low` to `high`: (windows, count)."""
     sizes = high - low

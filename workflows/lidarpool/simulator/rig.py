@@ -17,13 +17,13 @@ from ..base.vectors import turned
 from ..scene.actors import Actor
 from ..scene.scene import Scene
 from ..sensor import Pose, ScanSpec, Sensor, Survey, Trajectory
-from .device import DeviceColumns, DeviceReturns
+from .device import DeviceColumns, DevicePoints
 from .motion import Clock, Poses, check_trajectory, poses_of_firings
+from .points import BatchPoints
 from .pulses import PulseCaster
-from .returns import BatchReturns
+from .scene_caster import SceneCaster
 from .surfaces import Surfaces
 from .ways import Ways
-from .world import World
 
 PATTERN_RAYS = 20_000_000  # rays of a head's period that are kept; 24 bytes each
 IMAGE_RAYS = 1 << 20  # rays of images that are cast at a time
@@ -65,13 +65,13 @@ class Rig:
         self._assemble(scene, survey, options, None)
 
     def _assemble(
-        self, scene: Scene, survey: Survey, options: dict[str, Any], like: World | None
+        self, scene: Scene, survey: Survey, options: dict[str, Any], like: SceneCaster | None
     ) -> None:
         self.scene, self.survey, self._options = scene, survey, options
         self._ways = Ways(actor.trajectory for actor in scene.actors)
         wavelengths = {carried.sensor.optics.wavelength_nm for carried in survey.carried}
         self._surfaces = Surfaces(scene, tuple(survey.materials), sorted(wavelengths))
-        self._world = World(scene, self._surfaces, like, **options)
+        self._caster = SceneCaster(scene, self._surfaces, like, **options)
         self._device: DeviceColumns | None = None
         self._see()
         check_trajectory(survey.path)
@@ -103,7 +103,7 @@ class Rig:
         The tree of all that stands still is shared.
         """
         rig = copy(self)
-        rig._assemble(scene, survey, self._options, self._world)
+        rig._assemble(scene, survey, self._options, self._caster)
         return rig
 
     def with_actors(self, actors: tuple[Actor, ...]) -> Rig:
@@ -135,23 +135,23 @@ class Rig:
         assert shared is not None
         rows = np.flatnonzero(shared.owner == owner)
         rig._surfaces = self._surfaces.moved(rig.scene, rows)
-        rig._world.place(rig._surfaces, shared, rows)
+        rig._caster.place(rig._surfaces, shared, rows)
         rig._see()
         return rig
 
     def _see(self) -> None:
         """Make what depends on where the surfaces are."""
-        given = self._world, self.scene, self.survey, self._surfaces
+        given = self._caster, self.scene, self.survey, self._surfaces
         self._pulses = [PulseCaster(number, *given) for number in range(len(self.survey.carried))]
         if self._device is not None:
             self._device = self._device.moved(self.scene, self._surfaces)
-        elif self._world.caster.on_device and not any(pulses.steps for pulses in self._pulses):
+        elif self._caster.caster.on_device and not any(pulses.steps for pulses in self._pulses):
             self._device = DeviceColumns(*given)
 
     @property
     def backend(self) -> str:
         """Name of the ray-casting backend in use."""
-        return self._world.backend
+        return self._caster.backend
 
     def pattern(self, number: int, first: int, stop: int) -> Pattern:
         """Rays of firings `first` to `stop` of a sensor, in the axes of its carrier."""
@@ -165,7 +165,7 @@ class Rig:
             origins = np.add(np.zeros(3) if origins is None else origins, mount.position)
         return Pattern(directions, origins)
 
-    def cast(self, first: int, stop: int) -> Iterator[BatchReturns | DeviceReturns]:
+    def cast(self, first: int, stop: int) -> Iterator[BatchPoints | DevicePoints]:
         """Cast scans `first` to `stop` of the survey; yields the returns for each station."""
         run: list[ScanSpec] = []
         for spec in map(self.survey.scan, range(first, stop)):
@@ -184,7 +184,7 @@ class Rig:
         late_ns: float = 0.0,
         *,
         tally: bool = True,
-    ) -> BatchReturns | DeviceReturns:
+    ) -> BatchPoints | DevicePoints:
         """Cast scans of one station, the firings of each following those of the one before.
 
         The carrier is `late_ns` further on its path than the firings' own times say. Hits of each
@@ -218,7 +218,7 @@ class Rig:
         found = self._pulses[number].scan(
             scan, pattern, subrays, poses, window, groups, tally=tally
         )
-        return BatchReturns(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
+        return BatchPoints(self.scene, survey, self._surfaces, specs, found, pattern, start, poses)
 
     def _timed(self, poses: Poses, specs: list[ScanSpec], times: int = 1) -> Poses:
         """Return poses of scans, so many times in turn, with the times that actors need."""

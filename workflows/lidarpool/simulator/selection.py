@@ -6,28 +6,28 @@ import numpy as np
 
 from ..base.arrays import Bools, owned
 from ..sensor.optics import Mode
-from .hits import Hits
-from .step import Batch, Setup, Step
+from .returns import PulseReturns
+from .step import PulseBatch, PulseStep, Setup
 
 MODES: tuple[Mode, ...] = "all", "first", "last", "strongest", "dual"  # as of `pulse_loops`
 
 
-class Selection(Step):
+class SelectionStep(PulseStep):
     """Reports some of a pulse's returns, after those that waveforms and receivers made."""
 
     reads = "ray", "energy", "amplitude"
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.in_waveforms or setup.adds
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         return returns.take(chosen(returns, self.setup.reporting.mode))
 
 
-def chosen(returns: Hits, mode: Mode) -> Bools:
+def chosen(returns: PulseReturns, mode: Mode) -> Bools:
     """Whether a mode reports each return: (n,)."""
     from . import pulse_loops
 

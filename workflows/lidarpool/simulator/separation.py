@@ -11,9 +11,9 @@ from ..scene.colours import GREY, packed
 from ..sensor.disc import neighbours
 from ..sensor.noise import THRESHOLD_SIGMAS, Noise, Purpose, quantiles, starts
 from ..sensor.optics import Mode
-from .hits import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Hits, Keys, Planes, made
+from .returns import AIR, NO_SURFACE, OF_RETURNS, SURFACE, Keys, Planes, PulseReturns, made
 from .selection import MODES
-from .step import Batch, Setup, Step
+from .step import PulseBatch, PulseStep, Setup
 
 _NONE = np.zeros(0)
 
@@ -28,13 +28,13 @@ class Report(NamedTuple):
 
 
 def separated(
-    hits: Hits,
+    hits: PulseReturns,
     gap_m: float,
     each: int = 1,
     planes: Planes | None = None,
-    air: Hits | None = None,
+    air: PulseReturns | None = None,
     report: Report | None = None,
-) -> Hits:
+) -> PulseReturns:
     """Make returns of hits: those of a beam within a distance of the next are one return.
 
     So are hits of neighbouring sub-rays on one surface, however far apart they are: a beam that
@@ -47,7 +47,7 @@ def separated(
     """
     from . import pulse_loops  # not before: numba takes half a second to import
 
-    flies = Hits.none()._replace(energy=_NONE) if air is None else air
+    flies = PulseReturns.none()._replace(energy=_NONE) if air is None else air
     mode, noise, keys, first = report or Report()
     begun, table, limits = np.zeros(0, np.uint64), _NONE, (0.0, 0.0, THRESHOLD_SIGMAS)
     if noise is not None and noise.loses:
@@ -84,10 +84,10 @@ def separated(
     )
 
 
-def _unknown(hits: Hits, count: int) -> Hits:
+def _unknown(hits: PulseReturns, count: int) -> PulseReturns:
     """Make the columns of hits for some returns, none of which is of a surface."""
     columns = (None if one is None else np.zeros(count, one.dtype) for one in hits)
-    return Hits._make(columns)
+    return PulseReturns._make(columns)
 
 
 def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:
@@ -98,7 +98,7 @@ def surfaces_of(each: int, planes: Planes | None) -> tuple[AnyArray, ...]:
     return owned(pairs, np.int64), owned(normals.T), owned(directions.T)
 
 
-class Separation(Step):
+class SeparationStep(PulseStep):
     """Makes returns of hits by their distances; one loop detects and reports them as well."""
 
     reads = "ray", "distance", "triangle", "energy", "velocity"
@@ -107,12 +107,12 @@ class Separation(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.several and not setup.in_waveforms
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         setup = self.setup
-        shown = "all" if setup.adds else setup.reporting.mode  # more come before `Selection`
+        shown = "all" if setup.adds else setup.reporting.mode  # more come before `SelectionStep`
         report = Report(shown, setup.noise, batch.keys, batch.start)
         return separated(returns, setup.gap_m, batch.each, batch.planes, batch.air, report)

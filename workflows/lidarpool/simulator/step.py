@@ -21,10 +21,10 @@ from ..columns.table import VELOCITY
 from ..scene.scene import Scene
 from ..sensor import Noise, Returns, Sensor, Survey
 from ..sensor.noise import Purpose
-from .hits import Hits, Keys, Planes
 from .motion import Poses
+from .returns import Keys, Planes, PulseReturns
+from .scene_caster import SceneCaster
 from .surfaces import Surfaces
-from .world import World
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +163,7 @@ class Emitter:
 
 
 @dataclass(eq=False)
-class Batch:
+class PulseBatch:
     """Consecutive beams, and what steps leave for later ones."""
 
     keys: Keys
@@ -175,9 +175,9 @@ class Batch:
     emitter: Emitter
     divided: Pattern | None  # the pattern's sub-rays, if they are always the same
     offsets: Floats | None = None  # of the beams' angles, (n, 2), radians
-    hits: Hits | None = None  # of all sub-rays
+    hits: PulseReturns | None = None  # of all sub-rays
     planes: Planes | None = None  # of these
-    air: Hits | None = None  # hits in the air, which are not among them
+    air: PulseReturns | None = None  # hits in the air, which are not among them
 
     @property
     def each(self) -> int:
@@ -215,7 +215,7 @@ class Batch:
         return np.broadcast_to(origins, directions.shape), directions
 
 
-class Step(ABC):
+class PulseStep(ABC):
     """An effect on pulses. It is made where it applies, and then applied to batch after batch."""
 
     effects: ClassVar[tuple[str, ...]] = ()  # sections of docs/effects.md about it
@@ -224,8 +224,8 @@ class Step(ABC):
     purposes: ClassVar[tuple[Purpose, ...]] = ()  # of its random numbers
     of_kept: ClassVar[bool] = False  # whether it works on the returns that are kept, batch by batch
 
-    def __init__(self, setup: Setup, world: World, surfaces: Surfaces) -> None:
-        self.setup, self.world, self.surfaces = setup, world, surfaces
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        self.setup, self.caster, self.surfaces = setup, caster, surfaces
 
     @staticmethod
     @abstractmethod
@@ -243,5 +243,5 @@ class Step(ABC):
         return Memory()
 
     @abstractmethod
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
         """Return the returns as they are after it."""

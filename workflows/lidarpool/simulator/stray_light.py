@@ -13,16 +13,16 @@ from ..base.arrays import Bools, Floats, Integers, Ints, Ints32, owned
 from ..base.vectors import into_axes, length, products, turned
 from ..scene.scene import Scene
 from ..sensor.noise import Purpose
-from .hits import BLOOMING, OF_RETURNS, Hits, merged, unreal
-from .step import Batch, Memory, Setup, Sizes, Step
+from .returns import BLOOMING, OF_RETURNS, PulseReturns, merged, unreal
+from .scene_caster import SceneCaster
+from .step import Memory, PulseBatch, PulseStep, Setup, Sizes
 from .surfaces import Surfaces, light_of
-from .world import World
 
 CLUSTER_M = 1.0  # triangles of retro-reflectors so near to each other are looked for at a time
 FAINTEST = 0.1  # of the threshold: less is never detected, see `Noise.detected`
 
 
-class StrayLight(Step):
+class StrayLightStep(PulseStep):
     """Adds the light of retro-reflectors that beams beside them receive."""
 
     effects = ("Blooming",)
@@ -30,23 +30,23 @@ class StrayLight(Step):
     writes = OF_RETURNS
     purposes = (Purpose.STRAY,)
 
-    def __init__(self, setup: Setup, world: World, surfaces: Surfaces) -> None:
-        super().__init__(setup, world, surfaces)
+    def __init__(self, setup: Setup, caster: SceneCaster, surfaces: Surfaces) -> None:
+        super().__init__(setup, caster, surfaces)
         self._light = light_of(setup.survey, setup.sensor)
         self._retros = [*_retros(setup.scene, surfaces)]
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.noise.stray_light > 0
 
     @staticmethod
     def memory(setup: Setup, sizes: Sizes) -> Memory:
-        """See `Step.memory`."""
+        """See `PulseStep.memory`."""
         return Memory(kept=10 * sizes.returns, casting=120 * sizes.beams)
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         if not self._retros:
             return returns
         from . import stray_loops  # not before: numba takes half a second to import
@@ -78,7 +78,7 @@ class StrayLight(Step):
         distance = np.sqrt(products(ends[row].T, ends[row].T))
         within = (distance >= low) & (distance <= high)
         row, distance = row[within], distance[within]
-        free = self.world.free(origins[row], ends[row], distance, times[row], poses.ways)
+        free = self.caster.free(origins[row], ends[row], distance, times[row], poses.ways)
         free &= ~self._beside(returns, rays[row], distance)
         row = row[free]
         return merged(returns, unreal(returns, rays[row], distance[free], best[row], BLOOMING))
@@ -89,7 +89,7 @@ class StrayLight(Step):
         table = surfaces.at(self._light.wavelength_nm)
         return table.scattered(surfaces.objects(triangle), np.ones(count), np.ones(count))
 
-    def _beside(self, returns: Hits, ray: Ints, distance: Floats) -> Bools:
+    def _beside(self, returns: PulseReturns, ray: Ints, distance: Floats) -> Bools:
         """Whether a ray (n,) has a return of its own that cannot be told from one so far away."""
         first = np.searchsorted(returns.ray, ray, side="left")
         last = np.searchsorted(returns.ray, ray, side="right")

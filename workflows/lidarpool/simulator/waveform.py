@@ -15,14 +15,14 @@ import numpy as np
 
 from ..base.arrays import Floats, owned
 from ..sensor.optics import FWHM, LIGHT_M_NS, WINDOW_SIGMAS
-from .hits import NO_SURFACE, OF_RETURNS, Hits, Planes, made
+from .returns import NO_SURFACE, OF_RETURNS, Planes, PulseReturns, made
 from .separation import surfaces_of
-from .step import Batch, Setup, Step
+from .step import PulseBatch, PulseStep, Setup
 
 CUT = WINDOW_SIGMAS / 2  # standard deviations of the system waveform: beyond, an echo is 0 (4e-6)
 
 
-class Waveforms(Step):
+class WaveformStep(PulseStep):
     """Finds returns in the waveforms of pulses."""
 
     effects = ("Waveforms",)
@@ -31,11 +31,11 @@ class Waveforms(Step):
 
     @staticmethod
     def applies(setup: Setup) -> bool:
-        """See `Step.applies`."""
+        """See `PulseStep.applies`."""
         return setup.in_waveforms
 
-    def apply(self, returns: Hits, batch: Batch) -> Hits:
-        """See `Step.apply`."""
+    def apply(self, returns: PulseReturns, batch: PulseBatch) -> PulseReturns:
+        """See `PulseStep.apply`."""
         found = returns_in(returns, Digitizer.of(self.setup), batch.each, batch.planes)
         return found._replace(ray=batch.start + found.ray)
 
@@ -86,8 +86,8 @@ class Digitizer:
 
 
 def returns_in(
-    hits: Hits, digitizer: Digitizer, each: int = 1, planes: Planes | None = None
-) -> Hits:
+    hits: PulseReturns, digitizer: Digitizer, each: int = 1, planes: Planes | None = None
+) -> PulseReturns:
     """Make returns of the waveforms of beams; arguments and order as of `separated`.
 
     Hits that lie close together, or on one surface (see `pulse_loops`), are one Gaussian with their
