@@ -6,15 +6,16 @@ import json
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial, reduce, wraps
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 import click
 
 from ..base.storage import Storage, is_url
-from ..base.vocabulary import BACKENDS
+from ..base.vocabulary import BACKENDS, UNITS_M
 
 Command = Callable[..., None]
 
@@ -66,6 +67,83 @@ copies = click.option(
 def together(*added: Callable[[Command], Command]) -> Callable[[Command], Command]:
     """Return what adds options to a command, in their order."""
     return lambda command: reduce(lambda made, option: option(made), reversed(added), command)
+
+
+def _position(text: str) -> list[float]:
+    """Parse x,y,z; whole numbers stay so, to be written as they were."""
+    try:
+        x, y, z = map(float, text.split(","))
+    except ValueError as error:
+        raise click.BadParameter(
+            f"{text!r} is no position: give x,y,z in metres, such as 0,0,1.9. Angles are for a "
+            "scenario, which lidarpool init DIR --mesh FILE writes."
+        ) from error
+    return [int(one) if one.is_integer() else one for one in (x, y, z)]
+
+
+def _names(text: str) -> list[str]:
+    return [name.strip() for name in text.split(",")]
+
+
+_SURVEY = {
+    "sensor": click.option(
+        "--sensor",
+        metavar="MODEL|FILE.yaml",
+        help="Of a mesh: the sensor, a model of lidarpool sensors, with or without its maker.",
+    ),
+    "unit": click.option(
+        "--unit",
+        type=click.Choice(list(UNITS_M)),
+        help="Of a mesh: its length unit; by default the one it states, else metres.",
+    ),
+    "up_axis": click.option(
+        "--up-axis",
+        type=click.Choice(["x", "y", "z"]),
+        help="Of a mesh: its axis that points up; by default the one it states, else z.",
+    ),
+    "pose": click.option(
+        "--pose",
+        type=_position,
+        metavar="X,Y,Z",
+        multiple=True,
+        help="Of a mesh: where the sensor stands, metres; may be given several times.",
+    ),
+    "columns": click.option(
+        "--columns",
+        type=_names,
+        metavar="NAME,…",
+        multiple=True,
+        help="Of a mesh: further columns of the points, such as range,intensity.",
+    ),
+    "format": click.option(
+        "--format",
+        type=_names,
+        metavar="NAME,…",
+        multiple=True,
+        help="Of a mesh: further formats of the cloud, such as las.",
+    ),
+}
+
+
+def survey(command: Command) -> Command:
+    """Add what may be said of a mesh file; the command gets it as `said`, see `mesh_data`."""
+
+    @wraps(command)
+    def with_survey(*arguments: Any, **given: Any) -> None:
+        said = {name: given.pop(name) for name in _SURVEY}
+        said |= {name: [*chain(*said[name])] for name in ("columns", "format")}
+        said["pose"] = [*said["pose"]]
+        command(*arguments, said={name: one for name, one in said.items() if one}, **given)
+
+    return together(*_SURVEY.values())(with_survey)
+
+
+def as_words(said: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the words of a command that say this of a mesh file."""
+    for name, value in said.items():
+        for one in value if name == "pose" else [value]:
+            yield f"--{name.replace('_', '-')}"
+            yield one if isinstance(one, str) else ",".join(map(str, one))
 
 
 def scheduler(command: Command) -> Command:

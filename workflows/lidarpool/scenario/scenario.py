@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import PrivateAttr
 
-from ..base.declared import Several, Text, about
-from ..base.errors import Mistakes, prefixed
+from ..base.declared import Several, Text, about, by_text
+from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.files.meshfile import SUFFIXES
 from ..sensor import Material, Navigation
+from ..sensor.models import full_name
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
 from .actor_motion import (
     ActorSection,
-    CarriedSection,
-    MountSection,
+    CarriedEntry,
+    MountEntry,
     TrafficSection,
     TrajectoryEntry,
 )
@@ -43,6 +46,47 @@ from .sections import (
 
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
+
+# What is said of a mesh file without a scenario, and where a scenario has it.
+MESH_OPTIONS = {
+    "sensor": "sensor",
+    "unit": "unit of scene.files",
+    "up_axis": "up_axis of scene.files",
+    "pose": "poses",
+    "columns": "cloud.columns",
+    "format": "output.write",
+}
+_OWN_MODEL = (".yaml", ".yml")
+
+
+def mesh_data(files: Sequence[Path], folder: Path, said: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scenario of mesh files as data, as its YAML would have it; only what is said.
+
+    Parameters
+    ----------
+    files
+        The mesh files; without any the scene is left out.
+    folder
+        Of the scenario, where names of files in the data start from.
+    said
+        {name in `MESH_OPTIONS`: value}; the others are left out.
+    """
+
+    def moved(file: str | Path) -> str:
+        return Path(os.path.relpath(file, folder)).as_posix()
+
+    read = {name: said[name] for name in ("unit", "up_axis") if name in said}
+    columns = {"columns": said["columns"]} if "columns" in said else {}
+    model = full_name(said.get("sensor", ""))
+    data = {
+        "scene": files
+        and {"files": [{"file": moved(f)} | read if read else moved(f) for f in files]},
+        "sensor": moved(model) if model.endswith(_OWN_MODEL) else model,
+        "poses": said.get("pose"),
+        "cloud": (MESH_CLOUD if files else {}) | columns,
+        "output": "format" in said and {"write": said["format"]},
+    }
+    return {name: value for name, value in data.items() if value}
 
 
 class Scenario(Section):
@@ -68,7 +112,9 @@ class Scenario(Section):
     """
 
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
-    sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
+    sensor: Annotated[
+        SensorSection, may_be_empty(SensorSection), by_text("model", SensorSection | None)
+    ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
         about(
@@ -89,18 +135,20 @@ class Scenario(Section):
         ),
     ] = None
     sensors: Annotated[
-        dict[Text, CarriedSection],
+        dict[Text, CarriedEntry],
         about(
             "instead of sensor: several on one carrier, by name, each with its mount",
-            {"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}},
+            {"front": {"model": "velodyne/vlp16", "mount": [2, 0, 0.5]}, "roof": "ouster/os1-64"},
             max_length=SENSORS_MOST,
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
         Several[ActorSection],
         about(
-            "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
+            "objects that move, or stand at a pose: meshes, boxes or robots; one without "
+            "trajectory and at is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
+            [{"name": "Crane", "file": "crane.urdf", "at": [4, 5, 0]}],
             max_length=10_000,
         ),
     ] = ()
@@ -112,9 +160,10 @@ class Scenario(Section):
         ),
     ] = None
     mount: Annotated[
-        MountSection | None,
+        MountEntry | None,
         about(
             "pose of the sensor on its carrier, in the carrier's axes",
+            [1, 0, 2],
             {"position": [1, 0, 2], "pitch_deg": 10},
         ),
     ] = None
@@ -152,8 +201,8 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
 
     @classmethod
-    def load(cls, path: str | Path) -> Scenario:
-        """Read a scenario file (YAML), or make a scenario of a mesh file.
+    def load(cls, path: str | Path, said: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
+        """Read a scenario file (YAML), or make a scenario of a mesh file; see `mesh_data`.
 
         Raises
         ------
@@ -162,7 +211,14 @@ class Scenario(Section):
         """
         path = Path(path)
         mesh = path.suffix.lower() in SUFFIXES
-        data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD} if mesh else read_yaml(path)
+        data = mesh_data([path], path.parent, said) if mesh else read_yaml(path)
+        if said and not mesh:
+            name = next(iter(said))
+            where = "its base" if "base" in data else "it"
+            raise LidarpoolError(
+                f"--{name.replace('_', '-')} is for a mesh file, and {path} says its survey itself: "
+                f"change {MESH_OPTIONS[name]} in {where}."
+            )
         return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod
@@ -215,11 +271,11 @@ class Scenario(Section):
             wrong.append("trajectory.beyond is for actors; the carrier's has to cover the survey.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
-        carried = [entry for entry in self.actors if entry.trajectory is None]
+        carried = [entry for entry in self.actors if entry.is_carrier]
         if carried and self.trajectory is None:
             wrong.append(
-                f"actor {carried[0].name!r} has no trajectory: give it one, or give the survey a "
-                "trajectory in place of poses, to be its carrier."
+                f"actor {carried[0].name!r} has no trajectory: give it one, or at: [x, y, z] if it "
+                "stands, or give the survey a trajectory in place of poses, to be its carrier."
             )
         if self.links and not any(entry.robot for entry in carried):
             wrong.append(
