@@ -382,12 +382,9 @@ def field_hint(name: str, known: Collection[str], root: Any) -> str:
         owners = [(place[1:], kind) for place, kind in level if name in _named(kind)]
     kinds = {kind for _, kind in owners}
     places = [place for place, kind in owners if kinds.isdisjoint(kind.__mro__[1:])]
-    near = did_you_mean(name, known)
-    if not places:
-        return near
-    *others, last = places
-    listed = f"{', '.join(others)} and {last}" if others else last
-    return f"{near} {name} is a field of {listed}: write it there."
+    listed = " and ".join(filter(None, [", ".join(places[:-1]), *places[-1:]]))
+    where = f" {name} is a field of {listed}: write it there." if places else ""
+    return did_you_mean(name, known) + where
 
 
 def _at(place: FieldPath, hint: Any) -> tuple[Any, Fields]:

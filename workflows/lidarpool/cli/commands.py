@@ -137,7 +137,7 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
 
 @cli.command()
 @click.argument("scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path())
-@shared.survey
+@shared.mesh_options
 @shared.out
 @shared.scheduler
 @shared.cluster
@@ -175,7 +175,7 @@ def run(
     terminal: Terminal,
     options: RunOptions,
     scenarios: tuple[str, ...],
-    said: dict[str, Any],
+    of_mesh: dict[str, Any],
     no_plan: bool,
     only: str | None,
     number: int | None,
@@ -216,10 +216,11 @@ def run(
     assert options.out is not None, "it has a default"
     options = replace(options, folder=Storage.at(options.out).below(RUN_FOLDER))
     several = len(paths) > 1
-    if said and several:
-        told = f"{' '.join(shared.as_words(said))} is for one mesh file: run each by itself."
-        raise click.UsageError(told)
-    if several or (not said and is_campaign(paths[0])):
+    if of_mesh and several:
+        raise click.UsageError(
+            "--sensor, --pose and the like are for one mesh: run each by itself."
+        )
+    if several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, terminal, options, backend, only)
@@ -230,7 +231,7 @@ def run(
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
-        scenario = Scenario.load(paths[0], said)
+        scenario = Scenario.load(paths[0], of_mesh)
         run_scenario(scenario, terminal, options, backend, no_plan=no_plan, only=only)
 
 

@@ -41,9 +41,9 @@ _OBJECTS_TOLD = 12
     multiple=True,
     help="Mesh file to survey; may be given several times.",
 )
-@options.survey
+@options.mesh_options
 @options.flag("--all", "every", help="Write every field with its default and a description.")
-def init(folder: Path, meshes: tuple[Path, ...], said: dict[str, Any], every: bool) -> None:
+def init(folder: Path, meshes: tuple[Path, ...], of_mesh: dict[str, Any], every: bool) -> None:
     """Write a commented scenario file: what you say, and poses; the rest has defaults.
 
     Its JSON Schema is written beside it, so that editors complete and check it. An existing
@@ -67,20 +67,14 @@ def init(folder: Path, meshes: tuple[Path, ...], said: dict[str, Any], every: bo
         schema_text,
         short_scenario,
     )
-    from ..scene.files.meshfile import SUFFIXES
 
-    if not meshes and {"unit", "up_axis"} & said.keys():
+    if not meshes and {"unit", "up_axis"} & of_mesh.keys():
         raise click.UsageError("--unit and --up-axis say how to read a mesh: name it with --mesh.")
-    for path in meshes:
-        if not path.is_file() or path.suffix.lower() not in SUFFIXES:
-            raise LidarpoolError(
-                f"{path} has no mesh format that can be read; these can: {' '.join(SUFFIXES)}."
-            )
-    target, data = folder / SCENARIO_FILE, mesh_data(meshes, folder, said)
+    target, data = folder / SCENARIO_FILE, mesh_data(meshes, folder, of_mesh)
     note, notes = "", []
     if data and not target.exists():
         # From here: the scenario's folder need not be there yet.
-        read = Scenario.from_data(mesh_data(meshes, Path(), said), source=str(target))
+        read = Scenario.from_data(mesh_data(meshes, Path(), of_mesh), source=str(target))
         built = build(read, plans=False)
         notes = advice(built)
         if (placing := built.placing) is not None:
@@ -149,7 +143,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 
 @click.command()
 @click.argument("scenario", type=click.Path(path_type=Path))
-@options.survey
+@options.mesh_options
 @options.out
 @options.scheduler
 @options.cluster
@@ -159,7 +153,7 @@ def import_(survey: Path, assets: tuple[Path, ...], out: Path | None) -> None:
 @options.as_json
 def check(
     scenario: Path,
-    said: dict[str, Any],
+    of_mesh: dict[str, Any],
     out: Path | Storage,
     scheduler: str | None,
     files: TlsFiles,
@@ -194,7 +188,7 @@ def check(
         with nullcontext() if scheduler is None else connected(scheduler, files) as client:
             asked = RunOptions(out=out, cluster=file)
             found, lines = look_at(
-                scenario, said, number, client, asked, backend, no_plan=no_plan, quiet=as_json
+                scenario, of_mesh, number, client, asked, backend, no_plan=no_plan, quiet=as_json
             )
     except LidarpoolError as error:
         if as_json:
@@ -204,7 +198,7 @@ def check(
     if found["reasons"]:
         raise LidarpoolError("it cannot run. " + " ".join(found["reasons"]))
     if not as_json:
-        words = ["lidarpool", "run", str(scenario), *options.as_words(said)]
+        words = ["lidarpool", "run", str(scenario), *options.as_words(of_mesh)]
         given: dict[str, object] = {"out": out, "scheduler": scheduler, "cluster": cluster}
         given |= {"backend": backend, "job": number}
         for name, value in given.items():

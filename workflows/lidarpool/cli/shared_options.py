@@ -74,10 +74,8 @@ def _position(text: str) -> list[float]:
     try:
         x, y, z = map(float, text.split(","))
     except ValueError as error:
-        raise click.BadParameter(
-            f"{text!r} is no position: give x,y,z in metres, such as 0,0,1.9. Angles are for a "
-            "scenario, which lidarpool init DIR --mesh FILE writes."
-        ) from error
+        told = f"{text!r} is no place: give x,y,z, such as 0,0,1.9; angles are for scenario files."
+        raise click.BadParameter(told) from error
     return [int(one) if one.is_integer() else one for one in (x, y, z)]
 
 
@@ -85,62 +83,37 @@ def _names(text: str) -> list[str]:
     return [name.strip() for name in text.split(",")]
 
 
-_SURVEY = {
-    "sensor": click.option(
-        "--sensor",
-        metavar="MODEL|FILE.yaml",
-        help="Of a mesh: the sensor, a model of lidarpool sensors, with or without its maker.",
-    ),
-    "unit": click.option(
-        "--unit",
-        type=click.Choice(list(UNITS_M)),
-        help="Of a mesh: its length unit; by default the one it states, else metres.",
-    ),
-    "up_axis": click.option(
-        "--up-axis",
-        type=click.Choice(["x", "y", "z"]),
-        help="Of a mesh: its axis that points up; by default the one it states, else z.",
-    ),
-    "pose": click.option(
-        "--pose",
-        type=_position,
-        metavar="X,Y,Z",
-        multiple=True,
-        help="Of a mesh: where the sensor stands, metres; may be given several times.",
-    ),
-    "columns": click.option(
-        "--columns",
-        type=_names,
-        metavar="NAME,…",
-        multiple=True,
-        help="Of a mesh: further columns of the points, such as range,intensity.",
-    ),
-    "format": click.option(
-        "--format",
-        type=_names,
-        metavar="NAME,…",
-        multiple=True,
-        help="Of a mesh: further formats of the cloud, such as las.",
-    ),
-}
+def _of_mesh(name: str, what: str, **more: Any) -> Callable[[Command], Command]:
+    return click.option(f"--{name}", help=f"Of a mesh: {what}.", **more)
 
 
-def survey(command: Command) -> Command:
-    """Add what may be said of a mesh file; the command gets it as `said`, see `mesh_data`."""
+_list_of_mesh = partial(_of_mesh, metavar="NAME,…", type=_names, multiple=True)
+_mesh_options = together(
+    _of_mesh("sensor", "sensor, one of lidarpool sensors or a file", metavar="MODEL|FILE.yaml"),
+    _of_mesh("unit", "length unit; by default its own, or m", type=click.Choice([*UNITS_M])),
+    _of_mesh("up-axis", "upward axis; by default its own, or z", type=click.Choice([*"xyz"])),
+    _list_of_mesh("pose", "place of the sensor, metres", metavar="X,Y,Z", type=_position),
+    _list_of_mesh("columns", "further columns of its points, such as range,intensity"),
+    _list_of_mesh("format", "further formats of the cloud, such as las"),
+)
+
+
+def mesh_options(command: Command) -> Command:
+    """Add what may be said of a mesh file; the command gets a dict of it, see `mesh_data`."""
 
     @wraps(command)
-    def with_survey(*arguments: Any, **given: Any) -> None:
-        said = {name: given.pop(name) for name in _SURVEY}
-        said |= {name: [*chain(*said[name])] for name in ("columns", "format")}
-        said["pose"] = [*said["pose"]]
-        command(*arguments, said={name: one for name, one in said.items() if one}, **given)
+    def with_options(*arguments: Any, pose: Any, columns: Any, format: Any, **given: Any) -> None:  # noqa: A002
+        said = {name: given.pop(name) for name in ("sensor", "unit", "up_axis")}
+        said |= {"pose": [*pose], "columns": [*chain(*columns)], "format": [*chain(*format)]}
+        said = {name: value for name, value in said.items() if value}
+        command(*arguments, of_mesh=said, **given)
 
-    return together(*_SURVEY.values())(with_survey)
+    return _mesh_options(with_options)
 
 
-def as_words(said: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the words of a command that say this of a mesh file."""
-    for name, value in said.items():
+def as_words(of_mesh: Mapping[str, Any]) -> Iterator[str]:
+    """Yield the words of a command that give these options."""
+    for name, value in of_mesh.items():
         for one in value if name == "pose" else [value]:
             yield f"--{name.replace('_', '-')}"
             yield one if isinstance(one, str) else ",".join(map(str, one))

@@ -18,7 +18,6 @@ from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.files.meshfile import SUFFIXES
 from ..sensor import Material, Navigation
-from ..sensor.models import full_name
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
@@ -47,7 +46,7 @@ from .sections import (
 # The cloud of a mesh file without a scenario.
 MESH_CLOUD = {"precision_m": 0.001}
 
-# What is said of a mesh file without a scenario, and where a scenario has it.
+# Options of a mesh file without a scenario, and where a scenario has them.
 MESH_OPTIONS = {
     "sensor": "sensor",
     "unit": "unit of scene.files",
@@ -56,35 +55,28 @@ MESH_OPTIONS = {
     "columns": "cloud.columns",
     "format": "output.write",
 }
-_OWN_MODEL = (".yaml", ".yml")
 
 
-def mesh_data(files: Sequence[Path], folder: Path, said: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the scenario of mesh files as data, as its YAML would have it; only what is said.
+def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scenario of mesh files as data, as its YAML would have it.
 
-    Parameters
-    ----------
-    files
-        The mesh files; without any the scene is left out.
-    folder
-        Of the scenario, where names of files in the data start from.
-    said
-        {name in `MESH_OPTIONS`: value}; the others are left out.
+    Names of files start from `folder`, that of the scenario. `options` are {name in
+    `MESH_OPTIONS`: value}; what is not among them is left out, and so is the scene without files.
     """
 
     def moved(file: str | Path) -> str:
         return Path(os.path.relpath(file, folder)).as_posix()
 
-    read = {name: said[name] for name in ("unit", "up_axis") if name in said}
-    columns = {"columns": said["columns"]} if "columns" in said else {}
-    model = full_name(said.get("sensor", ""))
+    read = {name: options[name] for name in ("unit", "up_axis") if name in options}
+    columns = {"columns": options["columns"]} if "columns" in options else {}
+    model = options.get("sensor", "")
     data = {
         "scene": files
-        and {"files": [{"file": moved(f)} | read if read else moved(f) for f in files]},
-        "sensor": moved(model) if model.endswith(_OWN_MODEL) else model,
-        "poses": said.get("pose"),
+        and {"files": [{"file": f} | read if read else f for f in map(moved, files)]},
+        "sensor": moved(model) if model.endswith((".yaml", ".yml")) else model,
+        "poses": options.get("pose"),
         "cloud": (MESH_CLOUD if files else {}) | columns,
-        "output": "format" in said and {"write": said["format"]},
+        "output": "format" in options and {"write": options["format"]},
     }
     return {name: value for name, value in data.items() if value}
 
@@ -201,7 +193,7 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
 
     @classmethod
-    def load(cls, path: str | Path, said: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
+    def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
         """Read a scenario file (YAML), or make a scenario of a mesh file; see `mesh_data`.
 
         Raises
@@ -211,13 +203,12 @@ class Scenario(Section):
         """
         path = Path(path)
         mesh = path.suffix.lower() in SUFFIXES
-        data = mesh_data([path], path.parent, said) if mesh else read_yaml(path)
-        if said and not mesh:
-            name = next(iter(said))
-            where = "its base" if "base" in data else "it"
+        data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
+        if options and not mesh:
+            name = next(iter(options))
             raise LidarpoolError(
-                f"--{name.replace('_', '-')} is for a mesh file, and {path} says its survey itself: "
-                f"change {MESH_OPTIONS[name]} in {where}."
+                f"--{name.replace('_', '-')} is for a mesh file: in {path}"
+                f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
             )
         return cls.from_data(data, source=str(path), folder=path.parent)
 

@@ -6,7 +6,6 @@ import inspect
 import json
 import textwrap
 from collections.abc import Iterator, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 from pydantic.fields import FieldInfo
@@ -90,32 +89,29 @@ _FEW = f"""\
 # defaults: lidarpool init DIR --all writes every field."""
 # {section of a short scenario: (an example, what it is)}
 _SECTIONS = {
-    "scene": ("seed", "mesh files, or the six default objects (seed)"),
+    "scene": ("seed", "mesh files, named from this folder; seed is six objects"),
     "sensor": ("ouster/os1-64", "a model of `lidarpool sensors`, or your own .yaml"),
     "poses": ("[[0, 0, 1], {position: [0, 0, 2], yaw_deg: 90}]", "where the sensor stands"),
     "cloud": ("{columns: [range, intensity]}", "precision and further columns of the points"),
     "output": ("{write: [las]}", "further formats of the cloud"),
 }
-_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
-def short_scenario(data: Mapping[str, Any] = _NOTHING, note: str = "") -> str:
-    """Return a commented scenario in YAML of these sections, with examples of others.
+def short_scenario(data: Mapping[str, Any], note: str) -> str:
+    """Return a commented scenario in YAML of a few sections, those not in `data` as examples.
 
     `data` is what `mesh_data` returns, `note` a remark on its poses.
     """
     lines, data = [_FEW, ""], {"scene": "seed"} | dict(data)
     for name, (example, words) in _SECTIONS.items():
-        if name == "poses" and name in data:
-            lines += _poses(data[name], note)
-        elif name in data:
-            lines += _beside(f"{name}: {on_one_line(data[name])}", words, "")
-        else:
-            lines += _beside(f"# {name}: {example}", words, "")
+        given = name in data
+        code = f"{name}: {on_one_line(data[name])}" if given else f"# {name}: {example}"
+        placed = name == "poses" and given
+        lines += _poses(data[name], note) if placed else _beside(code, words, "")
     return "\n".join([*lines, ""])
 
 
-def scenario_template(data: Mapping[str, Any] = _NOTHING, note: str = "") -> str:
+def scenario_template(data: Mapping[str, Any], note: str) -> str:
     """Return a commented scenario in YAML that holds all defaults.
 
     `data` is what `mesh_data` returns, in place of some of them, `note` a remark on its poses.
@@ -147,10 +143,10 @@ def _poses(poses: Sequence[Any], note: str) -> Iterator[str]:
     if note:
         note = f"{note[:1].upper()}{note[1:]}."
         # A pose stays on one line, to be copied.
-        text, mark, poses = note.partition("poses: ")
+        text, mark, others = note.partition("poses: ")
         yield from textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
         if mark:
-            yield f"# poses: {poses.removesuffix('.')}"
+            yield f"# poses: {others.removesuffix('.')}"
     yield from _beside("poses:", _SECTIONS["poses"][1], "")
     yield from (f"  - {on_one_line(pose)}" for pose in poses)
 
