@@ -263,8 +263,9 @@ def read_model(name: str | Path) -> SensorModel:
     if name not in known:
         near = [model for model in known if _plain(name) in _plain(model)][:3]
         hint = f" Did you mean {' or '.join(map(repr, near))}?" if near else ""
+        names = [*known, *(model.partition("/")[2] for model in known)]
         raise LidarpoolError(
-            f"There is no sensor model {name!r}.{hint or did_you_mean(name, known)} "
+            f"There is no sensor model {name!r}.{hint or did_you_mean(name, names)} "
             "lidarpool sensors lists them; give your own as a file, such as mine.yaml."
         )
     return _built_in(name)
