@@ -203,7 +203,7 @@ BAD = [
     ("sensor: {rain_mm_h: 9}", r"sensor\.rain_mm_h is .* rain_mm_h is a field of weather: write"),
     ("columns: [range]", "a field of sensor, trajectory and cloud: write it there"),
     ("unit: mm", r"unit is a field of scene\.files and actors\.file: write it there"),
-    ("trajectory: {start: 3}", "mean 'start_s'[?] start is a field of cloud and planning: write it there"),
+    ("trajectory: {start: 3}", "mean 'start_s'[?] start is a field of cloud and planning: write"),
     ("sensor: {vertical_fov_deg: .nan}", r"is nan; it must be a finite number"),
     ("sensor: {model: velodyne/vlp61}", "no sensor model .* Did you mean 'velodyne/vlp16'"),
     ("sensor: vlp61", "no sensor model .* Did you mean 'vlp16'"),

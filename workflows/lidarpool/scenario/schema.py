@@ -86,7 +86,7 @@ _EVERY = f"""\
 _FEW = f"""\
 {_HEAD}
 # A lidar survey for lidarpool; lengths are in metres, Z is up. Fields that are left out have their
-# defaults: lidarpool init DIR --all writes every field."""
+# defaults; lidarpool init DIR --all writes all of them."""
 # {section of a short scenario: (an example, what it is)}
 _SECTIONS = {
     "scene": ("seed", "mesh files, named from this folder; seed is six objects"),
