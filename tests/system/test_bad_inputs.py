@@ -57,6 +57,7 @@ OPTIONS: dict[str, tuple[list[str], str]] = {
     ),
     "several meshes": (["run", "a.stl", "a.stl", "--pose", "0,0,1"], "are for one mesh"),
     "misspelt model": (["run", "a.stl", "--sensor", "vlp61"], "Did you mean 'vlp16'?"),
+    "no model": (["run", "a.stl", "--sensor", ""], "There is no sensor model ''."),
     "misspelt column": (["run", "a.stl", "--columns", "rang,time"], "Did you mean 'range'?"),
     "misspelt format": (["run", "a.stl", "--format", "lass"], "Did you mean 'las'?"),
     "no place": (["run", "a.stl", "--pose", "0,0"], "'0,0' is no place: give x,y,z"),

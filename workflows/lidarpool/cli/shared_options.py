@@ -105,7 +105,7 @@ def mesh_options(command: Command) -> Command:
     def with_options(*arguments: Any, pose: Any, columns: Any, format: Any, **given: Any) -> None:  # noqa: A002
         said = {name: given.pop(name) for name in ("sensor", "unit", "up_axis")}
         said |= {"pose": [*pose], "columns": [*chain(*columns)], "format": [*chain(*format)]}
-        said = {name: value for name, value in said.items() if value}
+        said = {name: value for name, value in said.items() if value not in (None, [])}
         command(*arguments, of_mesh=said, **given)
 
     return _mesh_options(with_options)

@@ -68,17 +68,17 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
         return Path(os.path.relpath(file, folder)).as_posix()
 
     read = {name: options[name] for name in ("unit", "up_axis") if name in options}
-    columns = {"columns": options["columns"]} if "columns" in options else {}
-    model = options.get("sensor", "")
+    entries = [{"file": name} | read if read else name for name in map(moved, files)]
+    cloud = (MESH_CLOUD if files else {}) | {k: options[k] for k in ("columns",) if k in options}
+    model = options.get("sensor")
     data = {
-        "scene": files
-        and {"files": [{"file": f} | read if read else f for f in map(moved, files)]},
-        "sensor": moved(model) if model.endswith((".yaml", ".yml")) else model,
+        "scene": {"files": entries} if files else None,
+        "sensor": moved(model) if model and model.endswith((".yaml", ".yml")) else model,
         "poses": options.get("pose"),
-        "cloud": (MESH_CLOUD if files else {}) | columns,
-        "output": "format" in options and {"write": options["format"]},
+        "cloud": cloud or None,
+        "output": {"write": options["format"]} if "format" in options else None,
     }
-    return {name: value for name, value in data.items() if value}
+    return {name: value for name, value in data.items() if value is not None}
 
 
 class Scenario(Section):
