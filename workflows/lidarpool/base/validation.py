@@ -268,7 +268,7 @@ def sentences(section: Any, source: object = "") -> Iterator[None]:
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     """Yield a line for each error in a file: field, value given, values allowed.
 
-    For a name that is no field, the sections that have it are named, else a field like it.
+    For a name that is no field, one like it is suggested, and the sections that have it are named.
     """
     found = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     alike: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: where it was made}
