@@ -27,7 +27,7 @@ from typing import (
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
-from pydantic import ConfigDict, GetCoreSchemaHandler, WrapValidator
+from pydantic import ConfigDict, GetCoreSchemaHandler, GetPydanticSchema, WrapValidator
 from pydantic.fields import FieldInfo
 from pydantic_core import (
     ErrorDetails,
@@ -268,7 +268,7 @@ def sentences(section: Any, source: object = "") -> Iterator[None]:
 def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     """Yield a line for each error in a file: field, value given, values allowed.
 
-    For a misspelt name, a field of the same section is suggested.
+    For a name that is no field, one like it is suggested, and the sections that have it are named.
     """
     found = {detail["loc"]: detail for detail in error.errors(include_url=False)}
     alike: dict[Any, list[FieldPath]] = {}  # {field and kind of mistake: where it was made}
@@ -282,7 +282,8 @@ def validation_errors(error: ValidationError, section: Any) -> Iterator[str]:
     for first, *others in alike.values():
         more = f" {plural(len(others), 'more entry', 'more entries')} like it." if others else ""
         hint, known = _at(first, section)
-        yield _sentence(first, [found[first]], hint, known, _in_file) + more
+        near = field_hint(str(first[-1]), known, section) if first else ""
+        yield _sentence(first, [found[first]], hint, near, _in_file) + more
 
 
 def _in_file(value: Any) -> str:
@@ -298,14 +299,14 @@ def _argument_error(error: ValidationError, hints: Mapping[str, Any]) -> str:
         entry = (name, *(step for step in steps if isinstance(step, int)))
         places.setdefault(entry, []).append(detail)
     place, details = next(iter(places.items()))
-    return _sentence(place, details, hints[str(place[0])], (), shown)
+    return _sentence(place, details, hints[str(place[0])], "", shown)
 
 
 def _sentence(
     place: FieldPath,
     details: Sequence[ErrorDetails],
     hint: Any,
-    known: Collection[str],
+    near: str,
     show: Callable[[Any], str],
 ) -> str:
     at, kind, given = dotted(place), details[0]["type"], details[0]["input"]
@@ -313,9 +314,6 @@ def _sentence(
         message = str(details[0]["ctx"]["error"])
         return f"{at}: {message}" if at else message
     if kind in ("extra_forbidden", "invalid_key", "unexpected_keyword_argument"):
-        name = str(place[-1])
-        other = _ALIKE.get(name, "")
-        near = f" Did you mean {other!r}?" if other in known else did_you_mean(name, known)
         return f"{at} is not a field.{near}"
     if kind == "missing":
         return f"{at} is missing; it must be given."
@@ -362,6 +360,31 @@ def _range(limits: Mapping[str, Any]) -> str:
     if numbers.keys() == {"ge", "le"}:
         return f"{numbers['ge']} to {numbers['le']}"
     return ", ".join(f"{_LIMITS[name]} {number}" for name, number in numbers.items())
+
+
+def field_hint(name: str, known: Collection[str], root: Any) -> str:
+    """Advise on a name that a section lacks: one like it of the `known`, and where it is a field.
+
+    `root` is the section of the whole file. Of the sections with such a field, the outermost are
+    named, and none that is derived from another of them.
+    """
+    if (other := _ALIKE.get(name)) in known:
+        return f" Did you mean {other!r}?"
+    level, owners = [("", root)], list[tuple[str, Any]]()
+    while level and not owners:
+        level = [
+            (f"{place}.{inner}", kind)
+            for place, outer in level
+            for inner, field in _named(outer).items()
+            if not any(isinstance(note, GetPydanticSchema) for note in field.metadata)  # of Python
+            for kind in sections_in(field.annotation)
+        ]
+        owners = [(place[1:], kind) for place, kind in level if name in _named(kind)]
+    kinds = {kind for _, kind in owners}
+    places = [place for place, kind in owners if kinds.isdisjoint(kind.__mro__[1:])]
+    listed = " and ".join(filter(None, [", ".join(places[:-1]), *places[-1:]]))
+    where = f" {name} is a field of {listed}: write it there." if places else ""
+    return did_you_mean(name, known) + where
 
 
 def _at(place: FieldPath, hint: Any) -> tuple[Any, Fields]:

@@ -52,8 +52,8 @@ def _of_size(built: Built) -> str:
     said = "states no unit" if unitless else "is in metres by its format"
     return (
         f"{(unitless or files)[0]} {said}, and in metres the scene is {side:,.5g} m long. If "
-        f"that is wrong, give the file's unit ({unit}?) in scene.files (lidarpool init DIR "
-        f"--mesh FILE --unit {unit} writes such a scenario)"
+        f"that is wrong, give the file's unit ({unit}?) in scene.files, or --unit {unit} with a "
+        "mesh file"
     )
 
 

@@ -118,9 +118,11 @@ class InstrumentPose(Pose):
     position: Annotated[Triple, about("x, y and z, metres")] = (0, 0, 0)
 
 
-# A pose in a file whose position may be left out.
+# A pose in a file whose position may be left out, or is all that is given.
 AT_CENTRE = short(
-    lambda v: isinstance(v, dict), lambda v: {"position": [0] * 3} | v, InstrumentPose
+    lambda v: isinstance(v, (dict, list)),
+    lambda v: {"position": v} if isinstance(v, list) else {"position": [0] * 3} | v,
+    Triple | InstrumentPose,
 )
 
 

@@ -240,7 +240,7 @@ def _tell_axes(
         return
     (axes or (_log.warning if why else _log.info))(
         f"{path.name} {done}; if it lies on its side, set up_axis: {other} in scene.files "
-        f"(lidarpool init --mesh FILE --up-axis {other}); any up_axis ends this note"
+        f"(--up-axis {other} with a mesh file); any up_axis ends this note"
     )
 
 
