@@ -39,6 +39,7 @@ from pydantic_core import (
 
 from .arrays import AnyArray
 from .errors import LidarpoolError, Mistakes
+from .one_line import one_line
 from .words import did_you_mean, plural
 
 P = ParamSpec("P")
@@ -121,7 +122,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 def checked_fields(cls: C) -> C:
     """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
-    In a section of a file it is a section itself, of the same fields.
+    In a section of a file it is a section itself, of the same fields. Its `repr` is one line.
 
     Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
     """
@@ -134,7 +135,16 @@ def checked_fields(cls: C) -> C:
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
     cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
+    if "__repr__" not in vars(cls):
+        cls.__repr__ = one_line  # type: ignore[method-assign, assignment]
+        cls.__init_subclass__ = classmethod(_one_line_too)  # type: ignore[assignment]
     return cls
+
+
+def _one_line_too(kind: type[Any], **_: Any) -> None:
+    # Else `dataclass` would give a subclass, such as another kind of sensor, a repr of all fields.
+    if "__repr__" not in vars(kind):
+        kind.__repr__ = one_line  # type: ignore[assignment]
 
 
 def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:

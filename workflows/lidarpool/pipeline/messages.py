@@ -14,6 +14,7 @@ import numpy as np
 from poolpart import TaskRecord
 
 from ..base.arrays import Floats32
+from ..base.one_line import one_line
 from ..base.tracing import trace
 from ..columns.cloud import Cloud
 from ..columns.parts import PartColumns
@@ -182,6 +183,7 @@ class ScanFrame:
     count: int
     samples: Floats32
     _read: Callable[[int], Cloud] = field(repr=False, compare=False)
+    __repr__ = one_line
 
     def points(self) -> Cloud:
         """Points of this scan, read from its part.

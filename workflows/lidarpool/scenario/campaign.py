@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, Field
+from pydantic_core import to_json
 
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
@@ -157,6 +158,9 @@ class CampaignSpec:
         self.command = " ".join(path.name for path in jobs.paths[:SHOWN_MOST])
         self.command += " …" * (jobs.count > SHOWN_MOST)
         return self
+
+    def __repr__(self) -> str:
+        return f"<Campaign: {plural(self.count, 'job')}>"
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -436,7 +440,7 @@ class _Varied(_JobSource):
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
-            "tables": fingerprint(repr([base.tables for base in self._bases])),
+            "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
 
     def values(self, number: int) -> dict[str, Value]:
