@@ -104,7 +104,9 @@ def test_it_says_what_differs_from_the_defaults():
     assert repr(Stations(tuple(POSES))) == "Stations(at=[24 Pose])"
     assert repr(PLANNING).endswith("centres=float64(100, 2), radii=float64(100,))")
     assert repr(SURVEY).startswith("Survey(sensor=Sensor('Velodyne VLP-16'), poses=[24 Pose], ")
-    assert "noise=Noise(range_m=0.01)" in repr(Survey(poses=POSES[:1], noise=Noise(range_m=0.01)))
+    assert repr(Mounted(SENSOR, noise=Noise(range_m=0.01))) == (
+        "Mounted(sensor=Sensor('Velodyne VLP-16'), noise=Noise(range_m=0.01))"
+    )
     assert repr(SENSOR).endswith(", …)")
 
 

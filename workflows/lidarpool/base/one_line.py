@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection
-from dataclasses import MISSING, Field, fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from typing import Any
 
 import numpy as np
@@ -12,26 +12,19 @@ _LINE, _VALUE = 119, 64  # most characters of all, and of the value of a field
 
 
 def one_line(thing: Any) -> str:
-    """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds.
-
-    Arrays are shown by type and shape, long lists by their length, dataclasses by their name.
-    """
-    in_order = sorted(fields(thing), key=lambda one: (one.name != "name", bool(one.kw_only)))
-    values = ((field, getattr(thing, field.name)) for field in in_order if field.repr)
-    shown = [f"{field.name}={_short(value)}" for field, value in values if _given(field, value)]
-    name, kept = type(thing).__name__, list[str]()
-    for text in shown:
-        if len(f"{name}({', '.join([*kept, text, '…'])})") <= _LINE:
+    """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds."""
+    name, kept, left_out = type(thing).__name__, list[str](), False
+    for field in sorted(fields(thing), key=lambda one: (one.name != "name", bool(one.kw_only))):
+        value, make = getattr(thing, field.name), field.default_factory
+        default = field.default if make is MISSING else make()
+        array = isinstance(value, np.ndarray)
+        if not field.repr or value is default or (not array and (value == default) is True):
+            continue
+        text = f"{field.name}={_short(value)}"
+        if fits := len(f"{name}({', '.join([*kept, text, '…'])})") <= _LINE:
             kept.append(text)
-    return f"{name}({', '.join([*kept, '…'] if len(kept) < len(shown) else kept)})"
-
-
-def _given(field: Field[Any], value: Any) -> bool:
-    if isinstance(value, np.ndarray):
-        return True
-    make = field.default_factory
-    default = field.default if make is MISSING else make()
-    return value is not default and (value == default) is not True
+        left_out |= not fits
+    return f"{name}({', '.join(kept + ['…'] * left_out)})"
 
 
 def _short(value: Any) -> str:

@@ -141,7 +141,7 @@ def checked_fields(cls: C) -> C:
     return cls
 
 
-def _one_line_too(kind: type[Any], **_: Any) -> None:
+def _one_line_too(kind: type[Any], /) -> None:
     # Else `dataclass` would give a subclass, such as another kind of sensor, a repr of all fields.
     if "__repr__" not in vars(kind):
         kind.__repr__ = one_line  # type: ignore[assignment]
