@@ -137,14 +137,11 @@ def checked_fields(cls: C) -> C:
     cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
     if "__repr__" not in vars(cls):
         cls.__repr__ = one_line  # type: ignore[method-assign, assignment]
-        cls.__init_subclass__ = classmethod(_one_line_too)  # type: ignore[assignment]
+        # Else `dataclass` gives a subclass, another kind of sensor, a repr of all fields.
+        cls.__init_subclass__ = classmethod(  # type: ignore[assignment]
+            lambda kind: setattr(kind, "__repr__", vars(kind).get("__repr__", one_line))
+        )
     return cls
-
-
-def _one_line_too(kind: type[Any], /) -> None:
-    # Else `dataclass` would give a subclass, such as another kind of sensor, a repr of all fields.
-    if "__repr__" not in vars(kind):
-        kind.__repr__ = one_line  # type: ignore[assignment]
 
 
 def _section(_: type, source: Any, handler: GetCoreSchemaHandler) -> core_schema.CoreSchema:

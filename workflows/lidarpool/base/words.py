@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import json
 import re
 from collections.abc import Iterable
 
@@ -21,41 +20,19 @@ def did_you_mean(word: str, known: Iterable[str]) -> str:
     return f" Did you mean {lower[near[0]]!r}?" if near else ""
 
 
-# In a note, a field of a scenario and its value; and the calls of Python that take those fields.
-_SETTING = re.compile(r"<(scene\.files|cloud|materials)\.(\w+)=(\w+)>")
-_CALLS = {
-    "scene.files": "Scene.load(path, {})",
-    "cloud": "Survey(…, {})",
-    "materials": "Material(…, {})",
-}
-_OPTION = " (lidarpool init --mesh FILE --{} {})"  # of a file in `scene.files`
+# In a note, a setting; and the calls of Python that take those of a section.
+_SETTING = re.compile(r'<(scene\.files|cloud|materials)\.(\w+)=("?)(\w+)\3>')
+_CALLS = {"scene.files": "Scene.load(path", "cloud": "Survey(…", "materials": "Material(…"}
 
 
 def as_python(note: str) -> str:
-    """Return a note with its settings as arguments in Python.
-
-    Examples
-    --------
-    >>> note = "give <scene.files.up_axis=y>"
-    >>> as_python(note)
-    'give Scene.load(path, up_axis="y")'
-    >>> as_scenario(note)
-    'give up_axis: y in scene.files (lidarpool init --mesh FILE --up-axis y)'
-    """
-    return _SETTING.sub(
-        lambda m: _CALLS[m[1]].format(f"{m[2]}={m[3] if m[3].isdigit() else json.dumps(m[3])}"),
-        note,
-    )
+    """Return a note with its settings as in Python: Scene.load(path, up_axis="z")."""
+    return _SETTING.sub(lambda m: f"{_CALLS[m[1]]}, {m[2]}={m[3]}{m[4]}{m[3]})", note)
 
 
 def as_scenario(note: str) -> str:
-    """Return a note with its settings as fields of a scenario."""
-
-    def said(m: re.Match[str]) -> str:
-        option = _OPTION.format(m[2].replace("_", "-"), m[3]) if m[1] == "scene.files" else ""
-        return f"{m[2]}: {m[3]} in {m[1]}{option}"
-
-    return _SETTING.sub(said, note)
+    """Return a note with its settings as in a scenario: up_axis: z in scene.files."""
+    return _SETTING.sub(r"\2: \4 in \1", note)
 
 
 def plural(number: float, what: str, several: str = "") -> str:

@@ -29,7 +29,7 @@ def advice(built: Built) -> list[str]:
     and on settings without effect.
     """
     notes, remarks = built.found.notes, built.found.remarks
-    axes = remarks[:1]
+    axes = [f"{remark} (lidarpool init DIR --mesh FILE --up-axis AXIS)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))

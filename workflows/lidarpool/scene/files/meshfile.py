@@ -244,7 +244,7 @@ def _tell_axes(
     else:
         return
     note = (
-        f"{path.name} {done}; if it lies on its side, give <scene.files.up_axis={other}>; any "
+        f'{path.name} {done}; if it lies on its side, give <scene.files.up_axis="{other}">; any '
         "up_axis ends this note"
     )
     if axes is not None:
