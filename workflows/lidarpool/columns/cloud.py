@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from html import escape
 from importlib import import_module
 from importlib.util import find_spec
 from textwrap import shorten
-from typing import Annotated, Any, Literal, Protocol, overload
+from typing import Any, Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, DTypeLike
-from pydantic import Field
 
 from ..base.arrays import AnyArray, AnyFloats
 from ..base.errors import LidarpoolError
@@ -24,8 +23,6 @@ from .waveforms import WAVEFORM, Waveforms
 
 CHUNK_POINTS = 1_000_000  # points in memory at a time while a cloud is read in order
 SHOWN_POINTS = 5
-
-Rows = slice | Sequence[int] | AnyArray  # a range, indices or a mask
 
 
 class CloudLike(Protocol):
@@ -127,13 +124,7 @@ class Cloud(Shown):
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> AnyArray:
         return np.array(self.positions, np.float64 if dtype is None else dtype, copy=copy)
 
-    @overload
-    def __getitem__(self, key: str) -> AnyArray: ...
-
-    @overload
-    def __getitem__(self, key: Rows) -> Cloud: ...
-
-    def __getitem__(self, key: str | Rows) -> AnyArray | Cloud:
+    def __getitem__(self, key: str | slice | ArrayLike) -> Any:
         if isinstance(key, str):
             try:
                 return self.columns[key]
@@ -226,8 +217,7 @@ class Cloud(Shown):
             cloud.point[column.in_files] = o3d.core.Tensor(values)
         return cloud
 
-    @checked
-    def head(self, points: Annotated[int, Field(ge=0)] = SHOWN_POINTS) -> Cloud:
+    def head(self, points: int = SHOWN_POINTS) -> Cloud:
         """Select the first points, or all if there are fewer."""
         return self[:points]
 

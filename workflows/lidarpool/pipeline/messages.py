@@ -14,8 +14,8 @@ import numpy as np
 from poolpart import TaskRecord
 
 from ..base.arrays import Floats32
-from ..base.one_line import one_line
 from ..base.tracing import trace
+from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import PartColumns
 from ..sensor import Pose

@@ -10,7 +10,7 @@ import numpy as np
 
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
-from ..base.one_line import one_line
+from ..base.validation import one_line
 from .cost import PathCost
 from .geometry import PathAxes, clearance, path_length, segment_distances
 from .planning import Planning

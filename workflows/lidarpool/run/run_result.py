@@ -10,7 +10,7 @@ from typing import Any
 from poolpart import TaskRecord
 
 from ..base.arrays import Floats32, Ints
-from ..base.one_line import one_line
+from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow

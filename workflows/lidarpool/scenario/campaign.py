@@ -159,9 +159,6 @@ class CampaignSpec:
         self.command += " …" * (jobs.count > SHOWN_MOST)
         return self
 
-    def __repr__(self) -> str:
-        return f"<Campaign: {plural(self.count, 'job')}>"
-
     @property
     def names(self) -> tuple[str, ...]:
         """Names of what differs from job to job, in the order of the table's columns.

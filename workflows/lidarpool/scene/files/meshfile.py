@@ -243,14 +243,10 @@ def _tell_axes(
         done, why, other = "states no axes and is taken as Z-up", "", "y"
     else:
         return
-    note = (
+    (axes or (warn if why else lambda note: _log.info(as_python(note))))(
         f'{path.name} {done}; if it lies on its side, give <scene.files.up_axis="{other}">; any '
         "up_axis ends this note"
     )
-    if axes is not None:
-        axes(note)
-    else:
-        _log.log(logging.WARNING if why else logging.INFO, as_python(note))
 
 
 def _lies(content: Content, meshes: Sequence[SceneMesh | SceneInstance]) -> str:
