@@ -166,7 +166,7 @@ def test_what_selects_no_points(key):
 def test_a_notebook_shows_the_columns_and_the_first_points():
     html = Cloud(np.ones((7, 3)), {"range": np.full(7, 0.5), "mine": np.zeros(7)})._repr_html_()
     assert "7 points" in html and html.count("<tr>") == 2 + 5
-    assert "<td>float32 m</td>" in html and "<td>0.5</td>" in html and "<td>mine</td>" in html
+    assert "<td>float32</td>" in html and "<td>0.5</td>" in html and "<td>mine</td>" in html
     assert "0 points" in Cloud(np.empty((0, 3)), {})._repr_html_()
 
 

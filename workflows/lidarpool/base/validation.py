@@ -439,13 +439,11 @@ def shown(value: object) -> str:
 def one_line(thing: Any) -> str:
     """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds."""
     name, kept, left_out = type(thing).__name__, list[str](), False
-    for field in sorted(
-        dataclass_fields(thing), key=lambda one: (one.name != "name", bool(one.kw_only))
-    ):
+    fields = sorted(dataclass_fields(thing), key=lambda f: (f.name != "name", bool(f.kw_only)))
+    for field in fields:
         value, make = getattr(thing, field.name), field.default_factory
         default = field.default if make is MISSING else make()
-        array = isinstance(value, np.ndarray)
-        if not field.repr or value is default or (not array and (value == default) is True):
+        if not field.repr or (not isinstance(value, np.ndarray) and (value == default) is True):
             continue
         text = f"{field.name}={_short(value)}"
         if fits := len(f"{name}({', '.join([*kept, text, '…'])})") <= _LINE:

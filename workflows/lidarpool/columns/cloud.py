@@ -54,16 +54,14 @@ class Shown:
         return f"<{type(self).__name__} of {len(self):,} points: {kept}>"
 
     def _repr_html_(self: CloudLike) -> str:
-        """Table that notebooks show: columns, their types and units, the first points."""
+        """Table that notebooks show: columns, their types, the first points."""
         first = next(self.chunks(SHOWN_POINTS), None)
         values = {} if first is None else first.by_name
-        units = {column.name: column.unit for column in self.table}
-        kinds = [f"{v.dtype} {units.get(name, 'm')}" for name, v in values.items()]
-        rows = "".join(
-            f"<tr>{''.join(f'<td>{escape(str(cell))}</td>' for cell in row)}</tr>"
-            for row in (values, kinds, *zip(*values.values(), strict=True))
-        )
-        return f"<table><caption>{len(self):,} points</caption>{rows}</table>"
+        kinds = [array.dtype for array in values.values()]
+        rows = (values, kinds, *zip(*values.values(), strict=True))
+        cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
+        body = "".join(f"<tr>{row}</tr>" for row in cells)
+        return f"<table><caption>{len(self):,} points</caption>{body}</table>"
 
 
 @dataclass(frozen=True, eq=False, repr=False)
