@@ -28,6 +28,7 @@ import numpy as np
 import pytest
 import yaml
 from distributed.cli import dask_scheduler, dask_worker
+from tests.clusters import import_jobqueue
 
 import lidarpool.run.cluster
 from lidarpool import Cloud, save_cloud
@@ -115,6 +116,8 @@ def test_python_runs(tmp_path, block, in_threads, capsys):
     compile(block.code, block.where, "exec")
     if block.reason:
         return
+    if "dask_jobqueue" in block.code:
+        import_jobqueue()
     folder = tmp_path / "lidarpool-out"
     folder.mkdir()
     one = np.ones(1, np.int32)

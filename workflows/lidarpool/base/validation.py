@@ -8,6 +8,7 @@ import re
 import reprlib
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import MISSING, is_dataclass
 from dataclasses import fields as dataclass_fields
 from datetime import datetime
 from functools import cache, partial, reduce, wraps
@@ -98,6 +99,7 @@ _SCALARS: dict[Any, tuple[Callable[..., Any], Collection[str]]] = {
     NoneType: (core_schema.none_schema, ()),
 }
 _LETTERS = 160  # of a value that is shown
+_LINE, _VALUE = 119, 64  # most characters of all, and of the value of a field
 
 
 def checked(function: Callable[P, R]) -> Callable[P, R]:
@@ -121,7 +123,7 @@ def checked(function: Callable[P, R]) -> Callable[P, R]:
 def checked_fields(cls: C) -> C:
     """Let a dataclass refuse values that do not fit their annotations, also in subclasses.
 
-    In a section of a file it is a section itself, of the same fields.
+    In a section of a file it is a section itself, of the same fields. Its `repr` is one line.
 
     Apply it before `dataclass`, which calls `__post_init__` only if the class has one.
     """
@@ -134,6 +136,12 @@ def checked_fields(cls: C) -> C:
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__pydantic_config__ = STRICT  # type: ignore[attr-defined]
     cls.__get_pydantic_core_schema__ = classmethod(_section)  # type: ignore[attr-defined]
+    if "__repr__" not in vars(cls):
+        cls.__repr__ = one_line  # type: ignore[method-assign, assignment]
+        # Else `dataclass` gives a subclass, another kind of sensor, a repr of all fields.
+        cls.__init_subclass__ = classmethod(  # type: ignore[assignment]
+            lambda kind: setattr(kind, "__repr__", vars(kind).get("__repr__", one_line))
+        )
     return cls
 
 
@@ -449,6 +457,35 @@ def shown(value: object) -> str:
     short.maxlevel = 3  # YAML aliases make deeply nested lists of a few letters
     text = short.repr(value)
     return text if len(text) <= _LETTERS else f"{text[:_LETTERS]}…"
+
+
+def one_line(thing: Any) -> str:
+    """`repr` of a dataclass: the fields that differ from their defaults, as far as a line holds."""
+    name, kept, left_out = type(thing).__name__, list[str](), False
+    fields = sorted(dataclass_fields(thing), key=lambda f: (f.name != "name", bool(f.kw_only)))
+    for field in fields:
+        value, make = getattr(thing, field.name), field.default_factory
+        default = field.default if make is MISSING else make()
+        if not field.repr or (not isinstance(value, np.ndarray) and (value == default) is True):
+            continue
+        text = f"{field.name}={_short(value)}"
+        if fits := len(f"{name}({', '.join([*kept, text, '…'])})") <= _LINE:
+            kept.append(text)
+        left_out |= not fits
+    return f"{name}({', '.join(kept + ['…'] * left_out)})"
+
+
+def _short(value: Any) -> str:
+    if isinstance(value, np.ndarray):
+        return f"{value.dtype}{value.shape}"
+    if is_dataclass(value) and (name := getattr(value, "name", "")):
+        return f"{type(value).__name__}({name!r})"
+    if len(text := repr(value)) <= _VALUE and "\n" not in text:
+        return text
+    if isinstance(value, Collection) and not isinstance(value, (str, bytes)):
+        kinds = {type(one).__name__ for one in value}
+        return f"[{len(value)} {kinds.pop() if len(kinds) == 1 else 'items'}]"
+    return f"{type(value).__name__}(…)" if is_dataclass(value) else f"{text[: _VALUE - 1]}…"
 
 
 def _with_article(name: str) -> str:

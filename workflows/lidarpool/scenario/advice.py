@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..base.words import plural
+from ..base.words import as_scenario, plural
 from ..columns.table import VELOCITY
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.materials import MaterialTable
@@ -29,11 +29,12 @@ def advice(built: Built) -> list[str]:
     and on settings without effect.
     """
     notes, remarks = built.found.notes, built.found.remarks
-    axes = remarks[:1]
+    axes = [f"{remark} (--up-axis AXIS with a mesh file)" for remark in remarks[:1]]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
-    return [*notes, *axes, *likely, *_without_effect(built.scenario)]
+    lines = (*notes, *axes, *likely, *_without_effect(built.scenario))
+    return [as_scenario(line) for line in lines]
 
 
 def _of_size(built: Built) -> str:

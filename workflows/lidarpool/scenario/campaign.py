@@ -16,6 +16,7 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, Field
+from pydantic_core import to_json
 
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
@@ -445,7 +446,7 @@ class _Varied(_JobSource):
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
-            "tables": fingerprint(repr([base.tables for base in self._bases])),
+            "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
 
     def values(self, number: int) -> dict[str, Value]:

@@ -13,7 +13,7 @@ from ..base.arrays import Bools, Floats, Indices
 from ..base.declared import AngleDeg, Triple, about, short, written_as
 from ..base.elementary import arctan2, sin_cos
 from ..base.errors import LidarpoolError
-from ..base.validation import as_array, checked_fields, shown
+from ..base.validation import as_array, checked_fields, one_line, shown
 from ..base.vectors import applied, hypot, length, matmul
 from .spline import knots_of, on_curve
 
@@ -199,6 +199,7 @@ class Stations:
     at: tuple[Pose, ...]
     moves: ClassVar[bool] = False
     duration_ns: ClassVar[float] = np.inf
+    __repr__ = one_line
 
     @property
     def stations(self) -> int:
