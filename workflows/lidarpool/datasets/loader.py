@@ -19,21 +19,20 @@ import numpy as np
 from pydantic import Field
 
 from ..base.archives import open_archive
-from ..base.arrays import AnyArray, Floats
+from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..base.validation import checked
 from ..base.words import did_you_mean
-from ..export.boxes import type_of
+from ..export.boxes import Boxes
 from ..export.format_table import DATA_SETS
 from ..export.formats import Format
 from ..export.pieces import Entry
 from ..export.reading import Reader
 from ..export.sweeps import SWEEPS_FILE, Sweeps
-from ..sensor.trajectory import matrices, quaternions_of
 from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import JobRow, read_table
-from .sweep_data import Sweep, SweepBoxes
+from .sweep_data import Sweep
 
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
 
@@ -156,36 +155,14 @@ class _OpenJob:
         job, sweeps = self.job, self.sweeps
         file = self.place.path(self.reader.file(sweep))
         try:
-            points, columns = self.reader.read(sweep)
+            points = self.reader.read(sweep)
         except Exception as error:  # libraries of five formats have many kinds
             raise _unreadable(file, error) from error
-        pose = sweeps.pose.matrix(sweep)
-        return Sweep(
-            job.name, job.number, job.split, job.values,
-            sweeps.sensors[sweeps.sensor[sweep]], int(sweeps.numbers[sweep]),
-            round(sweeps.begins_ns[sweep]), points, columns, pose,
-            self._boxes(sweep, pose[:3, :3]), (*sweeps.objects, *sweeps.actors),
-        )  # fmt: skip
-
-    def _boxes(self, sweep: int, turn: Floats) -> SweepBoxes:
-        sweeps, kept = self.sweeps, self.boxes
-        there = np.flatnonzero(kept["there"][sweep]) if kept else np.empty(0, np.intp)
-        if not len(there):
-            none = np.empty(0, np.int32)
-            place = np.empty((0, 3))
-            return SweepBoxes((), (), none, place, np.empty((0, 4)), place, none.astype(np.int64))
-        names = tuple(sweeps.actors[actor] for actor in there)
-        turns = turn.T @ matrices(kept["quaternions"][sweep, there])
-        sizes = sweeps.actor_bounds[there, 1] - sweeps.actor_bounds[there, 0]
-        return SweepBoxes(
-            names,
-            tuple(map(type_of, names)),
-            (len(sweeps.objects) + there).astype(np.int32),
-            sweeps.pose.inward(sweep, kept["centres"][sweep, there]),
-            quaternions_of(turns),
-            sizes,
-            kept["points"][sweep, there],
-        )
+        boxes = None
+        if self.boxes:
+            sizes = sweeps.actor_bounds[:, 1] - sweeps.actor_bounds[:, 0]
+            boxes = Boxes(sizes=sizes, **{name: of[sweep] for name, of in self.boxes.items()})
+        return Sweep.of(job, sweeps, sweep, points, boxes)
 
 
 @checked

@@ -1,4 +1,4 @@
-"""A sweep of a data set, and the boxes of actors in it."""
+"""A sweep of a job, as data sets and streams give it."""
 
 from __future__ import annotations
 
@@ -8,35 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from ..base.arrays import AnyArray, Floats, Floats32, Ints, Ints32
-from ..sensor.trajectory import matrices
-from .job_table import Value
-
-
-@dataclass(frozen=True, eq=False)
-class SweepBoxes:
-    """Boxes of the actors that are in the scene during a sweep, (k) of them.
-
-    Each is at its pose at the mean time of its points, or at the start of the sweep if it has none.
-    """
-
-    names: tuple[str, ...]
-    types: tuple[str, ...]  # "Car" of "Car 1"
-    objects: Ints32  # (k,): their numbers in the column `object`
-    centres: Floats  # (k, 3): metres, in the sensor's axes
-    quaternions: Floats  # (k, 4): x, y, z, w of the rotation from the box's axes to the sensor's
-    sizes: Floats  # (k, 3): length, width and height, metres
-    points: Ints  # (k,): how many points of the sweep are the actor's
-
-    def __len__(self) -> int:
-        return len(self.names)
-
-    @property
-    def yaw(self) -> Floats:
-        """float64 (k,): angles in radians about the sensor's z axis, from x to y."""
-        turns = matrices(self.quaternions)
-        angles: Floats = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
-        return angles
+from ..base.arrays import AnyArray, Floats, Floats32, Ints32
+from ..export.boxes import Boxes, SweepBoxes
+from ..export.reading import PointColumns
+from ..export.sweeps import Sweeps
+from .job_table import JobRow, Value
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -59,6 +35,18 @@ class Sweep:
     pose: Floats  # (4, 4): from the sensor's axes to the world's
     boxes: SweepBoxes
     object_names: tuple[str, ...]  # what the column `object` counts
+
+    @classmethod
+    def of(
+        cls, job: JobRow, sweeps: Sweeps, number: int, points: PointColumns, boxes: Boxes | None
+    ) -> Sweep:
+        """Make the sweep of a number among all of a job, with boxes if there are actors."""
+        return cls(
+            job.name, job.number, job.split, job.values,
+            sweeps.sensors[sweeps.sensor[number]], int(sweeps.numbers[number]),
+            round(sweeps.begins_ns[number]), *points, sweeps.pose.matrix(number),
+            SweepBoxes.of(sweeps, number, boxes), (*sweeps.objects, *sweeps.actors),
+        )  # fmt: skip
 
     def __len__(self) -> int:
         return len(self.points)

@@ -57,12 +57,11 @@ class TorchSweeps(torch.utils.data.IterableDataset):
 def tensors(sweep: Sweep) -> dict[str, Any]:
     """Make a dict of tensors, as `SavedSweeps.torch` describes it."""
     boxes = sweep.boxes
-    rows = np.column_stack([boxes.centres, boxes.sizes, boxes.yaw]).astype(np.float32)
     arrays = {
         name: array.astype(np.int64) if array.dtype.kind in "iu" else array
         for name, array in sweep.columns.items()
     }
-    arrays |= {"points": sweep.points, "pose": sweep.pose, "boxes": rows}
+    arrays |= {"points": sweep.points, "pose": sweep.pose, "boxes": boxes.rows}
     arrays["box_objects"] = boxes.objects.astype(np.int64)
     return {
         **{name: torch.from_numpy(np.ascontiguousarray(array)) for name, array in arrays.items()},

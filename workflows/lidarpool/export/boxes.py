@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..base.arrays import Bools, Floats, Ints
+from ..base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from ..columns.cloud import Cloud
-from ..sensor.trajectory import matrices
+from ..sensor.trajectory import matrices, quaternions_of
 from .sweeps import Sweeps
 
 
@@ -54,6 +54,57 @@ class Boxes:
         return cls(
             place + middle, turn, high - low, counts, sweeps.actor_there[:, sweep] | (counts > 0)
         )
+
+
+@dataclass(frozen=True, eq=False)
+class SweepBoxes:
+    """Boxes of the actors that are in the scene during a sweep, (k) of them.
+
+    Each is at its pose at the mean time of its points, or at the start of the sweep if it has none.
+    """
+
+    names: tuple[str, ...]
+    types: tuple[str, ...]  # "Car" of "Car 1"
+    objects: Ints32  # (k,): their numbers in the column `object`
+    centres: Floats  # (k, 3): metres, in the sensor's axes
+    quaternions: Floats  # (k, 4): x, y, z, w of the rotation from the box's axes to the sensor's
+    sizes: Floats  # (k, 3): length, width and height, metres
+    points: Ints  # (k,): how many points of the sweep are the actor's
+
+    @classmethod
+    def of(cls, sweeps: Sweeps, sweep: int, boxes: Boxes | None) -> SweepBoxes:
+        """Take those of a sweep's boxes that are in the scene."""
+        there = np.empty(0, np.intp) if boxes is None else np.flatnonzero(boxes.there)
+        if boxes is None or not len(there):
+            none = np.empty(0, np.int32)
+            place = np.empty((0, 3))
+            return cls((), (), none, place, np.empty((0, 4)), place, none.astype(np.int64))
+        names = tuple(sweeps.actors[actor] for actor in there)
+        turn = matrices(sweeps.pose.quaternions[sweep, None])[0]
+        return cls(
+            names,
+            tuple(map(type_of, names)),
+            (len(sweeps.objects) + there).astype(np.int32),
+            sweeps.pose.inward(sweep, boxes.centres[there]),
+            quaternions_of(turn.T @ matrices(boxes.quaternions[there])),
+            boxes.sizes[there],
+            boxes.points[there],
+        )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    @property
+    def yaw(self) -> Floats:
+        """float64 (k,): angles in radians about the sensor's z axis, from x to y."""
+        turns = matrices(self.quaternions)
+        angles: Floats = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
+        return angles
+
+    @property
+    def rows(self) -> Floats32:
+        """float32 (k, 7): centre, length, width, height, yaw."""
+        return np.column_stack([self.centres, self.sizes, self.yaw]).astype(np.float32)
 
 
 def type_of(name: str) -> str:
