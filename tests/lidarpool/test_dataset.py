@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import io
 import json
 import multiprocessing
 import pickle
+import tarfile
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
@@ -261,3 +263,52 @@ def test_what_cannot_be_written_is_told_in_a_line(job, sweeps, tmp_path, monkeyp
     monkeypatch.setattr("lidarpool.export.formats.find_spec", lambda name: None)
     with pytest.raises(LidarpoolError, match=r'pip install "lidarpool\[parquet\]"'):
         DataSet(place, "parquet").write_job(JobRow(0, "0"), job(0), sweeps)
+
+
+def test_webdataset_has_a_sample_for_each_sweep(scene, job, sweeps, tmp_path, monkeypatch):
+    monkeypatch.setattr("lidarpool.export.webdataset.SHARD_MOST", 60_000)
+    row = JobRow(7, "hall.b", "train", {"rain": 0.5})
+    places = [Storage.at(tmp_path / "here"), Storage.at((tmp_path / "there").as_uri())]
+    for place in places:  # as at a URL: several ranges are written at a time
+        data = DataSet(place, "webdataset")
+        data.write_job(row, job(7), sweeps)
+        data.finish([row])
+    written = files_of(tmp_path / "here")
+    assert written == files_of(tmp_path / "there")
+    tars = sorted((tmp_path / "here/shards/train").iterdir())
+    assert len(tars) > 1 and tars[0].name == "hall.b-000000.tar"
+    samples: dict[str, dict[str, bytes]] = {}
+    for path in tars:
+        assert path.stat().st_size <= 60_000 + tarfile.RECORDSIZE
+        with tarfile.open(path) as tar:
+            for member in tar:
+                assert (member.mtime, member.uid, member.uname) == (0, 0, "")
+                folder, _, name = member.name.rpartition("/")
+                key, _, ending = name.partition(".")
+                assert ending not in samples.setdefault(f"{folder}/{key}", {})
+                samples[f"{folder}/{key}"][ending] = tar.extractfile(member).read()
+    names = [f"hall.b/{sensor}-{n:06}" for sensor in ("front", "rear_left") for n in range(TURNS)]
+    assert [*samples] == names
+    cloud = job(7)
+    for number, sample in enumerate(samples.values()):
+        arrays = {k: np.load(io.BytesIO(v)) for k, v in sample.items() if k.endswith(".npy")}
+        points = cloud[cloud.scan // SCANS == number]
+        back = arrays["points.npy"] @ arrays["pose.npy"][:3, :3].T + arrays["pose.npy"][:3, 3]
+        np.testing.assert_allclose(back, points.positions, atol=2e-5)
+        for column in cloud.table:
+            np.testing.assert_array_equal(arrays[f"{column.name}.npy"], points[column.name])
+        about = json.loads(sample["json"])
+        assert (about["values"], about["split"]) == ({"rain": 0.5}, "train")
+        assert len(arrays["boxes.npy"]) == len(about["box_names"]) == len(about["box_points"])
+
+
+def test_webdataset_is_read_by_its_own_library(written, sweeps, job):
+    wds = pytest.importorskip("webdataset")
+    _, place = written("webdataset")
+    shards = sorted(map(str, (place / "shards").glob("*.tar")))
+    samples = list(wds.WebDataset(shards, shardshuffle=False).decode())
+    assert [sample["json"]["job"] for sample in samples] == [
+        name for name in ("000", "001", "007") for _ in range(len(sweeps))
+    ]
+    points = [len(sample["points.npy"]) for sample in samples[: len(sweeps)]]
+    assert points == np.bincount(job(0).scan // SCANS, minlength=len(sweeps)).tolist()

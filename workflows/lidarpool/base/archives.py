@@ -9,7 +9,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
@@ -78,16 +78,21 @@ def read_array(archive: zipfile.ZipFile, name: str, allowance: Allowance | None 
     if archive.getinfo(name).compress_type not in _LIMITED:
         raise ValueError(f"{name} is compressed by a method other than Deflate")
     with archive.open(name) as file:
-        length = int.from_bytes(file.read(10)[8:], "little")
-        if (header := _HEADER.fullmatch(file.read(length))) is None:
-            raise ValueError(f"{name} is not an array of numbers")
-        kind = np.dtype(header[1].decode())
-        shape = tuple(map(int, re.findall(rb"\d+", header[3])))
-        size = math.prod(shape) * kind.itemsize
-        if allowance is not None:
-            allowance.take(size)
-        data = bytearray(file.read(size))
-        if file.read(1):
-            raise ValueError(f"{name} is longer than its array")
+        return read_npy(file, name, allowance)
+
+
+def read_npy(file: IO[bytes], name: str, allowance: Allowance | None = None) -> AnyArray:
+    """Read an array of numbers from a file of NumPy that has no more; as `read_array`."""
+    length = int.from_bytes(file.read(10)[8:], "little")
+    if (header := _HEADER.fullmatch(file.read(length))) is None:
+        raise ValueError(f"{name} is not an array of numbers")
+    kind = np.dtype(header[1].decode())
+    shape = tuple(map(int, re.findall(rb"\d+", header[3])))
+    size = math.prod(shape) * kind.itemsize
+    if allowance is not None:
+        allowance.take(size)
+    data = bytearray(file.read(size))
+    if file.read(1):
+        raise ValueError(f"{name} is longer than its array")
     array = np.frombuffer(data, kind)
     return array.reshape(shape[::-1]).T if header[2] == b"True" else array.reshape(shape)

@@ -228,12 +228,14 @@ class Storage:
         if self.durable:
             flush(target.parent)
 
-    def read(self, name: str) -> bytes:
-        """Read a file."""
+    def read(self, name: str, first: int = 0, stop: int | None = None) -> bytes:
+        """Read a file, or its bytes from `first` to `stop`; fewer if it ends before."""
         if self.is_local:
-            return self.local(name).read_bytes()
+            with self.local(name).open("rb", buffering=0 if stop else -1) as file:
+                file.seek(first)
+                return file.read(-1 if stop is None else stop - first)
         with self._remote() as (system, folder):
-            return bytes(system.cat_file(f"{folder}/{name}"))
+            return bytes(system.cat_file(f"{folder}/{name}", first or None, stop))
 
     def checksum(self, name: str) -> list[int]:
         """Bytes of a file and their CRC-32, read a piece at a time."""

@@ -77,6 +77,7 @@ class DataSet:
 
     - kitti: `sequences/07` of job 7, of further sensors `sequences/07_NAME`
     - nuscenes: a scene for each job; `finish` writes the tables
+    - webdataset: `shards/SPLIT/NAME-000000.tar`, and `offsets/NAME.npz` for single sweeps
     - mcap: `bags/NAME.mcap`
     - parquet: `points/job=7`, one table of Hive's partitions
     - images: `images/NAME/SENSOR/000000.npz`
@@ -92,7 +93,7 @@ class DataSet:
     place
         A folder or URL. Without `durable` a power failure may lose jobs that were written.
     format
-        kitti, nuscenes, mcap, parquet, images or folder.
+        kitti, nuscenes, webdataset, mcap, parquet, images or folder.
     layout
         Of points in mcap: velodyne, autoware, ouster or images.
     made_with
@@ -100,7 +101,7 @@ class DataSet:
     """
 
     place: Storage
-    format: Literal["kitti", "nuscenes", "mcap", "parquet", "images", "folder"]
+    format: Literal[tuple(DATA_SETS)]  # type: ignore[valid-type]
     layout: Literal[tuple(LAYOUTS)] = "velodyne"  # type: ignore[valid-type]
     made_with: Mapping[str, Any] = field(default_factory=dict)
 
@@ -140,7 +141,8 @@ class DataSet:
             If a package or column is missing, the cloud is not of these sweeps, or the place
             cannot be written to.
         """
-        name, one, entry = row.name, self._of_jobs, Entry(row.number, row.name)
+        name, one = row.name, self._of_jobs
+        entry = Entry(row.number, name, row.split, row.values)
         one.check_installed()
         tally = Tally.of(cloud)
         row = replace(row, points=tally.points, sha256=tally.sha256, classes=tally.classes)

@@ -147,7 +147,7 @@ class _OpenJob:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(place.path(name), partial(place.read, name)) as arrays:
                 self.boxes = arrays
-        entry = Entry(job.number, job.name)
+        entry = Entry(job.number, job.name, job.split)
         self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
 
     def read(self, sweep: int) -> Sweep:

@@ -65,6 +65,7 @@ _KITTI = (
 _NUSCENES = (
     r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png"
 )
+_SHARDS = r"shards/([^/]+/)?[^/]+\.tar|offsets/[^/]+\.npz"
 _PARTS = r"part-\d+\.parquet"
 
 FORMATS = {
@@ -90,6 +91,10 @@ FORMATS = {
     "nuscenes": FormatRow(
         "nuscenes", "nuscenes", True, (), ("scan", "object", *_RINGS), _RINGS, inside=_NUSCENES,
         data_set="nuscenes", boxes=True,
+    ),
+    "webdataset": FormatRow(
+        "webdataset", "webdataset", True, (), ("scan", *_LABELS), inside=_SHARDS,
+        data_set="webdataset", boxes=True,
     ),
     "mcap": FormatRow(
         "cloud.mcap", "ros", *_BAG, data_set="mcap", of_job="bags/{name}.mcap"

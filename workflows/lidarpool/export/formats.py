@@ -191,7 +191,7 @@ def save_cloud(
         Its folder must exist. An existing file is replaced, a folder is not.
     format
         Such as "laz", and for folders of many files "parquet", "pcd", "images", "kitti",
-        "nuscenes" or "rosbag2".
+        "nuscenes", "webdataset" or "rosbag2".
     layout
         Layout of points in mcap and rosbag2: velodyne, autoware, ouster, or images, which is
         velodyne with range images.

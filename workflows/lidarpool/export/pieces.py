@@ -31,10 +31,15 @@ WrittenRange = tuple[int, list[Any]]
 
 @dataclass(frozen=True)
 class Entry:
-    """A job in a data set of many: its number and name make its files differ from others'."""
+    """A job in a data set of many: its number and name make its files differ from others'.
+
+    `values` are those that were varied, by name.
+    """
 
     number: int
     name: str
+    split: str = ""
+    values: Mapping[str, Any] = field(default_factory=dict)
 
     def place(self, format: str) -> str:  # noqa: A002
         """Name of its file or folder in data sets whose jobs are written in a format."""

@@ -74,8 +74,8 @@ class CampaignSpec:
     seed
         Another seed gives other random numbers.
     keep
-        Format of the data set: "kitti", "nuscenes", "mcap", "parquet", "images" or "folder"; or
-        ``{"format": "mcap", "layout": "ouster"}``.
+        Format of the data set: "kitti", "nuscenes", "webdataset", "mcap", "parquet", "images" or
+        "folder"; or ``{"format": "mcap", "layout": "ouster"}``.
     splits
         {name: share of the jobs}; they add up to 1.
     license, title

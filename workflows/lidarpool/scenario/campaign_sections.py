@@ -355,7 +355,7 @@ class Keep:
 
     format: Annotated[
         Literal[tuple(DATA_SETS)],  # type: ignore[valid-type]
-        about("kitti, nuscenes, mcap, parquet, images; folder: a cloud for each job"),
+        about("kitti, nuscenes, webdataset, mcap, parquet, images; folder: a cloud a job"),
     ] = "kitti"
     layout: Annotated[
         Literal[tuple(LAYOUTS)],  # type: ignore[valid-type]

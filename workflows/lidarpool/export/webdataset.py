@@ -1,0 +1,163 @@
+"""WebDataset: tar files of sweeps, which are read from end to end, or one sweep at a time."""
+
+from __future__ import annotations
+
+import io
+import json
+import tarfile
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property, partial
+from typing import Any
+
+import numpy as np
+
+from ..base.archives import open_archive, packed, read_npy
+from ..base.arrays import AnyArray, Ints
+from ..base.errors import LidarpoolError
+from ..base.storage import Storage
+from ..columns.cloud import Cloud, CloudLike
+from . import pieces, reading
+from .boxes import Boxes, SweepBoxes
+from .pieces import Entry, PieceRange, WrittenRange
+from .sweeps import Sweeps, plain_names
+
+SHARD_MOST = 1_000_000_000  # bytes of a tar file, unless a single sweep has more
+_OWN = ("points", "pose", "boxes")  # arrays that are no columns
+
+
+class Pieces(pieces.Pieces):
+    """A tar file for each hundred sweeps or million points, such as `shards/000000.tar`.
+
+    Each sweep is a sample, SENSOR-000000, with `points.npy` (float32 n x 3, metres in the sensor's
+    axes when the sweep began), a file for each column, such as `intensity.npy`, `pose.npy` (4 x 4),
+    from these axes to the world's, `boxes.npy` (float32 k x 7: centre, length, width, height and
+    yaw in the sensor's axes), and `json`, which says what the sweep and the boxes are.
+
+    In a data set, the files are `shards/SPLIT/JOB-000000.tar`, the samples JOB/SENSOR-000000, and
+    `json` has what was varied, too. `offsets/JOB.npz` says where each sweep is, int64 (sweeps, 3):
+    the first sweep of its tar file, the sample's first byte there, and its end.
+
+    Aizman et al., High performance I/O for large scale deep learning, 2019.
+    """
+
+    def __init__(self, cloud: CloudLike, sweeps: Sweeps, entry: Entry | None = None) -> None:
+        super().__init__(cloud, sweeps, entry)
+        self.folders = ["shards"]
+        self.names = plain_names(name or "lidar" for name in sweeps.sensors)
+        self.offsets = np.zeros((len(sweeps), 3), np.int64)
+        if clash := [column.name for column in cloud.table if column.name in _OWN]:
+            raise LidarpoolError(f"WebDataset has other {clash[0]!r}: rename the column.")
+
+    def spans(self, parts: int = 1) -> list[PieceRange]:
+        """Divide all sweeps into ranges, which begin a tar file each, wherever they are written."""
+        return super().spans()
+
+    def write(self, place: Storage, first: int, stop: int) -> WrittenRange:
+        """Write the tar files of some ranges, one in memory at a time; OSError if that fails."""
+        count, made = 0, []
+        for begin, end in self.spans():
+            tar, start = io.BytesIO(), begin
+            inside = self.read(begin, end) if first <= begin < stop else ()
+            for number, points in enumerate(inside, begin):
+                boxes = Boxes.of(self.sweeps, number, points) if self.sweeps.actors else None
+                sample = b"".join(self._members(number, points, boxes))
+                if tar.tell() and tar.tell() + len(sample) > SHARD_MOST:
+                    self._put(place, start, tar)
+                    tar, start = io.BytesIO(), number
+                self.offsets[number] = start, tar.tell(), tar.tell() + len(sample)
+                tar.write(sample)
+                count += len(points)
+                made.append(boxes)
+            if tar.tell():
+                self._put(place, start, tar)
+        return count, made
+
+    def others(self, made: Sequence[Boxes | None]) -> dict[str, bytes]:
+        """Return where the sweeps of a job are."""
+        return {} if self.entry is None else {_index(self.entry): packed({"at": self.offsets})}
+
+    def _put(self, place: Storage, start: int, tar: io.BytesIO) -> None:
+        tar.write(bytes(tarfile.RECORDSIZE - tar.tell() % tarfile.RECORDSIZE))  # two blocks end it
+        name = _shard(self.entry, start)
+        place.prepare(name.rpartition("/")[0])
+        place.write(name, tar.getbuffer())
+
+    def _members(self, number: int, points: Cloud, boxes: Boxes | None) -> Iterator[bytes]:
+        """Yield the files of a sample, each behind its header."""
+        sweeps, entry = self.sweeps, self.entry
+        there = SweepBoxes.of(sweeps, number, boxes)
+        arrays = {
+            "points": sweeps.in_sensor(number, points.positions).astype(np.float32),
+            **{column.name: points[column.name] for column in self.cloud.table},
+            "pose": sweeps.pose.matrix(number),
+            "boxes": there.rows,
+        }
+        about: dict[str, Any] = {}
+        if entry is not None:
+            about = {"job": entry.name, "job_number": entry.number, "split": entry.split}
+            about["values"] = dict(entry.values)
+        about |= {
+            "sensor": sweeps.sensors[sweeps.sensor[number]],
+            "number": int(sweeps.numbers[number]),
+            "time_ns": round(sweeps.begins_ns[number]),
+            "box_names": there.names,
+            "box_types": there.types,
+            "box_objects": there.objects.tolist(),
+            "box_points": there.points.tolist(),
+        }
+        files: Mapping[str, bytes] = {f"{name}.npy": _npy(array) for name, array in arrays.items()}
+        key = f"{self.names[sweeps.sensor[number]]}-{sweeps.numbers[number]:06}"
+        key = key if entry is None else f"{entry.name}/{key}"
+        for name, data in {**files, "json": json.dumps(about).encode()}.items():
+            head = tarfile.TarInfo(f"{key}.{name}")  # of 1970, and of nobody
+            head.size = len(data)
+            yield head.tobuf() + data + bytes(-len(data) % tarfile.BLOCKSIZE)
+
+
+class Reader(reading.Reader):
+    """Reads sweeps of a data set: all columns of each point."""
+
+    @cached_property
+    def _offsets(self) -> Ints:
+        name = _index(self.entry)
+        with open_archive(self.place.path(name), partial(self.place.read, name)) as arrays:
+            return arrays["at"]
+
+    def file(self, sweep: int) -> str:
+        """Return the name of the tar file."""
+        return _shard(self.entry, int(self._offsets[sweep, 0]))
+
+    def read(self, sweep: int) -> reading.PointColumns:
+        """Return the points of a sweep, of which alone bytes are read."""
+        _, first, stop = self._offsets[sweep].tolist()
+        sample = self.place.read(self.file(sweep), first, stop)
+        if len(sample) < stop - first:
+            raise ValueError(f"it ends {stop - first - len(sample)} bytes before the sweep does")
+        data = io.BytesIO(sample)
+        arrays: dict[str, AnyArray] = {}
+        with tarfile.open(fileobj=data, mode="r:") as tar:
+            for member in tar:
+                name = member.name.rpartition("/")[2].partition(".")[2]
+                if name.endswith(".npy") and name != "boxes.npy":
+                    data.seek(member.offset_data)
+                    part = io.BytesIO(data.read(member.size))
+                    arrays[name.removesuffix(".npy")] = read_npy(part, name)
+        del arrays["pose"]
+        return arrays.pop("points"), arrays
+
+
+def _npy(array: AnyArray) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.ascontiguousarray(array), (1, 0), allow_pickle=False)
+    return file.getvalue()
+
+
+def _shard(entry: Entry | None, start: int) -> str:
+    """Name of the tar file that begins with a sweep."""
+    if entry is None:
+        return f"shards/{start:06}.tar"
+    return "/".join(filter(None, ("shards", entry.split, f"{entry.name}-{start:06}.tar")))
+
+
+def _index(entry: Entry) -> str:
+    return f"offsets/{entry.name}.npz"
