@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Annotated
 
 from distributed import Client
+from pydantic import Field
 
 from ..base.declared import declared
 from ..base.storage import Storage
@@ -22,6 +24,7 @@ from ..run.options import RunOptions
 from ..run.progress import Progress, Screen
 from ..run.run_result import CampaignRun, RunResult
 from ..run.store import RUN_FOLDER
+from ..run.stream import SweepStream
 from ..scenario import campaign as described
 from ..scenario.build import Job
 from ..scene.scene import Scene
@@ -240,3 +243,59 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
         with page_of(self, live) as page:
             output = DataSetOutput(place, self)
             return Conductor(self, options, output, Screen(on_progress), page)()
+
+    @checked
+    def stream(
+        self,
+        client: Client | None = None,
+        ahead: Annotated[int, Field(ge=1)] = 8,
+        *,
+        split: str | Sequence[str] | None = None,
+        backend: str | None = None,
+        gpu_workers: int | None = None,
+        wait_s: float = WAIT_S,
+        patience_s: float = PATIENCE_S,
+    ) -> SweepStream:
+        """Stream the sweeps of the jobs while they are cast, without a data set.
+
+        The sweeps are those of a data set of the campaign, with all columns, in the order of jobs,
+        sensors and time. The points go from the workers to this process, past the scheduler and
+        without files. If a worker dies, its sweeps are cast again. A job that fails is left out, and
+        the log says why.
+
+        Parameters
+        ----------
+        client
+            Client of a cluster whose workers declare the resource GPU. Without one, each iteration
+            starts a local cluster and stops it in the end.
+        ahead
+            Most sweeps that are being cast or wait to be read: it bounds the memory, and says how
+            many casting workers have something to do.
+        split
+            Only the jobs of this split, or these.
+        backend, gpu_workers
+            As of `run`.
+        wait_s, patience_s
+            As for `simulate`.
+
+        Returns
+        -------
+        SweepStream
+            It begins when a loop begins, and anew with each. Its `torch` gives a dataset for
+            PyTorch.
+
+        Raises
+        ------
+        LidarpoolError
+            If there is no such split; while it is read, if the cluster lacks something, is lost,
+            or has no casting worker for `patience_s`.
+
+        Examples
+        --------
+        >>> for sweep in Campaign.load("campaign.yaml").stream():    # doctest: +SKIP
+        ...     print(sweep.job, sweep.points.shape)
+        """
+        options = RunOptions(
+            client=client, gpu_workers=gpu_workers, wait_s=wait_s, patience_s=patience_s
+        ).with_pool(self.pool, backend)
+        return SweepStream(self, self.of_splits(split), ahead, options)

@@ -1,15 +1,17 @@
-"""Sweeps for PyTorch; imported by `SavedSweeps.torch` alone, since torch may not be installed."""
+"""Sweeps for PyTorch; imported by `torch()` of sweeps alone, since torch may not be installed."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Generator, Iterator
+from contextlib import closing
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 import torch
 import torch.distributed
 import torch.utils.data
 
+from ..base.errors import LidarpoolError
 from .sweep_data import Sweep
 
 if TYPE_CHECKING:
@@ -30,20 +32,11 @@ class TorchSweeps(torch.utils.data.IterableDataset):
 
     def __getstate__(self) -> dict[str, Any]:
         # Workers that are spawned do not know their rank; this is called as they start.
-        return self.__dict__ | {"_rank": self._ranks()}
-
-    def _ranks(self) -> tuple[int, int]:
-        """Rank of this process, and how many there are."""
-        if self._rank is not None:
-            return self._rank
-        there = torch.distributed
-        if not (there.is_available() and there.is_initialized()):
-            return 0, 1
-        return there.get_rank(), there.get_world_size()
+        return self.__dict__ | {"_rank": self._rank or _ranks()}
 
     def _share(self) -> range:
         """Return the indices of the sweeps of this rank."""
-        rank, ranks = self._ranks()
+        rank, ranks = self._rank or _ranks()
         count = len(self.sweeps)
         return range(rank, count - count % ranks if self.even else count, ranks)
 
@@ -52,6 +45,40 @@ class TorchSweeps(torch.utils.data.IterableDataset):
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
         for index in self._share()[first::step]:
             yield self.transform(self.sweeps[index])
+
+
+class Stream(Protocol):
+    """Sweeps that ranks share; a generator gives them."""
+
+    def __iter__(self) -> Generator[Sweep]:
+        """Give all sweeps, or those of the rank."""
+
+    def of_rank(self, rank: int, ranks: int) -> Stream:
+        """Return the stream of a rank."""
+
+
+class TorchStream(torch.utils.data.IterableDataset):
+    """Items made of the sweeps of a stream, whose jobs are divided between ranks."""
+
+    def __init__(self, stream: Stream, transform: Callable[[Sweep], Any] | None) -> None:
+        self.stream, self.transform = stream, transform or tensors
+
+    def __iter__(self) -> Iterator[Any]:
+        if torch.utils.data.get_worker_info() is not None:
+            raise LidarpoolError(
+                "A stream is read by the process that trains, since the cluster works ahead: give "
+                "the DataLoader num_workers=0."
+            )
+        with closing(iter(self.stream.of_rank(*_ranks()))) as sweeps:
+            yield from map(self.transform, sweeps)
+
+
+def _ranks() -> tuple[int, int]:
+    """Rank of this process, and how many there are."""
+    there = torch.distributed
+    if not (there.is_available() and there.is_initialized()):
+        return 0, 1
+    return there.get_rank(), there.get_world_size()
 
 
 def tensors(sweep: Sweep) -> dict[str, Any]:

@@ -86,11 +86,7 @@ class RunDriver:
         is committed. Frames read their points with `read`. `on_parts` is called with parts that
         were committed.
         """
-        try:
-            packed = cloudpickle.dumps(survey, protocol=5)
-            scene_name = self.workers.add(number, scene, packed)
-        except _UNSENT as error:  # of pickling what a user has defined
-            raise JobError(f"The survey cannot be sent to the workers: {error}") from error
+        packed, scene_name = send_job(self.workers, number, scene, survey)
         parts = self._db.job(number, survey.scan_count)
         parts.has_frames = on_frame is not None
         job = self.jobs[number] = JobState(
@@ -306,3 +302,17 @@ class RunDriver:
                 self.book.add(record)
         finally:
             self.workers.release()
+
+
+def send_job(
+    workers: CastingWorkers, number: int, scene: Scene, survey: Survey
+) -> tuple[bytes, str]:
+    """Let workers cast a job; returns its survey, pickled, and what jobs of its scene share.
+
+    JobError if it cannot be sent to workers.
+    """
+    try:
+        packed: bytes = cloudpickle.dumps(survey, protocol=5)
+        return packed, workers.add(number, scene, packed)
+    except _UNSENT as error:  # of pickling what a user has defined
+        raise JobError(f"The survey cannot be sent to the workers: {error}") from error

@@ -133,7 +133,7 @@ def _survey_pool(client: Client, needed: Mapping[str, int], writing: bool) -> Po
         raise LidarpoolError(str(error)) from error
     purpose = {
         GPU: "stage 2 casts the rays",
-        LIDAR: f"{GENERATE}, {SORT} and {needed[LIDAR] - 2 - writing} x {COLLECT}"
+        LIDAR: f"{GENERATE}, {SORT} and {needed.get(LIDAR, 0) - 2 - writing} x {COLLECT}"
         f"{', and writing jobs of a campaign' if writing else ''}",
         OTHER: "path planning; or leave it out with --no-plan",
     }

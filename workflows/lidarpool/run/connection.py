@@ -85,15 +85,17 @@ def local_cluster(
     """Start a Dask cluster on this machine, divided into GPU, LIDAR and OTHER.
 
     Workers of GPU and OTHER have one thread each; their default numbers are `default_workers` of
-    this machine, and OTHER may have none. The one LIDAR worker has `lidar_slots` threads and slots.
+    this machine, and OTHER may have none. The one LIDAR worker has `lidar_slots` threads and slots;
+    with 0 there is none.
     Further options, and the errors, are those of `poolpart.local_cluster`.
     """
     defaults = default_workers(CPU_COUNT, len(visible_gpus()))
     gpu_workers = defaults[GPU] if gpu_workers is None else gpu_workers
     other_workers = defaults[OTHER] if other_workers is None else other_workers
     check_count("gpu_workers", gpu_workers)
+    lidar = (min(1, lidar_slots), max(1, lidar_slots))
     return poolpart.local_cluster(
-        {GPU: (gpu_workers, 1), LIDAR: (1, lidar_slots), OTHER: (other_workers, 1)}, **options
+        {GPU: (gpu_workers, 1), LIDAR: lidar, OTHER: (other_workers, 1)}, **options
     )
 
 
@@ -119,7 +121,7 @@ def local_client(
             closing(
                 local_cluster(
                     gpu_workers=gpu_workers,
-                    lidar_slots=needed[LIDAR],
+                    lidar_slots=needed.get(LIDAR, 0),
                     other_workers=other_workers if OTHER in needed or other_workers else 0,
                     security=tls,
                     dashboard_port=None,  # is never printed, and Bokeh takes half a second
