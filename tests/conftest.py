@@ -4,8 +4,10 @@ import logging
 import os
 import signal
 import sys
+import types
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -85,3 +87,22 @@ def _as_before(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None
     for number, handler in _HANDLERS.items():
         if signal.getsignal(number) is not handler:
             signal.signal(number, handler)
+
+
+@pytest.fixture
+def torch(monkeypatch: pytest.MonkeyPatch) -> Iterator[types.ModuleType]:
+    """A module in place of PyTorch, whose tensors are arrays."""
+    played: Any = types.ModuleType("torch")
+    played.__spec__ = types.SimpleNamespace()
+    played.from_numpy = lambda array: array
+    played.utils = types.ModuleType("torch.utils")
+    played.utils.data = types.ModuleType("torch.utils.data")
+    played.utils.data.IterableDataset = object
+    played.utils.data.get_worker_info = lambda: None
+    played.distributed = types.ModuleType("torch.distributed")
+    played.distributed.is_available = played.distributed.is_initialized = lambda: False
+    for module in (played, played.utils, played.utils.data, played.distributed):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.delitem(sys.modules, "lidarpool.datasets.torch_sweeps", raising=False)
+    yield played
+    sys.modules.pop("lidarpool.datasets.torch_sweeps", None)

@@ -6,7 +6,6 @@ import json
 import multiprocessing
 import pickle
 import shutil
-import sys
 import threading
 import types
 from collections.abc import Callable
@@ -240,25 +239,6 @@ def test_threads_and_forks_read_beside_each_other(written, name):
 
 
 # -- PyTorch ---------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def torch(monkeypatch) -> types.ModuleType:
-    """A module in place of PyTorch, whose tensors are arrays."""
-    played: Any = types.ModuleType("torch")
-    played.__spec__ = types.SimpleNamespace()
-    played.from_numpy = lambda array: array
-    played.utils = types.ModuleType("torch.utils")
-    played.utils.data = types.ModuleType("torch.utils.data")
-    played.utils.data.IterableDataset = object
-    played.utils.data.get_worker_info = lambda: None
-    played.distributed = types.ModuleType("torch.distributed")
-    played.distributed.is_available = played.distributed.is_initialized = lambda: False
-    for module in (played, played.utils, played.utils.data, played.distributed):
-        monkeypatch.setitem(sys.modules, module.__name__, module)
-    monkeypatch.delitem(sys.modules, "lidarpool.datasets.torch_sweeps", raising=False)
-    yield played
-    sys.modules.pop("lidarpool.datasets.torch_sweeps", None)
 
 
 def test_torch_gets_tensors(written, torch):

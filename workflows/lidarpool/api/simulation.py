@@ -260,8 +260,8 @@ class Campaign(described.CampaignSpec):  # noqa: D101 - as there
 
         The sweeps are those of a data set of the campaign, with all columns, in the order of jobs,
         sensors and time. The points go from the workers to this process, past the scheduler and
-        without files. If a worker dies, its sweeps are cast again. A job that fails is left out, and
-        the log says why.
+        without files. If a worker dies, its sweeps are cast again. A job that fails is left out,
+        and the log says why.
 
         Parameters
         ----------

@@ -151,7 +151,7 @@ class _Streamed:
 class _Collector:
     """Plays stage 4 for a dispatcher: keeps the orders until the columns are fetched."""
 
-    collectors: Mapping[str, str] = {"reader": ""}  # noqa: RUF012 - is never changed
+    collectors: Mapping[str, str] = {"reader": ""}
     collector_count = 1
 
     def __init__(self) -> None:

@@ -1,0 +1,192 @@
+"""Campaigns that are streamed: sweeps from the workers to the reader, without files."""
+
+from __future__ import annotations
+
+import os
+import types
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import numpy as np
+import psutil
+import pytest
+from distributed import Client
+from tests.clusters import thread_cluster
+from tests.daemons import wait_until
+from tests.drives import SCANS, TURNS, the_scene
+
+import lidarpool as lp
+from lidarpool import Campaign, Job, LidarpoolError, Mounted, Noise, Pose, Sensor, Survey, Sweep
+from lidarpool.base.tracing import trace_to
+
+SCENE = the_scene()
+SWEEPS = 2 * TURNS  # of a job
+
+
+def make(number: int, rng: np.random.Generator) -> Job:
+    """A job of two sensors that pass two cars."""
+    track = lp.Track([0, 1], [[0, number, 1], [10, 5, 1]])
+    lidar = Sensor.grid(360, 4)
+    sensors = [Mounted(lidar, Pose((1, 0, 0.5), 30.0), "front"), Mounted(lidar, name="rear/left")]
+    survey = Survey(
+        sensors=sensors, trajectory=track, steps=TURNS * SCANS, noise=Noise(range_m=0.02),
+        keep_every=1, columns=["intensity", "class", "time"],
+    )  # fmt: skip
+    return Job(SCENE, survey, values={"x": number + 0.5})
+
+
+def campaign(count: int = 3, **options: Any) -> Campaign:
+    return Campaign(make, count, seed=4, **options)
+
+
+def same(one: Sweep, two: Sweep, columns: set[str]) -> bool:
+    """Whether two sweeps are equal to the bit, in these columns."""
+    plain = ("job", "job_number", "split", "values", "sensor", "number", "time_ns", "object_names")
+    boxes = ("names", "types", "objects", "centres", "quaternions", "sizes", "points")
+    return (
+        all(getattr(one, name) == getattr(two, name) for name in plain)
+        and one.points.tobytes() == two.points.tobytes()
+        and one.pose.tobytes() == two.pose.tobytes()
+        and all(one.columns[name].tobytes() == two.columns[name].tobytes() for name in columns)
+        and all(np.array_equal(getattr(one.boxes, n), getattr(two.boxes, n)) for n in boxes)
+    )
+
+
+@pytest.fixture(scope="module")
+def expected(local_client: Client) -> list[Sweep]:
+    """All sweeps of a campaign that nobody disturbs."""
+    return list(campaign().stream(local_client))
+
+
+@pytest.mark.parametrize("keep", ["parquet", "kitti", "webdataset"])
+def test_the_sweeps_are_those_of_the_data_set(cluster_client, client, tmp_path, keep):
+    splits = {"train": 0.5, "test": 0.5}
+    varied = campaign(keep=keep, splits=splits)
+    with (
+        thread_cluster({"GPU": 1}, {"LIDAR": 5}) as cluster,
+        Client(cluster, set_as_default=False) as writers,
+    ):
+        varied.run(tmp_path / "ds", client=writers)
+    saved = list(lp.sweeps(tmp_path / "ds"))
+    fresh = list(varied.stream(client))
+    assert len(fresh) == len(saved) == 3 * SWEEPS and sum(map(len, fresh)) > 1000
+    assert any(sweep.boxes.points.any() for sweep in fresh)
+    for one, two in zip(saved, fresh, strict=True):
+        assert same(one, two, {*one.columns}) and {*one.columns} <= {*two.columns}
+    chosen = list(varied.stream(cluster_client, split="test", ahead=1))
+    saved = list(lp.sweeps(tmp_path / "ds", split="test"))
+    assert [one.job for one in chosen] == [one.job for one in saved] != []
+    assert all(same(one, two, {*one.columns}) for one, two in zip(saved, chosen, strict=True))
+
+
+def test_sweeps_of_a_killed_worker_are_cast_again(client, sabotage, expected):
+    armed = sabotage("intersect.cast", SCANS)
+    pids = set(client.run(os.getpid).values())
+
+    def disarm() -> None:
+        wait_until(lambda: pids - {*client.run(os.getpid, on_error="ignore").values()})
+        armed.unlink()
+
+    with ThreadPoolExecutor(1) as pool:
+        disarmed = pool.submit(disarm)
+        again = list(campaign().stream(client))
+        disarmed.result()
+    columns = {*expected[0].columns}
+    assert all(same(one, two, columns) for one, two in zip(expected, again, strict=True))
+
+
+def test_one_that_is_left_early_leaves_nothing(client, left_over):
+    before = {child.pid for child in psutil.Process().children(recursive=True)}
+    for sweep in campaign().stream(gpu_workers=1):
+        assert (sweep.job, sweep.number) == ("0000", 0)
+        break
+    del sweep
+
+    def others() -> set[int]:
+        return {child.pid for child in psutil.Process().children(recursive=True)} - before
+
+    wait_until(lambda: not others())
+    for _ in campaign().stream(client):
+        break
+    assert left_over(client) == ([], [], [])
+
+
+@pytest.fixture
+def cast() -> Iterator[list[tuple[int, int]]]:
+    """Sweeps that workers in threads have cast: (job, number)."""
+    found: list[tuple[int, int]] = []
+
+    def note(point: str, fields: Any) -> None:
+        if point == "intersect.start":
+            found.extend({(fields["job"], scan // SCANS) for scan in fields["scans"]})
+
+    trace_to(note)
+    yield found
+    trace_to(None)
+
+
+def test_casting_waits_for_the_reader(cluster_client, cast):
+    stream = iter(campaign(4).stream(cluster_client, ahead=3))
+    for read in range(1, 4 * SWEEPS - 3):
+        next(stream)
+        wait_until(lambda read=read: len(cast) >= read + 3)
+        assert len(cast) == len({*cast}) == read + 3
+    stream.close()
+
+
+def test_jobs_that_fail_are_left_out(cluster_client, caplog):
+    def some(number: int, rng: np.random.Generator) -> Job:
+        if number == 1:
+            raise RuntimeError("no such street")
+        return make(number, rng)
+
+    sweeps = list(Campaign(some, 3).stream(cluster_client))
+    assert [sweep.job_number for sweep in sweeps] == [0] * SWEEPS + [2] * SWEEPS
+    (told,) = [record.getMessage() for record in caplog.records if "left out" in record.message]
+    assert told.startswith("Job 0001 is left out of the stream") and "no such street" in told
+
+
+def test_errors_are_told_in_a_line(cluster_client):
+    for options, words in (
+        ({"ahead": 0}, "ahead is 0; it must be at least 1"),
+        ({"split": "tran"}, r"no split 'tran'\. Did you mean 'train'"),
+        ({"split": "x"}, r"no split 'x'\. It has train, test"),
+    ):
+        with pytest.raises(LidarpoolError, match=words) as told:
+            campaign(splits={"train": 0.5, "test": 0.5}).stream(cluster_client, **options)
+        assert "\n" not in str(told.value)
+    with (
+        thread_cluster({"LIDAR": 1}) as cluster,
+        Client(cluster, set_as_default=False) as client,
+        pytest.raises(LidarpoolError, match="GPU"),
+    ):
+        next(iter(campaign().stream(client, wait_s=0)))
+
+
+def test_a_cluster_that_is_lost_ends_it():
+    with thread_cluster({"GPU": 1}) as cluster:
+        client = Client(cluster, set_as_default=False)
+        stream = iter(campaign(9).stream(client, ahead=1))
+        next(stream)
+        client.close()
+        with pytest.raises(LidarpoolError, match="cannot be reached any more"):
+            list(stream)
+
+
+# -- PyTorch ---------------------------------------------------------------------------------------
+
+
+def test_torch_divides_jobs_between_ranks(cluster_client, torch):
+    stream = campaign(5).stream(cluster_client, ahead=4)
+    torch.distributed.is_available = torch.distributed.is_initialized = lambda: True
+    torch.distributed.get_world_size = lambda: 2
+    for rank, jobs in ((0, (0, 2)), (1, (1, 3))):
+        torch.distributed.get_rank = lambda rank=rank: rank
+        items = list(stream.torch())
+        assert [item["job"] for item in items] == [f"{n:04}" for n in jobs for _ in range(SWEEPS)]
+        assert items[0]["points"].dtype == np.float32 and items[0]["boxes"].shape[1] == 7
+    assert next(iter(stream.torch(transform=lambda sweep: sweep.job))) == "0001"
+    torch.utils.data.get_worker_info = lambda: types.SimpleNamespace(id=0, num_workers=2)
+    with pytest.raises(LidarpoolError, match="num_workers=0"):
+        next(iter(stream.torch()))
