@@ -9,7 +9,7 @@ import numpy as np
 
 from ..base.arrays import Bools, Floats, Floats32, Ints, Ints32
 from ..columns.cloud import Cloud
-from ..sensor.trajectory import matrices, quaternions_of
+from ..sensor.trajectory import matrices
 from .sweeps import Sweeps
 
 
@@ -80,13 +80,12 @@ class SweepBoxes:
             place = np.empty((0, 3))
             return cls((), (), none, place, np.empty((0, 4)), place, none.astype(np.int64))
         names = tuple(sweeps.actors[actor] for actor in there)
-        turn = matrices(sweeps.pose.quaternions[sweep, None])[0]
         return cls(
             names,
             tuple(map(type_of, names)),
             (len(sweeps.objects) + there).astype(np.int32),
             sweeps.pose.inward(sweep, boxes.centres[there]),
-            quaternions_of(turn.T @ matrices(boxes.quaternions[there])),
+            _turned(sweeps.pose.quaternions[sweep], boxes.quaternions[there]),
             boxes.sizes[there],
             boxes.points[there],
         )
@@ -105,6 +104,15 @@ class SweepBoxes:
     def rows(self) -> Floats32:
         """float32 (k, 7): centre, length, width, height, yaw."""
         return np.column_stack([self.centres, self.sizes, self.yaw]).astype(np.float32)
+
+
+def _turned(pose: Floats, quaternions: Floats) -> Floats:
+    """Convert quaternions (k, 4) to the axes of a pose, whose own is (4,); w is at least 0."""
+    # By matrices this took longer than reading the points of a sweep.
+    x, y, z, w = -pose[0], -pose[1], -pose[2], pose[3]
+    product = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
+    turned: Floats = quaternions @ product.T
+    return np.where(turned[:, 3:] < 0, -turned, turned)
 
 
 def type_of(name: str) -> str:

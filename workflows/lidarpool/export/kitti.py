@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 
@@ -99,14 +100,16 @@ class Reader(reading.Reader):
         labels = self.rows(file, np.dtype("<u4"))
         if len(labels) != len(rows):
             raise ValueError(f"{file} has {len(labels):,} points, not {len(rows):,}")
-        return np.ascontiguousarray(rows[:, :3]), {
-            "intensity": np.ascontiguousarray(rows[:, 3]),
-            "class": labels.astype(np.uint16),
-            "object": (labels >> 16).astype(np.int32) - 1,
-        }
+        halves = labels.view("<u2").reshape(-1, 2)
+        columns = {"intensity": rows[:, 3], "class": halves[:, 0]}
+        return rows[:, :3], columns | {"object": halves[:, 1].astype(np.int32) - 1}
+
+    @cached_property
+    def _names(self) -> list[str]:
+        return _names(self.sweeps, self.entry)
 
     def _file(self, sweep: int, folder: str, ending: str) -> str:
-        name = _names(self.sweeps, self.entry)[self.sweeps.sensor[sweep]]
+        name = self._names[self.sweeps.sensor[sweep]]
         return f"sequences/{name}/{folder}/{self.sweeps.numbers[sweep]:06}.{ending}"
 
 

@@ -105,7 +105,7 @@ class Reader(reading.Reader):
         """Return the points of a sweep."""
         rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
         columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
-        return np.ascontiguousarray(rows[:, :3]), columns
+        return rows[:, :3], columns
 
 
 def _samples(sweeps: Sweeps) -> tuple[Ints, Bools]:

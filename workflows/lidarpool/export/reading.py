@@ -54,10 +54,13 @@ class Reader:
 
     def rows(self, name: str, row: np.dtype[Any]) -> AnyArray:
         """Read a file of rows; ValueError if it ends within one."""
-        data = self.place.read(name)
+        if self.place.is_local:
+            data = np.fromfile(self.place.local(name), np.uint8)
+        else:
+            data = np.frombuffer(bytearray(self.place.read(name)), np.uint8)
         if len(data) % row.itemsize:
             raise ValueError(f"{len(data)} bytes are no whole rows of {row.itemsize}")
-        return np.frombuffer(bytearray(data), row)  # PyTorch wants arrays that it may write to
+        return data.view(row)  # PyTorch wants arrays that it may write to
 
     def inside(self, sweep: int, cloud: Cloud) -> PointColumns:
         """Return points of the cloud's coordinates and all their columns."""

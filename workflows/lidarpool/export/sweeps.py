@@ -43,17 +43,21 @@ class Placed:
     positions: Floats  # (n, 3): metres, world coordinates
     quaternions: Floats  # (n, 4): x, y, z, w of the rotation from its own axes to the world's
 
+    @cached_property
+    def turns(self) -> Floats:
+        """float64 (n, 3, 3): rotations from its own axes to the world's."""
+        return matrices(self.quaternions)
+
     def matrix(self, sweep: int) -> Floats:
         """Matrix (4, 4) from its own axes at the start of a sweep to the world's."""
         pose = np.eye(4)
-        pose[:3, :3] = matrices(self.quaternions[sweep, None])[0]
+        pose[:3, :3] = self.turns[sweep]
         pose[:3, 3] = self.positions[sweep]
         return pose
 
     def inward(self, sweep: int, points: Floats) -> Floats:
         """Convert points (k, 3) of the world to its axes at the start of a sweep."""
-        turn = matrices(self.quaternions[sweep, None])[0]
-        turned: Floats = (points - self.positions[sweep]) @ turn
+        turned: Floats = (points - self.positions[sweep]) @ self.turns[sweep]
         return turned
 
 
