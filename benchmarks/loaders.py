@@ -1,9 +1,9 @@
 """Sweeps a second that data sets are read with: by lidarpool, and by the format's own loader.
 
-    python -m benchmarks.loaders [--jobs 6] [--turns 20] [FORMAT ...]
+    python -m benchmarks.loaders [FORMAT ...]
 
-Both read the same files, which are in memory, in order and in one process. Packages that are not
-installed are left out: pip install webdataset pykitti nuscenes-devkit pyarrow.
+Both read the same files, which are in memory, in order and in one process. It needs the packages
+webdataset, pykitti, nuscenes-devkit and pyarrow; formats without theirs are left out.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from importlib.util import find_spec
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -22,12 +23,11 @@ import numpy as np
 import lidarpool as lp
 from lidarpool.base.storage import Storage
 from lidarpool.datasets.dataset import DataSet
-from lidarpool.datasets.loader import SavedSweeps
 from lidarpool.datasets.job_table import JobRow, write_table
 from lidarpool.export.sweeps import Sweeps
 from lidarpool.scene.actors import Actor, box
 
-POINTS, ROUNDS = 30_000, 5
+POINTS, TURNS, JOBS, ROUNDS = 30_000, 20, 6, 7
 
 
 def webdataset(place: Path) -> Iterator[Any]:
@@ -42,8 +42,11 @@ def kitti(place: Path) -> Iterator[Any]:
 
     for folder in sorted((place / "sequences").iterdir()):
         drive = pykitti.odometry(str(place), folder.name)
-        for number, points in enumerate(drive.velo):  # it reads no labels and boxes
-            yield points, drive.poses[number]
+        for number, points in enumerate(drive.velo):
+            # It reads no labels: this is what semantic-kitti-api does.
+            file = place / "sequences" / folder.name / "labels" / f"{number:06}.label"
+            labels = np.fromfile(file, np.uint32)
+            yield points, labels & 0xFFFF, labels >> 16, drive.poses[number]
 
 
 def nuscenes(place: Path) -> Iterator[Any]:
@@ -59,11 +62,11 @@ def nuscenes(place: Path) -> Iterator[Any]:
 def parquet(place: Path) -> Iterator[Any]:
     import pyarrow.dataset
 
-    for folder in sorted((place / "points").iterdir(), key=lambda path: int(path.name[4:])):
+    for folder in (place / "points").iterdir():
         table = pyarrow.dataset.dataset(folder, format="parquet")
-        scans = np.load(place / "sweeps" / f"{int(folder.name[4:]):04}.npz")["scans"]
+        scans = np.load(place / f"sweeps/{int(folder.name[4:]):04}.npz")["scans"]
         field = pyarrow.dataset.field("scan")
-        for first, stop in zip(scans, scans[1:], strict=False):
+        for first, stop in pairwise(scans):
             rows = table.to_table(filter=(field >= first) & (field < stop), use_threads=False)
             yield {name: rows[name].to_numpy() for name in rows.column_names}
 
@@ -74,16 +77,15 @@ PEERS: dict[str, tuple[str, Callable[[Path], Iterator[Any]]]] = {
 }  # fmt: skip
 
 
-def write(place: Path, name: str, jobs: int, turns: int) -> None:
+def write(place: Path, name: str) -> None:
     """Write a data set of sweeps of 30,000 points past a car."""
     lidar = lp.Sensor.grid(360, 4)
     track = lp.Track([0, 60], [[0, 0, 1], [60, 5, 1]])
     car = Actor(box("Car 1", (4, 2, 1.5)), lp.Track([0, 60], [[5, 5, 0], [9, 5, 0]]))
-    scans = turns * 36
+    scans, scene = TURNS * 36, lp.Scene.seed()
     survey = lp.Survey(lidar, trajectory=track, steps=scans)
-    scene = lp.Scene.seed()
     sweeps = Sweeps.of(survey, scene.with_actors((car,)))
-    rng, count, data = np.random.default_rng(1), turns * POINTS, DataSet(Storage.at(place), name)
+    rng, count, data = np.random.default_rng(1), TURNS * POINTS, DataSet(Storage.at(place), name)
     scan = np.arange(count) * scans // count
     columns = {
         "scan": scan, "ray": np.arange(count) % 40, "channel": np.arange(count) % 4,
@@ -91,7 +93,7 @@ def write(place: Path, name: str, jobs: int, turns: int) -> None:
         "intensity": rng.uniform(0, 1, count).astype(np.float32), "time": scan * 1000,
     }  # fmt: skip
     cloud = lp.Cloud(np.round(rng.uniform(-60, 60, (count, 3)), 3), columns)
-    rows = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(jobs)]
+    rows = [data.write_job(JobRow(n, f"{n:04}"), cloud, sweeps) for n in range(JOBS)]
     data.finish(rows)
     write_table(data.place, [], lambda: rows)
 
@@ -110,18 +112,15 @@ def rates(*reads: Callable[[], Iterator[Any]]) -> list[float]:
 def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("formats", nargs="*", default=[*PEERS])
-    parser.add_argument("--jobs", type=int, default=6)
-    parser.add_argument("--turns", type=int, default=20)
-    options = parser.parse_args()
-    for name in options.formats:
+    for name in parser.parse_args().formats:
         package, peer = PEERS[name]
+        if find_spec(package) is None:
+            continue
         with tempfile.TemporaryDirectory() as folder:
             place = Path(folder)
-            write(place, name, options.jobs, options.turns)
-            if find_spec(package) is None:
-                continue
-            own, other = rates(partial(SavedSweeps.__iter__, lp.sweeps(place)), partial(peer, place))
-        print(f"{name:>10}  {own:6.0f}/s  {package} {other:6.0f}/s  {own / other:.2f}")
+            write(place, name)
+            own, other = rates(lp.sweeps(place).__iter__, partial(peer, place))
+        print(f"{name:>10}  {own:6.0f}/s  {package:>10} {other:6.0f}/s  {own / other:.2f}")
 
 
 if __name__ == "__main__":

@@ -15,10 +15,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from tests.daemons import wait_until
 from tests.drives import SCANS, SPLITS, TURNS, points_of, the_scene, the_sweeps, write_set
 from tests.rows import quick
 
 import lidarpool
+import lidarpool.export.kitti
 from lidarpool import LidarpoolError, Scene, Sweep
 from lidarpool.datasets.dataset import INDEX_FILE
 from lidarpool.export.boxes import Boxes
@@ -236,6 +238,30 @@ def test_threads_and_forks_read_beside_each_other(written, name):
     for one in (*forks, *threads):
         one.join()
     assert found == [alone] * 4
+
+
+@pytest.mark.parametrize("url", [False, True])
+def test_a_loop_reads_a_few_sweeps_ahead(written, monkeypatch, url):
+    read = lidarpool.export.kitti.Reader.read
+    threads: list[str] = []
+
+    def noted(self: Any, sweep: int) -> Any:
+        if threading.current_thread() is not threading.main_thread():
+            threads.append(threading.current_thread().name)
+        return read(self, sweep)
+
+    monkeypatch.setattr("lidarpool.export.kitti.Reader.read", noted)
+    place = written("kitti")
+    data = lidarpool.sweeps(place.as_uri() if url else place, shuffle=1)
+    loop = iter(data)
+    assert identity(next(loop)) == identity(data[0])
+    for number in range(1, 6):
+        wait_until(lambda number=number: len(threads) > number + 1)
+        assert len(threads) <= number + (17 if url else 10)
+        assert identity(next(loop)) == identity(data[number])
+    loop.close()
+    assert not any(one.name.startswith("sweeps") for one in threading.enumerate())
+    assert [*map(identity, data.ahead([3, 1]))] == [identity(data[3]), identity(data[1])]
 
 
 # -- PyTorch ---------------------------------------------------------------------------------------

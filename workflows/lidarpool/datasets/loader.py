@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import operator
 import os
 import threading
 from bisect import bisect_right
-from collections import OrderedDict
-from collections.abc import Callable, Iterator, Sequence
+from collections import OrderedDict, deque
+from collections.abc import Callable, Generator, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import partial
 from importlib.util import find_spec
@@ -34,6 +37,8 @@ from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import JobRow, read_table
 from .sweep_data import Sweep
 
+_THREADS, _REQUESTS = 2, 8  # that read ahead: of files, and at a URL
+_TOGETHER = 2  # sweeps of a job that a thread reads at a time
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
 
 
@@ -49,8 +54,8 @@ class _Run:
 class SavedSweeps:
     """A sequence of the sweeps of a data set in an order; see `sweeps`.
 
-    An item is read when it is asked for. Several threads may ask, and processes that this one
-    forks or that get a pickled copy.
+    An item is read when it is asked for; a loop reads ahead in threads. Several threads may ask,
+    and processes that this one forks or that get a pickled copy.
     """
 
     def __init__(
@@ -76,22 +81,59 @@ class SavedSweeps:
         return int(self._ends[-1]) if len(self._ends) else 0
 
     def __iter__(self) -> Iterator[Sweep]:
-        return (self[index] for index in range(len(self)))
+        return self.ahead(range(len(self)))
+
+    def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
+        """Give some sweeps in this order; threads read the next ones meanwhile.
+
+        In memory are at most four sweeps for each thread, beside the last ones that were given.
+        """
+        threads = _THREADS if self._place.is_local else _REQUESTS
+        # Neighbouring sweeps share what is kept of an open job. But at a URL, where each request
+        # takes long, several threads fetch single sweeps that have files of their own.
+        apart = itertools.count() if self._written.row.boxes and not self._place.is_local else None
+
+        def lane_of(index: int) -> int:
+            return self._find(index)[0].job.number if apart is None else next(apart)
+
+        lanes = [ThreadPoolExecutor(1, "sweeps") for _ in range(threads)]
+        coming: deque[Future[list[Sweep]]] = deque()
+        try:
+            for lane, group in itertools.groupby(indices, lane_of):
+                while some := [*itertools.islice(group, _TOGETHER)]:
+                    sweeps_of = map(self.__getitem__, some)  # they are read in the thread
+                    coming.append(lanes[lane % threads].submit(list, sweeps_of))
+                    if len(coming) > 2 * threads:
+                        yield from coming.popleft().result()
+            while coming:
+                yield from coming.popleft().result()
+        finally:
+            for task in coming:
+                task.cancel()
+            for one in lanes:
+                with suppress(RuntimeError):  # as the program ends, threads take nothing more
+                    one.submit(self._close)
+                one.shutdown()
 
     def __getitem__(self, index: int) -> Sweep:
         """Read a sweep.
 
         LidarpoolError if a file is missing or damaged; IndexError if there is no such sweep.
         """
+        run, number = self._find(index)
+        return self._opened(run.job).read(number)
+
+    def _find(self, index: int) -> tuple[_Run, int]:
+        """Find out where a sweep is; IndexError if there is none."""
         at = operator.index(index)
         at += len(self) if at < 0 else 0
         if not 0 <= at < len(self):
             raise IndexError(f"there is no sweep {index} of {len(self)}")
         if self._order is not None:
             at = int(self._order[at])
-        run = self._runs[bisect_right(self._ends, at)]
-        number = run.first + at - (int(self._ends[bisect_right(self._ends, at)]) - run.count)
-        return self._opened(run.job).read(number)
+        which = bisect_right(self._ends, at)
+        run = self._runs[which]
+        return run, run.first + at - (int(self._ends[which]) - run.count)
 
     def torch(self, transform: Callable[[Sweep], Any] | None = None, *, even: bool = True) -> Any:
         """Return a `torch.utils.data.IterableDataset` of the sweeps.
@@ -120,6 +162,12 @@ class SavedSweeps:
         from .torch_sweeps import TorchSweeps
 
         return TorchSweeps(self, transform, even)
+
+    def _close(self) -> None:
+        """Close the jobs that are open in this thread."""
+        for job in self._local.__dict__.pop("jobs", {}).values():
+            job.reader.close()
+        self._local.__dict__.clear()
 
     def _opened(self, job: JobRow) -> _OpenJob:
         """Return a job that is open in this thread."""
@@ -192,9 +240,9 @@ def sweeps(
 
     Returns
     -------
-    A sequence of `Sweep`, which reads each when it is asked for. Going through it again gives the
-    same order. In memory are a row for each job, 8 bytes for each sweep if shuffled, and poses
-    and boxes of 16 jobs.
+    A sequence of `Sweep`, which reads each when it is asked for; a loop reads a few ahead in
+    threads. Going through it again gives the same order. In memory are a row for each job, 8 bytes
+    for each sweep if shuffled, and in each thread poses and boxes of 16 jobs.
 
     Raises
     ------

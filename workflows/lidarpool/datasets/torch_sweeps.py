@@ -15,7 +15,7 @@ from ..base.errors import LidarpoolError
 from .sweep_data import Sweep
 
 if TYPE_CHECKING:
-    from _typeshed import SupportsLenAndGetItem
+    from .loader import SavedSweeps
 
 
 class TorchSweeps(torch.utils.data.IterableDataset):
@@ -23,7 +23,7 @@ class TorchSweeps(torch.utils.data.IterableDataset):
 
     def __init__(
         self,
-        sweeps: SupportsLenAndGetItem[Sweep],
+        sweeps: SavedSweeps,
         transform: Callable[[Sweep], Any] | None,
         even: bool,
     ) -> None:
@@ -43,8 +43,7 @@ class TorchSweeps(torch.utils.data.IterableDataset):
     def __iter__(self) -> Iterator[Any]:
         worker = torch.utils.data.get_worker_info()
         first, step = (0, 1) if worker is None else (worker.id, worker.num_workers)
-        for index in self._share()[first::step]:
-            yield self.transform(self.sweeps[index])
+        yield from map(self.transform, self.sweeps.ahead(self._share()[first::step]))
 
 
 class Stream(Protocol):
