@@ -37,8 +37,8 @@ from .dataset import BOXES_FILE, INDEX_FILE, VERSION, job_file
 from .job_table import JobRow, read_table
 from .sweep_data import Sweep
 
-_THREADS, _REQUESTS = 2, 8  # that read ahead: of files, and at a URL
-_TOGETHER = 2  # sweeps of a job that a thread reads at a time
+_THREADS, _REQUESTS = 1, 8  # that read ahead: Python runs one at a time, but for requests at a URL
+_TOGETHER = 4  # sweeps of a job that a thread reads at a time
 _OPEN_JOBS = 16  # jobs whose poses, boxes and opened files a thread keeps
 
 
@@ -86,7 +86,7 @@ class SavedSweeps:
     def ahead(self, indices: Iterable[int]) -> Generator[Sweep]:
         """Give some sweeps in this order; threads read the next ones meanwhile.
 
-        In memory are at most four sweeps for each thread, beside the last ones that were given.
+        In memory are at most eight sweeps for each thread, beside the last ones that were given.
         """
         threads = _THREADS if self._place.is_local else _REQUESTS
         # Neighbouring sweeps share what is kept of an open job. But at a URL, where each request
@@ -195,6 +195,7 @@ class _OpenJob:
             name = job_file(row.data_set, job.name, BOXES_FILE)
             with open_archive(place.path(name), partial(place.read, name)) as arrays:
                 self.boxes = arrays
+        self.sizes = self.sweeps.actor_bounds[:, 1] - self.sweeps.actor_bounds[:, 0]
         entry = Entry(job.number, job.name, job.split)
         self.reader: Reader = row.load().Reader(place, self.sweeps, entry, written.layout)
 
@@ -208,8 +209,8 @@ class _OpenJob:
             raise _unreadable(file, error) from error
         boxes = None
         if self.boxes:
-            sizes = sweeps.actor_bounds[:, 1] - sweeps.actor_bounds[:, 0]
-            boxes = Boxes(sizes=sizes, **{name: of[sweep] for name, of in self.boxes.items()})
+            own = {name: of[sweep] for name, of in self.boxes.items()}
+            boxes = Boxes(sizes=self.sizes, **own)
         return Sweep.of(job, sweeps, sweep, points, boxes)
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,15 +73,15 @@ class SweepBoxes:
     @classmethod
     def of(cls, sweeps: Sweeps, sweep: int, boxes: Boxes | None) -> SweepBoxes:
         """Take those of a sweep's boxes that are in the scene."""
-        there = np.empty(0, np.intp) if boxes is None else np.flatnonzero(boxes.there)
+        there = np.empty(0, np.intp) if boxes is None else boxes.there.nonzero()[0]
         if boxes is None or not len(there):
             none = np.empty(0, np.int32)
             place = np.empty((0, 3))
             return cls((), (), none, place, np.empty((0, 4)), place, none.astype(np.int64))
-        names = tuple(sweeps.actors[actor] for actor in there)
+        actors = there.tolist()
         return cls(
-            names,
-            tuple(map(type_of, names)),
+            tuple(sweeps.actors[actor] for actor in actors),
+            tuple(sweeps.actor_types[actor] for actor in actors),
             (len(sweeps.objects) + there).astype(np.int32),
             sweeps.pose.inward(sweep, boxes.centres[there]),
             _turned(sweeps.pose.quaternions[sweep], boxes.quaternions[there]),
@@ -109,19 +108,8 @@ class SweepBoxes:
 def _turned(pose: Floats, quaternions: Floats) -> Floats:
     """Convert quaternions (k, 4) to the axes of a pose, whose own is (4,); w is at least 0."""
     # By matrices this took longer than reading the points of a sweep.
-    x, y, z, w = -pose[0], -pose[1], -pose[2], pose[3]
-    product = np.array([[w, -z, y, x], [z, w, -x, y], [-y, x, w, z], [-x, -y, -z, w]])
-    turned: Floats = quaternions @ product.T
-    return np.where(turned[:, 3:] < 0, -turned, turned)
-
-
-def type_of(name: str) -> str:
-    """Type of an actor for labels: its name without spaces, and a number or identity at the end.
-
-    Examples
-    --------
-    >>> [type_of(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
-    ['Car', 'Car', 'Delivery_van', '7']
-    """
-    plain = re.sub(r"(\s*\([^()]*\)|[\s._-]*\d+)$", "", name.strip())
-    return re.sub(r"\s+", "_", plain or name.strip())
+    x, y, z, w = pose.tolist()
+    product = [[w, z, -y, -x], [-z, w, x, -y], [y, -x, w, -z], [x, y, z, w]]
+    turned: Floats = quaternions @ np.array(product).T
+    turned[turned[:, 3] < 0] *= -1
+    return turned

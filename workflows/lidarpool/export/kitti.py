@@ -13,7 +13,7 @@ from ..base.errors import LidarpoolError
 from ..columns.cloud import Cloud, CloudLike
 from ..sensor.trajectory import matrices
 from . import pieces, reading
-from .boxes import Boxes, type_of
+from .boxes import Boxes
 from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
 
@@ -101,8 +101,13 @@ class Reader(reading.Reader):
         if len(labels) != len(rows):
             raise ValueError(f"{file} has {len(labels):,} points, not {len(rows):,}")
         halves = labels.view("<u2").reshape(-1, 2)
-        columns = {"intensity": rows[:, 3], "class": halves[:, 0]}
-        return rows[:, :3], columns | {"object": halves[:, 1].astype(np.int32) - 1}
+        instances = halves[:, 1].astype(np.int32)
+        instances -= 1
+        return rows[:, :3], {
+            "intensity": rows[:, 3],
+            "class": halves[:, 0],
+            "object": instances,
+        }
 
     @cached_property
     def _names(self) -> list[str]:
@@ -160,5 +165,5 @@ def _labels(sweeps: Sweeps, sweep: int, boxes: Boxes, camera: Floats) -> str:
         length, width, height = boxes.sizes[actor]
         values = (seen[actor], 0, 0, 0, 0, height, width, length, *places[actor], around[actor])
         numbers = " ".join(f"{value:.4f}" for value in values)
-        lines.append(f"{type_of(sweeps.actors[actor])} 0.00 3 {numbers}\n")
+        lines.append(f"{sweeps.actor_types[actor]} 0.00 3 {numbers}\n")
     return "".join(lines)

@@ -18,7 +18,7 @@ from ..base.fingerprint import fingerprint
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
 from . import pieces, reading
-from .boxes import Boxes, type_of
+from .boxes import Boxes
 from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
 
@@ -217,7 +217,7 @@ class _Tables:
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
         """Add what actors are, and where they were in the key frames of each sample."""
-        kinds = [type_of(name) for name in self.sweeps.actors]
+        kinds = self.sweeps.actor_types
         self.rows |= {"category": [], "instance": [], "sample_annotation": []}
         for kind in dict.fromkeys(kinds):
             self._add("category", kind, name=kind, description="")

@@ -110,6 +110,11 @@ class Sweeps:
         return _placed(self.pose.positions - levers, turns)
 
     @cached_property
+    def actor_types(self) -> list[str]:
+        """Types of the actors."""
+        return [type_of(actor) for actor in self.actors]
+
+    @cached_property
     def numbers(self) -> Ints:
         """int64 (n,): number of each sweep among those of its sensor, from 0."""
         return np.arange(len(self)) - np.searchsorted(self.sensor, self.sensor)
@@ -267,6 +272,18 @@ class Sweeps:
                 **{name: arrays[name] for name in _ARRAYS},
                 **{name: words[name] for name in _WORDS},
             )
+
+
+def type_of(name: str) -> str:
+    """Type of an actor for labels: its name without spaces, and a number or identity at the end.
+
+    Examples
+    --------
+    >>> [type_of(name) for name in ("Car 1", "Car (b.2)", "Delivery van", "7")]
+    ['Car', 'Car', 'Delivery_van', '7']
+    """
+    plain = re.sub(r"(\s*\([^()]*\)|[\s._-]*\d+)$", "", name.strip())
+    return re.sub(r"\s+", "_", plain or name.strip())
 
 
 def plain_names(names: Iterable[str]) -> list[str]:
