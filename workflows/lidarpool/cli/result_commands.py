@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -153,7 +155,9 @@ def export(
 
 
 @click.command()
-@click.argument("result", type=options.StoragePath())
+@click.argument(
+    "results", metavar="RESULT...", type=options.StoragePath(), nargs=-1, required=True
+)
 @click.option(
     "--port",
     type=click.IntRange(0, 65_535),
@@ -162,21 +166,25 @@ def export(
     help="Port on 127.0.0.1, or the next free one; 0 for any.",
 )
 @options.flag("--no-browser", help="Only print the address.")
-def view(result: Path | Storage, port: int, no_browser: bool) -> None:
-    """Show a result or a cloud in the browser.
+def view(results: Sequence[Path | Storage], port: int, no_browser: bool) -> None:
+    """Show a result or a cloud in the browser; several in one view, with a colour each.
 
     \b
     Examples:
       lidarpool view lidarpool-out
       lidarpool view lidarpool-out/cloud.ply --no-browser
+      lidarpool view before after
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
     from ..export.sweeps import SWEEPS_FILE
-    from ..live.view import CLOUD, view_result
+    from ..live.several import open_results
+    from ..live.view import CLOUD, show_view
     from ..run.picture_file import PICTURE_FILE
 
-    with local_result(result, (CLOUD, PICTURE_FILE, SWEEPS_FILE)) as made:
-        view_result(made, port=port, browser=not no_browser)
+    with ExitStack() as stack:
+        files = (CLOUD, PICTURE_FILE, SWEEPS_FILE)
+        made = [stack.enter_context(local_result(result, files)) for result in results]
+        show_view(open_results(made), port=port, browser=not no_browser)
 
 
 @click.command()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +13,9 @@ from ..base.sampling import even_indices
 from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
+from ..columns.table import Column
 
+RESULT = Column("result", "uint8", "", "result that the point is of", kind="label")
 ScanRanges = tuple[tuple[int, int], ...]  # first and last scan of each range
 
 BLOCK = 1 << 15  # rows that are read at a time
@@ -43,7 +45,48 @@ class HeldPoints:
         return 0, len(self)
 
 
-Points = CloudFile | HeldPoints
+class JoinedPoints:
+    """Points of several results, one after the other, with the columns that all of them have.
+
+    `firsts` is the first scan, and the first sensor, of each result and one past the last: they
+    are numbered through.
+    """
+
+    def __init__(self, parts: Sequence[Points], firsts: Mapping[str, Sequence[int]]) -> None:
+        self._parts, self._firsts = parts, firsts
+        self._rows = np.cumsum([0, *map(len, parts)])  # the first of each, and one past the last
+        tables = [[column.name for column in part.table] for part in parts]
+        shared = [c for c in parts[0].table if all(c.name in names for names in tables)]
+        self.table = (*shared, RESULT)
+
+    def __len__(self) -> int:
+        return int(self._rows[-1])
+
+    def values(self, name: str, rows: Ints | slice) -> AnyArray:
+        """Values of a column, or of x, y or z in world coordinates, in some rows."""
+        if isinstance(rows, slice):
+            rows = np.arange(*rows.indices(len(self)))
+        owners = np.searchsorted(self._rows, rows, "right") - 1
+        if name == RESULT.name:
+            return owners.astype(np.uint8)
+        values = []
+        for number, part in enumerate(self._parts):
+            own = part.values(name, rows[owners == number] - self._rows[number])
+            values.append(own + self._firsts[name][number] if name in self._firsts else own)
+        found = np.empty(len(rows), np.result_type(*values))
+        for number, own in enumerate(values):
+            found[owners == number] = own
+        return found
+
+    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
+        """First row of these scans of one result and the first after them."""
+        number = int(np.searchsorted(self._firsts["scan"], scans[0], "right")) - 1
+        first, before = self._rows[number], self._firsts["scan"][number]
+        low, high = self._parts[number].rows_of((scans[0] - before, scans[1] - before))
+        return int(first + low), int(first + high)
+
+
+Points = CloudFile | HeldPoints | JoinedPoints
 
 
 @dataclass(frozen=True)

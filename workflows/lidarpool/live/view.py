@@ -46,10 +46,21 @@ from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.scene import Scene
 from ..scene.simplified import simplified
 from ..sensor.trajectory import presence_ns
-from .point_selection import Eye, Filter, PointFinder, Points, ScanRanges, corners_of, positions
+from .download import FORMATS, written
+from .point_selection import (
+    RESULT,
+    Eye,
+    Filter,
+    HeldPoints,
+    PointFinder,
+    Points,
+    ScanRanges,
+    corners_of,
+    positions,
+)
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
-MOST_POINTS = 20_000_000  # in an answer
+MOST_POINTS = 20_000_000  # in an answer, and in a download
 MOST_RAYS = 150  # more rays would hide the surfaces
 _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
@@ -82,6 +93,7 @@ class View:
     sweeps: Sweeps | None = None
     note: str = ""  # a remark on what is shown
     title: str = "lidarpool"
+    results: Sequence[str] = ()  # names, if the points are of several results
     # Returns those of each triangle, those of actors after the others; by default as pictured.
     hits: Callable[[], AnyArray] | None = None
 
@@ -147,6 +159,8 @@ class View:
 
     def _names(self, column: str) -> Sequence[str]:
         """Names of the values 0, 1, 2, … of a column, if any."""
+        if column == RESULT.name and self.results:
+            return self.results
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
         if self.sweeps is not None and column == "sensor":
@@ -183,6 +197,7 @@ class View:
             "column": lambda asked, _: self._column(asked["name"]),
             "surface": lambda asked, _: self._scene(asked["colour"]),
             "range": lambda asked, _: self._range(int(asked["sweep"])),
+            "export": self._export,
         }
         return answers[what](asked, abandoned)
 
@@ -212,6 +227,7 @@ class View:
             arrays["sweep_begins"] = self.sweeps.begins_ns / _NS
             arrays["sweep_sensor"] = self.sweeps.sensor
         pictured, objects = self.pictured, len(self._names("object"))
+        classes, several = self._classes_of_objects(), np.arange(len(self.results))
         header = {
             "title": self.title,
             "version": self.version,
@@ -229,7 +245,13 @@ class View:
             "sensors": [
                 {"name": way.name, "model": way.model, "moves": way.moves} for way in self.sensors
             ],
-            "actors": [{"name": actor.name} for actor in self._actors],
+            "actors": [
+                {"name": actor.name, "class": classes.get(objects + number)}
+                for number, actor in enumerate(self._actors, -len(self._actors))
+            ],
+            "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
+            "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
+            "exports": () if isinstance(self.points, HeldPoints) else FORMATS,
             "actor_colours": as_bytes(object_colours(objects))[
                 objects - len(self._actors) :
             ].tolist(),
@@ -254,14 +276,40 @@ class View:
         discs = np.column_stack([planning.centres, planning.radii])
         return {"corners": self.path.tolist(), "discs": discs.tolist()}
 
+    def _classes_of_objects(self) -> dict[int, int]:
+        """{object: class} of some points."""
+        if not {"object", "class"} <= self.columns.keys():
+            return {}
+        rows, _ = self._finder.find(_SAMPLE)
+        columns = (self.points.values(name, rows).tolist() for name in ("object", "class"))
+        return dict(zip(*columns, strict=True))
+
+    def _export(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
+        """Write the points for a filter and ranges of scans to a file, see `written`."""
+        rows, count = self._finder.find(MOST_POINTS, *self._wanted(asked), None, abandoned)
+        try:
+            if count > MOST_POINTS:
+                raise LidarpoolError(
+                    f"{count:,} points are too many for a download of at most {MOST_POINTS:,}: "
+                    "filter or clip them, or use lidarpool export for all."
+                )
+            name, content = written(self.points, rows, self.sweeps, asked["format"])
+        except LidarpoolError as error:
+            return {"error": str(error)}, {}
+        return {"name": name}, {"file": content}
+
+    def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
+        """Read the filter and the ranges of scans of a question."""
+        wanted = Filter.read(asked.get("filter", ""), list(self.columns))
+        return wanted, _scans(asked["scans"]) if "scans" in asked else None
+
     def _points(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
         """Points for a filter, ranges of scans and a camera, and their colours."""
         finder, version = self._finder, self.version
-        wanted = Filter.read(asked.get("filter", ""), list(self.columns))
+        wanted, scans = self._wanted(asked)
         name = asked["colour"]
         column = self._coloured[name]
         eye = Eye.read(asked["eye"]) if "eye" in asked else None
-        scans = _scans(asked["scans"]) if "scans" in asked else None
         most = max(1, min(int(asked["most"]), MOST_POINTS))
         rows, count = finder.find(most, wanted, scans, eye, abandoned)
         colouring = self._colouring(finder, name, wanted, abandoned)
@@ -554,9 +602,8 @@ def wait_for_interrupt(stopped: Event | None = None) -> None:
             pass
 
 
-def view_result(path: Path, *, port: int, browser: bool = True) -> None:
-    """Show a folder of a result, or a cloud, until Ctrl-C; see `result_page`."""
-    view = open_result(path)
+def show_view(view: View, *, port: int, browser: bool = True) -> None:
+    """Show a view until Ctrl-C; see `result_page`."""
     if view.note:
         click.echo(f"note: {view.note}", err=True)
     with result_page(view, port=port, browser=browser):
