@@ -32,7 +32,7 @@ from lidarpool.live.view import (
     legend_of,
     open_result,
     range_image,
-    view_result,
+    show_view,
 )
 from lidarpool.plan import Plan
 from lidarpool.render.colouring import colours_of as colouring_of
@@ -90,7 +90,7 @@ def test_what_is_no_result_is_refused(tmp_path):
         (tmp_path / "run" / "run").mkdir(parents=True, exist_ok=True)
         (tmp_path / "run" / "run" / "run.db").touch()
         with pytest.raises(LidarpoolError, match=words):
-            view_result(tmp_path / name, port=0, browser=False)
+            show_view(open_result(tmp_path / name), port=0, browser=False)
 
 
 @pytest.fixture(scope="module")
@@ -218,7 +218,7 @@ def test_actors_are_told_with_their_poses_and_numbers(cloud):
     scene = replace(scene, actors=(Actor(cart, track),))
     view = View(CloudFile(cloud), seen(scene, [[20, 0, 1]]))
     state, arrays = told(view, "state")
-    assert (state["actors"], state["statics"]) == ([{"name": "Cart"}], 2)
+    assert (state["actors"], state["statics"]) == ([{"name": "Cart", "class": None}], 2)
     assert len(state["actor_colours"]) == 1
     assert arrays["mesh0_colours"].tolist() == [[9, 8, 7]] * 36 and "colour" in state["scene"]
     assert (arrays["actor0_times"][0], arrays["actor0_times"][-1]) == (0, 2)
@@ -359,7 +359,7 @@ def test_damaged_pictures_are_noted_and_the_cloud_is_shown(cloud, capsys, monkey
 
     monkeypatch.setattr("lidarpool.live.view.wait_for_interrupt", look)
     (cloud.parent / PICTURE_FILE).write_bytes(b"PK\x03\x04junk")
-    view_result(cloud.parent, port=0, browser=False)
+    show_view(open_result(cloud.parent), port=0, browser=False)
     (said,) = asked
     assert PICTURE_FILE in said.splitlines()[0]
     assert "shows 10,000 points" in said

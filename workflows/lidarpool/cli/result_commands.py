@@ -155,9 +155,7 @@ def export(
 
 
 @click.command()
-@click.argument(
-    "results", metavar="RESULT...", type=options.StoragePath(), nargs=-1, required=True
-)
+@click.argument("results", metavar="RESULT...", type=options.StoragePath(), nargs=-1, required=True)
 @click.option(
     "--port",
     type=click.IntRange(0, 65_535),
@@ -177,8 +175,7 @@ def view(results: Sequence[Path | Storage], port: int, no_browser: bool) -> None
     """  # noqa: D301 - click wants the character, not its name
     from ..export.folder import local_result
     from ..export.sweeps import SWEEPS_FILE
-    from ..live.several import open_results
-    from ..live.view import CLOUD, show_view
+    from ..live.view import CLOUD, open_results, show_view
     from ..run.picture_file import PICTURE_FILE
 
     with ExitStack() as stack:

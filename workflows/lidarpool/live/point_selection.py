@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,44 +46,28 @@ class HeldPoints:
 
 
 class JoinedPoints:
-    """Points of several results, one after the other, with the columns that all of them have.
+    """Points of several results, one after the other, with the columns that all of them have."""
 
-    `firsts` is the first scan, and the first sensor, of each result and one past the last: they
-    are numbered through.
-    """
+    table: tuple[Column, ...]
 
-    def __init__(self, parts: Sequence[Points], firsts: Mapping[str, Sequence[int]]) -> None:
-        self._parts, self._firsts = parts, firsts
-        self._rows = np.cumsum([0, *map(len, parts)])  # the first of each, and one past the last
-        tables = [[column.name for column in part.table] for part in parts]
-        shared = [c for c in parts[0].table if all(c.name in names for names in tables)]
-        self.table = (*shared, RESULT)
+    def __init__(self, parts: Sequence[Points]) -> None:
+        self._firsts = np.cumsum([0, *map(len, parts)])  # rows; the last is one past all
+        self.parts = [*zip(self._firsts[:-1].tolist(), parts, strict=True)]
+        shared = set.intersection(*({column.name for column in part.table} for part in parts))
+        self.table = (*(one for one in parts[0].table if one.name in shared), RESULT)
 
     def __len__(self) -> int:
-        return int(self._rows[-1])
+        return int(self._firsts[-1])
 
     def values(self, name: str, rows: Ints | slice) -> AnyArray:
-        """Values of a column, or of x, y or z in world coordinates, in some rows."""
+        """Values of a column, or of x, y or z in world coordinates, in some rows, ascending."""
         if isinstance(rows, slice):
             rows = np.arange(*rows.indices(len(self)))
-        owners = np.searchsorted(self._rows, rows, "right") - 1
+        ends = np.searchsorted(rows, self._firsts)
         if name == RESULT.name:
-            return owners.astype(np.uint8)
-        values = []
-        for number, part in enumerate(self._parts):
-            own = part.values(name, rows[owners == number] - self._rows[number])
-            values.append(own + self._firsts[name][number] if name in self._firsts else own)
-        found = np.empty(len(rows), np.result_type(*values))
-        for number, own in enumerate(values):
-            found[owners == number] = own
-        return found
-
-    def rows_of(self, scans: tuple[float, float]) -> tuple[int, int]:
-        """First row of these scans of one result and the first after them."""
-        number = int(np.searchsorted(self._firsts["scan"], scans[0], "right")) - 1
-        first, before = self._rows[number], self._firsts["scan"][number]
-        low, high = self._parts[number].rows_of((scans[0] - before, scans[1] - before))
-        return int(first + low), int(first + high)
+            return np.repeat(np.arange(len(self.parts), dtype=np.uint8), np.diff(ends))
+        pieces = zip(self.parts, itertools.pairwise(ends), strict=True)
+        return np.concatenate([of.values(name, rows[a:b] - at) for (at, of), (a, b) in pieces])
 
 
 Points = CloudFile | HeldPoints | JoinedPoints
@@ -221,7 +205,10 @@ class PointFinder:
         """
         ranges = [(0, len(self.points))]  # of rows, first and after the last
         if scans is not None:
-            ranges = sorted(map(self.points.rows_of, scans))
+            points = self.points
+            parts = points.parts if isinstance(points, JoinedPoints) else [(0, points)]
+            each = ((first, part.rows_of(one)) for first, part in parts for one in scans)
+            ranges = sorted((first + low, first + high) for first, (low, high) in each)
         whole = sum(high - low for low, high in ranges)
         if not wanted.limits and (eye is None or whole <= most):
             numbers = even_indices(whole, most)

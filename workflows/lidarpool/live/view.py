@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import math
+import shutil
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from threading import Event
 from typing import Any
 
@@ -21,10 +23,12 @@ from ..base.arrays import AnyArray, Bytes, Floats, Floats32, Ints
 from ..base.errors import LidarpoolError
 from ..base.notebook import cell_display
 from ..base.words import plural
+from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
 from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
+from ..export.formats import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
@@ -46,12 +50,12 @@ from ..scene.actors import Actor, samples_each, shapes_of
 from ..scene.scene import Scene
 from ..scene.simplified import simplified
 from ..sensor.trajectory import presence_ns
-from .download import FORMATS, written
 from .point_selection import (
     RESULT,
     Eye,
     Filter,
     HeldPoints,
+    JoinedPoints,
     PointFinder,
     Points,
     ScanRanges,
@@ -61,6 +65,7 @@ from .point_selection import (
 from .server import PORT, Answer, Arguments, PageServer, announced, page_server
 
 MOST_POINTS = 20_000_000  # in an answer, and in a download
+EXPORTS = ("ply", "las", "parquet")  # formats of a download
 MOST_RAYS = 150  # more rays would hide the surfaces
 _SAMPLE = 100_000  # points that colour scales and limits are taken from
 _HITS_SAMPLE = 500_000  # points that tell where on large triangles the hits are
@@ -251,7 +256,7 @@ class View:
             ],
             "classes": {str(k): name for k, name in enumerate(self._names("class")) if name},
             "results": legend_of(colours_of(several, RESULT, self.results))["labels"],
-            "exports": () if isinstance(self.points, HeldPoints) else FORMATS,
+            "exports": () if isinstance(self.points, HeldPoints) else EXPORTS,
             "actor_colours": as_bytes(object_colours(objects))[
                 objects - len(self._actors) :
             ].tolist(),
@@ -285,18 +290,25 @@ class View:
         return dict(zip(*columns, strict=True))
 
     def _export(self, asked: Arguments, abandoned: Callable[[], bool]) -> Answer:
-        """Write the points for a filter and ranges of scans to a file, see `written`."""
+        """Write the points for a filter and ranges of scans to a file; of many files, a ZIP."""
+        points, sweeps, kind = self.points, self.sweeps, EXPORTS.index(asked["format"])
         rows, count = self._finder.find(MOST_POINTS, *self._wanted(asked), None, abandoned)
-        try:
-            if count > MOST_POINTS:
-                raise LidarpoolError(
-                    f"{count:,} points are too many for a download of at most {MOST_POINTS:,}: "
-                    "filter or clip them, or use lidarpool export for all."
-                )
-            name, content = written(self.points, rows, self.sweeps, asked["format"])
-        except LidarpoolError as error:
-            return {"error": str(error)}, {}
-        return {"name": name}, {"file": content}
+        if count > MOST_POINTS:
+            words = f"{count:,} points are more than {MOST_POINTS:,}: filter or clip them, or use"
+            return {"error": f"{words} lidarpool export for all."}, {}
+        columns = {column.name: points.values(column.name, rows) for column in points.table}
+        places = np.stack([points.values(axis, rows) for axis in AXES], axis=1)
+        own = tuple(column for column in points.table if column.name not in TABLE)
+        cloud = Cloud(places, columns, own, None if sweeps is None else lambda: sweeps)
+        with TemporaryDirectory(prefix="lidarpool-") as folder:
+            made = Path(folder) / f"cloud.{EXPORTS[kind]}"
+            try:
+                save_cloud(cloud, made)
+            except LidarpoolError as error:
+                return {"error": str(error)}, {}
+            if made.is_dir():
+                made = Path(shutil.make_archive(str(made), "zip", made))
+            return {"name": made.name}, {"file": np.fromfile(made, np.uint8)}
 
     def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
         """Read the filter and the ranges of scans of a question."""
@@ -608,6 +620,29 @@ def show_view(view: View, *, port: int, browser: bool = True) -> None:
         click.echo(f"note: {view.note}", err=True)
     with result_page(view, port=port, browser=browser):
         wait_for_interrupt()
+
+
+def open_results(paths: Sequence[Path]) -> View:
+    """Open results of one place as one view, with the scene, sensors and actors of the first.
+
+    They are played if their sweeps are alike. LidarpoolError as of `open_result`, or if points are
+    in the axes of their sensors.
+    """
+    first, *others = views = [open_result(path) for path in paths]
+    if not others:
+        return first
+    if IN_SENSOR_AXES in (notes := [view.note for view in views]):
+        raise LidarpoolError(
+            f"{paths[notes.index(IN_SENSOR_AXES)]} has points in the axes of its sensors, which "
+            "fit no other result: show it alone, or run it with cloud.coordinates: world."
+        )
+    names = [path.resolve().name for path in paths]
+    names = names if len({*names}) == len(names) else [str(path) for path in paths]
+    begins = [() if view.sweeps is None else view.sweeps.begins_ns for view in views]
+    sweeps = first.sweeps if all(np.array_equal(begins[0], one) for one in begins) else None
+    points = JoinedPoints([view.points for view in views])
+    title = f"{' and '.join(names)} - lidarpool"
+    return View(points, first.pictured, sweeps, " ".join(notes).strip(), title, results=names)
 
 
 def open_result(path: Path) -> View:

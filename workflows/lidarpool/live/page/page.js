@@ -2,7 +2,7 @@
 import { ask } from "./ask.js";
 import { button, dual, element, iconButton, legend, menu, number, saveFile, section, setIcon, slider, stepFor, themeButton, tick } from "./controls.js";
 import { Picture, lastNotAbove } from "./picture.js";
-import { count, follow, replace, stop } from "./run.js";
+import { count, follow, replace, slots, stop } from "./run.js";
 
 const FIRST_LOOK = 200_000; // points that are asked for first
 const REST_MS = 250; // for which the camera stands still before points are asked for
@@ -807,7 +807,7 @@ function tellRun(told) {
   const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
   const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
   const head = element("div", {}, element("b", { textContent: told.state }), since, pace);
-  replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(count));
+  replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(slots));
 }
 
 function keys(event) {
