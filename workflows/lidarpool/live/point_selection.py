@@ -5,6 +5,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -206,7 +207,9 @@ class PointFinder:
         ranges = [(0, len(self.points))]  # of rows, first and after the last
         if scans is not None:
             points = self.points
-            parts = points.parts if isinstance(points, JoinedPoints) else [(0, points)]
+            parts: Sequence[tuple[int, Any]] = [(0, points)]
+            if isinstance(points, JoinedPoints):
+                parts = points.parts
             each = ((first, part.rows_of(one)) for first, part in parts for one in scans)
             ranges = sorted((first + low, first + high) for first, (low, high) in each)
         whole = sum(high - low for low, high in ranges)

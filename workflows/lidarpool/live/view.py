@@ -301,14 +301,17 @@ class View:
         own = tuple(column for column in points.table if column.name not in TABLE)
         cloud = Cloud(places, columns, own, None if sweeps is None else lambda: sweeps)
         with TemporaryDirectory(prefix="lidarpool-") as folder:
-            made = Path(folder) / f"cloud.{EXPORTS[kind]}"
+            name = f"cloud.{EXPORTS[kind]}"
+            made = Path(folder) / name
             try:
                 save_cloud(cloud, made)
             except LidarpoolError as error:
                 return {"error": str(error)}, {}
             if made.is_dir():
-                made = Path(shutil.make_archive(str(made), "zip", made))
-            return {"name": made.name}, {"file": np.fromfile(made, np.uint8)}
+                file, *more = made.iterdir()
+                made = Path(shutil.make_archive(str(made), "zip", made)) if more else file
+                name = made.name if more else name
+            return {"name": name}, {"file": np.fromfile(made, np.uint8)}
 
     def _wanted(self, asked: Arguments) -> tuple[Filter, ScanRanges | None]:
         """Read the filter and the ranges of scans of a question."""

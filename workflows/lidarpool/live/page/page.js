@@ -14,6 +14,7 @@ const SPEEDS = [0.1, 0.25, 0.5, 1, 2, 5, 10];
 const BUDGETS = [0.2, 0.5, 1, 2, 5, 10, 20].map((millions) => millions * 1e6);
 const SHOWS = [["all", "all points"], ["sweep", "one sweep"], [0.5, "last 0.5 s"], [2, "last 2 s"], [10, "last 10 s"], ["now", "all until now"]];
 const HIDDEN = "not shown";
+const OPEN = 3e38; // an end of a range that limits nothing; float32 holds it
 const FAINT = 0.2; // opacity of grey surfaces before points, so that these come first
 const NARROW = matchMedia("(max-width: 799px)"); // there the panel is a drawer
 
@@ -279,7 +280,7 @@ function limitWords(name, low, high) {
   const names = filterNames[name] ?? {};
   if (low === high) return `${name}: only ${names[low] ?? number(low)}`;
   const column = state.columns.find((one) => one.name === name), size = column?.unit === "s" ? 1e9 : 1;
-  const [a, b] = [low, high].map((value) => (Math.abs(value) > 1e300 ? null : number(value / size)));
+  const [a, b] = [low, high].map((value) => (Math.abs(value) >= OPEN ? null : number(value / size)));
   return `${name}: ${a === null ? `up to ${b}` : b === null ? `from ${a}` : `${a} to ${b}`} ${column?.unit ?? ""}`;
 }
 
@@ -298,7 +299,7 @@ async function showFilterInput(name) {
   const low = Math.floor(told.low / step) * step, high = Math.max(Math.ceil(told.high / step) * step, low + step);
   const ends = limits ? [limits[1] / told.unit, limits[2] / told.unit] : [null, null];
   const apply = later((some) => setLimits(name, some.every((one) => one === null) ? null :
-    [some[0] === null ? -1.7e308 : some[0] * told.unit, some[1] === null ? 1.7e308 : some[1] * told.unit]));
+    [some[0] === null ? -OPEN : some[0] * told.unit, some[1] === null ? OPEN : some[1] * told.unit]));
   panel.filterInput.replaceChildren(dual("range", low, high, step, ends, (value) => number(value, step), apply));
 }
 
@@ -397,7 +398,7 @@ function showPanel(on) {
 // Has the server write the points that are shown, and saves its file.
 async function download(format) {
   const cut = chosen.clip.flatMap(([low, high], axis) => (low === null && high === null ? [] :
-    [["xyz"[axis], low === null ? -1.7e308 : low + state.origin[axis], high === null ? 1.7e308 : high + state.origin[axis]]]));
+    [["xyz"[axis], low === null ? -OPEN : low + state.origin[axis], high === null ? OPEN : high + state.origin[axis]]]));
   const asked = { ...questionAt(chosen.time), format, filter: [...chosen.filter, ...cut].map(String).join(";") };
   say("Writing …");
   const told = await ask("export", asked);
