@@ -807,6 +807,7 @@ async function news(told) {
 function tellRun(told) {
   const since = told.seconds === null ? "" : `, ${number(told.seconds, 1)} s`;
   const pace = told.rate && !told.over ? `, ${told.rate}  ${told.left && `${told.left} left`}` : "";
+  if (NARROW.matches && !lost) say(told.over ? "" : told.state);
   const head = element("div", {}, element("b", { textContent: told.state }), since, pace);
   replace(panel.progress, head, ...(told.over ? [] : told.stages.map(count)), ...told.slots.map(slots));
 }
@@ -851,7 +852,7 @@ async function begin() {
     if (it.columns) return true;
     $("panel").replaceChildren(panel.progress, stop); // its only job has not begun
     tellRun(it);
-    say(it.failures[0]?.error ?? (NARROW.matches ? it.state : ""), Boolean(it.failures[0]));
+    if (it.failures[0]) say(it.failures[0].error, true);
     return false;
   });
   say("Reading …");
