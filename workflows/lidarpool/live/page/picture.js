@@ -270,7 +270,7 @@ export class Picture {
     const { size, least, most } = this.pointMaterial.uniforms;
     const ratio = this.renderer.getPixelRatio();
     size.value = this.pointScale * this.extent * Math.min(0.0035, 1.2 / Math.sqrt(count));
-    least.value = ratio * (count < 20_000 ? 3.5 : count < 200_000 ? 2.2 : 1.6) * Math.sqrt(this.pointScale);
+    least.value = ratio * (count < 20_000 ? 3.5 : count < 3_000_000 ? 2.2 : 1.5) * Math.sqrt(this.pointScale);
     most.value = ratio * Math.max(2, 7 * this.pointScale);
     this.dirty = true;
   }
