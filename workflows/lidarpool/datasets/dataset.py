@@ -26,6 +26,7 @@ from ..export.boxes import Boxes
 from ..export.folder import local_folder
 from ..export.format_table import DATA_SETS, FORMATS, LAYOUTS, FormatRow
 from ..export.formats import Format
+from ..export.kitti import NAMES_FILE, labels_file
 from ..export.nuscenes import merge
 from ..export.pieces import Entry, Pieces, pieces_of
 from ..export.sweeps import SWEEPS_FILE, Sweeps
@@ -174,6 +175,7 @@ class DataSet:
                 place.write(file, data)
             of_sensors = np.bincount(sweeps.sensor, minlength=len(sweeps.sensors)).tolist()
             manifest |= {"sensors": [*zip(sweeps.sensors, of_sensors, strict=True)]}
+            manifest |= {"classes": dict(sweeps.classes)} if sweeps.classes else {}
             manifest |= {"made_of": made_of, "files": dict(sorted(place.files.items()))}
             # Of its row, what every run gives.
             row_ = asdict(replace(row, seconds=0.0))
@@ -200,15 +202,22 @@ class DataSet:
                 head = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
                 file.write(f'{json.dumps(head)[:-1]}, "jobs": ['.encode())
-                manifests = self._indexed(jobs, file)
+                classes: dict[int, str] = {}
+                manifests = self._indexed(jobs, file, classes)
                 if self.format == "nuscenes":
                     merge(self.place, manifests)
                 else:
                     deque(manifests, maxlen=0)
-                file.write(b"\n]}\n")
+                if self.format == "kitti" and classes:
+                    self.place.write(NAMES_FILE, labels_file(classes))
+                file.write(
+                    f'\n], "classes": {json.dumps(classes)}}}\n'.encode() if classes else b"\n]}\n"
+                )
 
-    def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
-        """Yield the manifest of each job that is done, and add it to the index."""
+    def _indexed(
+        self, jobs: Iterable[JobRow], index: IO[bytes], classes: dict[int, str]
+    ) -> Iterator[dict[str, Any]]:
+        """Yield the manifest of each job that is done, and add it to the index and the classes."""
         comma = ""
         for job, (manifest, wrong) in self.look(jobs):
             if wrong:
@@ -217,6 +226,9 @@ class DataSet:
             row = {"number": job.number, "name": job.name, "sensors": manifest["sensors"]}
             index.write(f"{comma}\n{json.dumps(row)}".encode())
             comma = ","
+            for number, name in manifest.get("classes", {}).items():
+                if name not in (told := classes.setdefault(int(number), name)).split("; "):
+                    classes[int(number)] = f"{told}; {name}"
             yield manifest
 
     def look(

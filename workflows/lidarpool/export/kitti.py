@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
+import yaml
 
 from ..base.arrays import Floats
 from ..base.errors import LidarpoolError
@@ -17,6 +18,7 @@ from .pieces import Data, Entry, as_data
 from .sweeps import Sweeps, plain_names
 
 INSTANCES_MOST = 65_535
+NAMES_FILE = "semantic-kitti.yaml"
 # From axes of a level sensor to KITTI's of a camera: x to the right, y down, z ahead.
 _CAMERA = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
 
@@ -33,6 +35,7 @@ class Pieces(pieces.Pieces):
     are in axes of a camera as KITTI's are, which sits where the sensor does; `Tr` leads to them.
     The camera is level where the sensor is tilted, in the mean over its sweeps, because KITTI turns
     boxes about its vertical axis alone. KITTI's own tools look for the poses in `poses/00.txt`.
+    `semantic-kitti.yaml` has names of classes, if there are some.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """
@@ -82,6 +85,8 @@ class Pieces(pieces.Pieces):
             files[f"{folder}/times.txt"] = _table(sweeps.begins_ns[own] / 1e9)
             lines = [f"P{number}: {_row(np.eye(3))}\n" for number in range(4)]
             files[f"{folder}/calib.txt"] = "".join([*lines, f"Tr: {_row(camera)}\n"]).encode()
+        if sweeps.classes and self.entry is None:  # else all jobs share a file
+            files[NAMES_FILE] = labels_file(sweeps.classes)
         return files
 
 
@@ -108,6 +113,11 @@ class Reader(reading.Reader):
     def _file(self, sweep: int, folder: str, ending: str) -> str:
         name = _names(self.sweeps, self.entry)[self.sweeps.sensor[sweep]]
         return f"sequences/{name}/{folder}/{self.sweeps.numbers[sweep]:06}.{ending}"
+
+
+def labels_file(classes: Mapping[int, str]) -> bytes:
+    """Return names of classes as tools of SemanticKITTI read them; 0 is there."""
+    return yaml.safe_dump({"labels": {0: "unlabeled", **classes}}, allow_unicode=True).encode()
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from functools import cached_property
 from itertools import islice
@@ -24,6 +25,8 @@ _GROUP_ROWS = 65_536
 class Pieces(pieces.Pieces):
     """A file for each million points; units and meanings are in the metadata of the fields.
 
+    In the schema's are names of objects and classes.
+
     In a data set it is a partition, `points/job=7`, in groups of rows of which readers of single
     sweeps read one or two.
     """
@@ -42,6 +45,8 @@ class Pieces(pieces.Pieces):
         ]
         objects = "\n".join((*sweeps.objects, *sweeps.actors))  # that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
+        if sweeps.classes:
+            words["classes"] = json.dumps(dict(sweeps.classes))
         self.schema = pa.schema(fields, words)
 
     def __len__(self) -> int:

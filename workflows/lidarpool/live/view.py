@@ -24,7 +24,7 @@ from ..base.words import plural
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
-from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
+from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
 from ..render.closeup import around_ways, floor_and_cut
@@ -153,6 +153,8 @@ class View:
             return self.sweeps.sensors
         if self.sweeps is not None and column == "object":
             return (*self.sweeps.objects, *self.sweeps.actors)
+        if self.sweeps is not None and column == "class":
+            return by_value(self.sweeps.classes)
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _around(self) -> tuple[Floats, Floats, Floats]:

@@ -156,8 +156,9 @@ class DataSetOutput(Output[CampaignRun]):
         write_table(place, campaign.names, store.rows)
         self.dataset.finish(store.rows())
         saved = sweeps(place.url)
-        picture = draw_sweep(next(iter(saved))) if len(saved) else None
-        write_card(place, campaign, run, store.rows(), store.casting or software(), picture)
+        picture = draw_sweep(next(iter(saved)), saved.classes) if len(saved) else None
+        casting = store.casting or software()
+        write_card(place, campaign, run, store.rows(), casting, picture, saved.classes)
 
 
 def _look(

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
+from types import MappingProxyType
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
@@ -19,7 +20,7 @@ from ..run.run_result import CampaignRun
 from ..scenario.campaign import CampaignSpec
 from .charts import draw_results, draw_varied
 from .page.rendering import rendered
-from .report import stage_figures
+from .report import named_classes, stage_figures
 
 CARD, PAGE, PICTURES, SPLITS = "README.md", "report.html", "pictures", "splits"
 VALUES_SHOWN = 12  # of a quantity with labels
@@ -37,6 +38,7 @@ def write_card(
     jobs: Iterable[JobRow],
     versions: Mapping[str, str],
     picture: Page | None = None,
+    classes: Mapping[int, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Write README.md, report.html, pictures and splits of a data set, and report.json last.
 
@@ -54,6 +56,8 @@ def write_card(
         Software on which the bytes of points depend, {name: version}.
     picture
         Of one job, for README.md.
+    classes
+        Names of classes.
 
     Returns
     -------
@@ -73,15 +77,11 @@ def write_card(
             with place.writing(f"{PICTURES}/{name}.png") as file:
                 file.write(drawing.png())
         place.remove([f"{PICTURES}/{name}.png" for name in pages if name not in drawn])
-        report = campaign_report(campaign, run, versions, figures)
+        report = campaign_report(campaign, run, versions, figures, classes)
         values: dict[str, Any] = {
             "report": report,
             "captions": _CAPTIONS,
             "command": campaign.command,
-            "points_by_class": {
-                name if name != "0" else "0 none": one["points"]
-                for name, one in report["classes"].items()
-            },
             "VALUES_SHOWN": VALUES_SHOWN,
         }
         page = rendered(
@@ -118,7 +118,11 @@ def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
 
 
 def campaign_report(
-    campaign: CampaignSpec, run: CampaignRun, versions: Mapping[str, str], figures: Figures
+    campaign: CampaignSpec,
+    run: CampaignRun,
+    versions: Mapping[str, str],
+    figures: Figures,
+    classes: Mapping[int, str],
 ) -> dict[str, Any]:
     """Return the figures of a data set, as in report.json."""
     return {
@@ -145,7 +149,7 @@ def campaign_report(
             name: {key: counts[key] for key in ("jobs", "sweeps", "points")}
             for name, counts in figures.splits.items()
         },
-        "classes": {str(number): {**counts} for number, counts in sorted(figures.classes.items())},
+        "classes": named_classes(figures.classes, classes),
         "varied": list(figures.described()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],

@@ -14,7 +14,7 @@ import numpy as np
 from ..base.archives import open_archive
 from ..base.arrays import AnyArray, Floats, Floats32
 from ..base.words import plural
-from ..columns.table import CAUSES, TABLE, Column
+from ..columns.table import CAUSES, TABLE, Column, by_value
 from ..plan import Plan, Planning
 from ..scenario.build import Job
 from ..scene.actors import Actor, samples_each, shapes_of
@@ -73,6 +73,7 @@ class PictureContent:
     reflectance: Floats | None = None
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
     triangles: int = 0  # of the scene, though simpler instances may be drawn
+    classes: Sequence[str] = ()  # names of the classes 0, 1, 2, …
 
     @classmethod
     def of(cls, result: RunResult) -> PictureContent:
@@ -109,6 +110,7 @@ class PictureContent:
             materials.reflectance,
             survey.coordinates,
             scene.triangles,
+            by_value(survey.classes),
         )
         return pictured, drawn
 
@@ -136,6 +138,8 @@ class PictureContent:
         """Names of the values 0, 1, 2, … of a column, if any."""
         if column.name == "sensor":
             return [way.name for way in self.sensors]
+        if column == TABLE["class"]:
+            return self.classes
         if column == TABLE["cause"]:
             return CAUSES
         return self.scene.all_names if column.name == "object" else ()
@@ -149,6 +153,7 @@ class PictureContent:
             "own": [asdict(column) for column in self.own],
             "coordinates": self.coordinates,
             "triangles": self.triangles,
+            **({"classes": self.classes} if self.classes else {}),
         }
         arrays: dict[str, Any] = {
             "format": _FORMAT,
@@ -239,7 +244,8 @@ class PictureContent:
             plan = Plan(path=arrays["path"], **numbers)
         rays, trials = arrays["sample_rays"], tuple(arrays.get("waypoints", ()))
         duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
-        rest = arrays.get("reflectance"), names["coordinates"], names["triangles"]
+        rest = names["coordinates"], names["triangles"], names.get("classes", ())
+        rest = (arrays.get("reflectance"), *rest)
         return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
 
 

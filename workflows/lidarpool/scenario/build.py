@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import partial
@@ -22,6 +22,7 @@ from ..export.formats import Format
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor
+from ..scene.files.cityjson import CLASS_NAMES as CITY_NAMES
 from ..scene.files.cityjson import CLASSES as CITY_CLASSES
 from ..scene.files.meshfile import CITYJSON
 from ..scene.robot import Robot
@@ -331,9 +332,24 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
     for semantic_class in sorted({one for one in vehicles if one is not None}):
         rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
         made = with_class(made or [every], semantic_class, rows, scene.all_names)
-    if any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files):
+    if _has_city(scenario):
         made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
     return made
+
+
+def _has_city(scenario: Scenario) -> bool:
+    return any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files)
+
+
+def _class_names(given: Scenario, columns: Collection[str]) -> dict[int, str]:
+    """Names of classes, also of those that city objects have by their types."""
+    names = dict(given.classes)
+    if "class" in columns and _has_city(given):
+        vehicles = given.traffic.vehicles if given.traffic else ()
+        own = {one.semantic_class for one in (*given.materials, *given.placed, *vehicles)}
+        own |= {number for number, name in CITY_NAMES.items() if name in names.values()}
+        names = {n: name for n, name in CITY_NAMES.items() if n not in own} | names
+    return names
 
 
 def _survey(
@@ -362,6 +378,7 @@ def _survey(
         **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
         steps=given.steps,
         materials=materials,
+        classes=_class_names(given, cloud["columns"]),
         returns=Returns(**dict(given.returns)),
         noise=Noise() if own_noise else Noise(**dict(given.noise)),
         navigation=given.navigation,

@@ -16,6 +16,7 @@ from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.files.meshfile import SUFFIXES
 from ..sensor import Material, Navigation
+from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
@@ -54,6 +55,8 @@ class Scenario(Section):
     ----------
     scene, sensor, materials, returns, noise, weather, navigation, cloud, output, planning, pool
         See `lidarpool.scenario.sections`.
+    classes
+        Names of semantic classes, {number: name}.
     poses
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
         objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
@@ -133,6 +136,10 @@ class Scenario(Section):
             max_length=100_000,
         ),
     ] = ()
+    classes: Annotated[
+        ClassNames,
+        about("names of classes, for reports and files; they add the column class", {40: "road"}),
+    ] = {}  # noqa: RUF012 - of a frozen model
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
     weather: Annotated[Weather, may_be_empty(Weather)] = Weather()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase, translate
 from functools import cache
@@ -14,13 +14,13 @@ from typing import Annotated, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import Field
+from pydantic import Field, WrapValidator
 
 from ..base.arrays import Bools, Floats, Indices, Integers
 from ..base.declared import TextOrTexts, UnitShare, about, allowed, written_as
 from ..base.elementary import exp, power
 from ..base.errors import LidarpoolError
-from ..base.validation import checked_fields
+from ..base.validation import checked_fields, shown
 from ..base.words import did_you_mean
 from .leaves import LeafAngle
 
@@ -34,8 +34,27 @@ NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
 POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
 DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
-SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
+CLASS_MOST = 65_535
+SemanticClass = Annotated[int, Field(ge=0, le=CLASS_MOST)]
 Transparent = Literal["none", "pass", "mirror"]
+
+
+def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
+    """Refuse names of classes that files cannot hold, or that two classes share."""
+    numbers: dict[str, int] = {}
+    for number, name in given.items() if isinstance(given, Mapping) else ():
+        known = type(number) is int and 0 <= number <= CLASS_MOST
+        if not (known and isinstance(name, str) and 0 < len(name) < 100 and name.isprintable()):
+            raise ValueError(
+                f"{shown({number: name})} is no class with its name: give a whole number of 0 to "
+                f"{CLASS_MOST} and a line of less than 100 letters, such as {{10: car}}."
+            )
+        if (other := numbers.setdefault(name, number)) != number:
+            raise ValueError(f"{other} and {number} are both {name!r}: give each its own name.")
+    return handler(given)
+
+
+ClassNames = Annotated[Mapping[SemanticClass, str], WrapValidator(_checked_names)]
 
 
 class Measured(NamedTuple):
