@@ -151,11 +151,9 @@ class _Digest:
         if own is None and not state:
             raise _refusal(thing)
         state |= {k: v for k, v in (own or {}).items() if not _is_cached(kind, k)}
-        for field in named:
-            if not field.compare:
-                del state[field.name]
+        ignored = {field.name for field in named if not field.compare}
         self._add_class(kind)
-        self.add(state)
+        self.add({name: value for name, value in state.items() if name not in ignored})
 
     def _add_class(self, kind: type) -> None:
         self._mark("class", kind.__module__, kind.__qualname__)

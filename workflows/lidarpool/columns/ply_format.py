@@ -62,13 +62,8 @@ def row_type(real: np.dtype[np.floating], table: Sequence[Column]) -> np.dtype[n
 def header(row: np.dtype[np.void], count: int, comments: str = "") -> bytes:
     """Header of a file of `count` points, in the words of Open3D; `comments` are whole lines."""
     lines = [f"property {_NAMES[row[name].str]} {name}" for name in row.names or ()]
-    lines = [
-        "comment Created by Open3D",
-        f"{comments}element vertex {count}",
-        *lines,
-        "end_header\n",
-    ]
-    return (_MAGIC + "\n".join(lines)).encode()
+    lines = ["comment Created by Open3D", f"{comments}element vertex {count}", *lines]
+    return (_MAGIC + "\n".join([*lines, "end_header\n"])).encode()
 
 
 def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
@@ -84,10 +79,10 @@ def layout(path: Path) -> tuple[int, int, np.dtype[np.void]]:
     if path.is_fifo():  # would wait for a writer, and has no random access
         raise ValueError("it is a pipe")
     with path.open("rb") as file:
-        start = file.read(_HEADER_LIMIT)
-        if b"end_header\n" not in start:  # comments may be long
-            start += file.read(_COMMENTS_LIMIT)
-    head, found, _ = start.partition(b"end_header\n")
+        data = file.read(_HEADER_LIMIT)
+        if b"end_header\n" not in data:  # names of many classes, perhaps
+            data += file.read(_COMMENTS_LIMIT)
+    head, found, _ = data.partition(b"end_header\n")
     text = head.decode("ascii", errors="replace")
     if not found or not text.startswith(_MAGIC):
         raise ValueError("it has no header of a binary little-endian PLY file")

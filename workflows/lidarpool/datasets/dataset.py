@@ -202,23 +202,15 @@ class DataSet:
                 head = {"lidarpool": __version__, "version": VERSION}
                 head |= {"format": self.format, "layout": self.layout}
                 file.write(f'{json.dumps(head)[:-1]}, "jobs": ['.encode())
-                classes: dict[int, str] = {}
-                manifests = self._indexed(jobs, file, classes)
+                manifests = self._indexed(jobs, file)
                 if self.format == "nuscenes":
                     merge(self.place, manifests)
                 else:
                     deque(manifests, maxlen=0)
-                if self.format == "kitti" and classes:
-                    self.place.write(NAMES_FILE, labels_file(classes))
-                file.write(
-                    f'\n], "classes": {json.dumps(classes)}}}\n'.encode() if classes else b"\n]}\n"
-                )
 
-    def _indexed(
-        self, jobs: Iterable[JobRow], index: IO[bytes], classes: dict[int, str]
-    ) -> Iterator[dict[str, Any]]:
-        """Yield the manifest of each job that is done, and add it to the index and the classes."""
-        comma = ""
+    def _indexed(self, jobs: Iterable[JobRow], index: IO[bytes]) -> Iterator[dict[str, Any]]:
+        """Yield the manifest of each job that is done, and add it to the index, with names."""
+        comma, named = "", dict[int, dict[str, None]]()  # {class: names that jobs have for it}
         for job, (manifest, wrong) in self.look(jobs):
             if wrong:
                 told = f"Job {job.name} of {self.place} is not whole: its {wrong}."
@@ -227,9 +219,13 @@ class DataSet:
             index.write(f"{comma}\n{json.dumps(row)}".encode())
             comma = ","
             for number, name in manifest.get("classes", {}).items():
-                if name not in (told := classes.setdefault(int(number), name)).split("; "):
-                    classes[int(number)] = f"{told}; {name}"
+                named.setdefault(int(number), {})[name] = None
             yield manifest
+        classes = {number: "; ".join(names) for number, names in named.items()}
+        if classes and self.format == "kitti":
+            self.place.write(NAMES_FILE, labels_file(classes))
+        more = f', "classes": {json.dumps(classes)}' if classes else ""
+        index.write(f"\n]{more}}}\n".encode())
 
     def look(
         self, jobs: Iterable[JobRow], *, contents: bool = False

@@ -51,18 +51,14 @@ class SavedSweeps:
     """A sequence of the sweeps of a data set in an order; see `sweeps`.
 
     An item is read when it is asked for. Several threads may ask, and processes that this one
-    forks or that get a pickled copy. `classes` are the names of semantic classes, {number: name}.
+    forks or that get a pickled copy. `classes` are names of semantic classes, {number: name}.
     """
 
+    classes: Mapping[int, str]
+
     def __init__(
-        self,
-        place: Storage,
-        written: Format,
-        runs: Sequence[_Run],
-        shuffle: int | None,
-        classes: Mapping[int, str],
+        self, place: Storage, written: Format, runs: Sequence[_Run], shuffle: int | None
     ) -> None:
-        self.classes = classes
         self._place, self._written, self._runs = place, written, runs
         self._ends = np.cumsum([run.count for run in runs], dtype=np.int64)
         self._order = None  # int64 (n,): 8 bytes for each sweep
@@ -248,8 +244,9 @@ def sweeps(
             if count and (sensors is None or name in sensors):
                 runs.append(_Run(job, first, count))
             first += count
-    classes = {int(number): name for number, name in head.get("classes", {}).items()}
-    return SavedSweeps(storage, written, runs, shuffle, classes)
+    saved = SavedSweeps(storage, written, runs, shuffle)
+    saved.classes = {int(number): name for number, name in head.get("classes", {}).items()}
+    return saved
 
 
 def read_index(place: Storage) -> dict[str, Any]:

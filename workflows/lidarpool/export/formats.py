@@ -67,10 +67,9 @@ class Format:
 
     def left_out(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Names of the cloud's columns that it cannot hold."""
-        if (held := self.row.holds) is None:
-            return []
-        held += self._laid_out + (self.row.named if sweeps.classes else ())
-        return [column.name for column in cloud.table if column.name not in held]
+        held, there = self.row.holds, (column.name for column in cloud.table)
+        more = self._laid_out + (self.row.named if sweeps.classes else ())
+        return [] if held is None else [name for name in there if name not in held + more]
 
     def notes(self, cloud: CloudLike, sweeps: Sweeps) -> list[str]:
         """Return a note for the user on the cloud in this format, or none."""

@@ -35,7 +35,6 @@ class Pieces(pieces.Pieces):
     are in axes of a camera as KITTI's are, which sits where the sensor does; `Tr` leads to them.
     The camera is level where the sensor is tilted, in the mean over its sweeps, because KITTI turns
     boxes about its vertical axis alone. KITTI's own tools look for the poses in `poses/00.txt`.
-    `semantic-kitti.yaml` has names of classes, if there are some.
 
     Behley et al., SemanticKITTI, 2019; Geiger et al., 2012.
     """

@@ -17,7 +17,7 @@ from typing import IO, Any
 import laspy
 import lazrs
 import numpy as np
-from laspy.vlrs import known
+from laspy.vlrs.known import WaveformPacketStruct, WaveformPacketVlr, WktCoordinateSystemVlr
 
 from ..base.arrays import AnyArray, Bytes
 from ..base.errors import LidarpoolError
@@ -53,10 +53,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     `azimuth` (-180 to 180 degrees) is the scan angle, `sensor` + 1 the point source. With `red`,
     `green` and `blue` the point format is 7, and colours are 257 times these, 16 bits. Intensity is
     the column `intensity` times 65,535, at most that, and classification `class` if it is below
-    256; because of these limits, both columns are in the extra bytes as well. Names of classes are
-    the classification lookup: ASCII, 15 letters, of classes below 256. Return numbers are
-    15 at most, and angles in steps of 0.006 degrees. Recorded waveforms make the point format 9, or
-    10 with colours; see `_Packets`.
+    256; because of these limits, both columns are in the extra bytes as well. Of these classes, the
+    lookup has 15 letters of the names, ASCII. Return numbers are 15 at most, and angles in steps of
+    0.006 degrees. Recorded waveforms make the point format 9, or 10 with colours; see `_Packets`.
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
     packets = _Packets.of(cloud)
@@ -71,12 +70,12 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
         header.global_encoding.gps_time_type = laspy.header.GpsTimeType.STANDARD
         begins_s = (sweeps.start_ns - _GPS_NS) / 1e9 + _LEAP_S - _ADJUSTED_S
     if sweeps.epsg is not None:
-        header.vlrs.append(known.WktCoordinateSystemVlr(wkt(sweeps.epsg)))
+        header.vlrs.append(WktCoordinateSystemVlr(wkt(sweeps.epsg)))
     # LAS 1.4 wants it of formats 6 and above, with a coordinate system or without; PDAL before
     # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
     header.global_encoding.wkt = True
     if sweeps.classes:
-        lookup = known.ClassificationLookupVlr()
+        lookup = laspy.vlrs.known.ClassificationLookupVlr()
         for number in range(256):  # the record has them all
             lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
         header.vlrs.append(lookup)
@@ -145,9 +144,8 @@ class _Packets:
         self.descriptors = []
         for number, (step_ps, exponent) in enumerate(kinds, 1):
             gain = 2.0**exponent
-            told = known.WaveformPacketVlr(99 + number, "lidarpool")
-            record = known.WaveformPacketStruct(16, 0, samples, step_ps, gain, -ZERO * gain)
-            told.parsed_record = record
+            told = WaveformPacketVlr(99 + number, "lidarpool")
+            told.parsed_record = WaveformPacketStruct(16, 0, samples, step_ps, gain, -ZERO * gain)
             self.descriptors.append(told)
 
     @classmethod

@@ -31,7 +31,7 @@ _TABLES = (
     "attribute", "calibrated_sensor", "category", "ego_pose", "instance", "log", "map", "sample",
     "sample_annotation", "sample_data", "scene", "sensor", "visibility",
 )  # fmt: skip
-_LABELS = f"lidarseg/{VERSION}"
+_LABELS = f"lidarseg/{VERSION}/"
 _SHARED = ("category", "log", "map", "sensor")  # tables whose rows the jobs of a data set share
 
 
@@ -43,8 +43,7 @@ class Pieces(pieces.Pieces):
     first sensor's sweeps are the samples; of another sensor, the first sweep that begins in a
     sample is its key frame, and more are in `sweeps/NAME`. The ego vehicle's pose is the
     sensor's, at each sweep. Actors are annotated in each sample, where they are at the mean time of
-    their points in its key frames. Where classes have names, each sweep has labels as those of
-    nuScenes-lidarseg: uint8 class, 0 for classes without a name or above 255.
+    their points in its key frames. Classes with names, below 256, are labels of nuScenes-lidarseg.
 
     In a data set each job is a scene with its name, on a day of its own, its files are in folders
     of that name in `samples/NAME` and `sweeps/NAME`, and `merge` makes the tables of all jobs.
@@ -58,10 +57,9 @@ class Pieces(pieces.Pieces):
         self.sample, self.first = _samples(sweeps)
         self.names = _files(sweeps, self.channels, self.first, entry)
         self.folders = [name.rpartition("/")[0] for name in self.names]
-        self.classes: dict[int, str] = {}
-        if sweeps.classes and any(column.name == "class" for column in cloud.table):
-            self.classes = {0: "none"} | {n: name for n, name in sweeps.classes.items() if n < 256}
-            self.folders.append(_LABELS)
+        named = sweeps.classes and any(column.name == "class" for column in cloud.table)
+        self.labels = [_LABELS + name.replace("/", "-") for name in self.names] if named else []
+        self.folders += [_LABELS] if named else []
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, Data], Boxes]:
         """Return the file of a sweep, and its boxes."""
@@ -70,21 +68,19 @@ class Pieces(pieces.Pieces):
         rows = np.empty((len(points), 5), "<f4")
         rows[:, :3], rows[:, 3], rows[:, 4] = inside, light, points["channel"]
         files = {self.names[number]: as_data(rows)}
-        if self.classes:
-            named = np.isin(points["class"], [*self.classes])
+        if self.labels:
+            named = np.isin(points["class"], [n for n in self.sweeps.classes if n < 256])
             labels = np.where(named, points["class"], 0).astype("u1")
-            files[_labels_of(self.names[number])] = as_data(labels)
+            files[self.labels[number]] = as_data(labels)
         return files, Boxes.of(self.sweeps, number, points)
 
     def others(self, made: Sequence[Boxes]) -> dict[str, bytes]:
         """Return the tables of a survey by itself, and its map."""
         if self.entry is not None:
             return {}
-        tables = self._tables(made)
-        tables["category"] = _numbered(tables["category"])
         files = {
             f"{VERSION}/{name}.json": json.dumps(rows, indent=1).encode()
-            for name, rows in tables.items()
+            for name, rows in self._tables(made).items()
         }
         return files | {_MAP: _no_map()}
 
@@ -99,8 +95,14 @@ class Pieces(pieces.Pieces):
         for sweep in np.flatnonzero(self.first):
             keys[self.sample[sweep]].append(made[int(sweep)])
         tables.add_actors(keys)
-        if self.classes:
-            tables.add_labels(self.classes)
+        if self.labels:
+            tokens = [row["token"] for row in tables.rows["sample_data"]]
+            tables.rows["lidarseg"] = [
+                {"token": one, "sample_data_token": one, "filename": file}
+                for one, file in zip(tokens, self.labels, strict=True)
+            ]
+        if self.labels and self.entry is None:  # else `merge` knows all
+            tables.rows["category"] = _categories(tables.rows["category"], self.sweeps.classes)
         return tables.rows
 
 
@@ -121,7 +123,8 @@ class Reader(reading.Reader):
         rows = self.rows(self.file(sweep), np.dtype("<f4")).reshape(-1, 5)
         columns = {"intensity": rows[:, 3] / np.float32(255), "channel": rows[:, 4].astype("u2")}
         if self.sweeps.classes:
-            columns["class"] = self.rows(_labels_of(self.file(sweep)), np.dtype("u1")).astype("u2")
+            labels = self.rows(_LABELS + self.file(sweep).replace("/", "-"), np.dtype("u1"))
+            columns["class"] = labels.astype("u2")
         return np.ascontiguousarray(rows[:, :3]), columns
 
 
@@ -141,21 +144,15 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
     ]
 
 
-def _labels_of(file: str) -> str:
-    """Name of the labels of a file of points: the devkit counts those in one folder."""
-    sweep = file.removesuffix(".pcd.bin").partition("/")[2]
-    return f"{_LABELS}/{sweep.replace('/', '-')}_lidarseg.bin"
-
-
-def _numbered(categories: Sequence[dict[str, Any]]) -> Sequence[dict[str, Any]]:
-    """Number categories if some are classes: these, without gaps, then those of actors."""
-    classes = {row["index"]: row for row in categories if "index" in row}
-    if not classes:
-        return categories
-    blanks = [{"token": f"class {n}", "name": f"class {n}"} for n in range(max(classes))]
-    rows = [classes.get(n) or blank for n, blank in enumerate([*blanks, {}])]
-    rows += [row for row in categories if "index" not in row]
-    return [{"description": "", **row, "index": number} for number, row in enumerate(rows)]
+def _categories(kinds: list[dict[str, Any]], classes: Mapping[int, str]) -> list[dict[str, Any]]:
+    """Rows of all classes and of kinds of actors, numbered without gaps as lidarseg needs it."""
+    known = {row["name"]: row for row in kinds}
+    last = max((number for number in classes if number < 256), default=0)
+    names = [classes.get(n, f"class {n}" if n else "none") for n in range(last + 1)]
+    return [
+        {"token": name, "name": name, "description": "", **known.get(name, {}), "index": n}
+        for n, name in enumerate([*names, *(name for name in known if name not in names)])
+    ]
 
 
 def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
@@ -166,27 +163,26 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
             name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
         }
         before: dict[str, bytes] = {}  # what comes before the next row
-        categories = []
+        kinds, classes = list[dict[str, Any]](), dict[int, str]()
 
-        def put(name: str, row: Mapping[str, Any]) -> None:
-            if name not in files:
-                files[name] = stack.enter_context(place.writing(f"{VERSION}/{name}.json"))
-            files[name].write(before.get(name, b"[\n") + json.dumps(row).encode())
-            before[name] = b",\n"
-
-        for job in jobs:
-            for name, rows in job["tables"].items():
+        def write(tables: Mapping[str, list[dict[str, Any]]]) -> None:
+            for name, rows in tables.items():
                 for row in rows:
                     if name in _SHARED:
                         if row["token"] in shared:
                             continue
                         shared.add(row["token"])
-                    if name == "category":
-                        categories.append(row)
-                    else:
-                        put(name, row)
-        for row in _numbered(categories):
-            put("category", row)
+                    if name not in files:  # lidarseg
+                        file = place.writing(f"{VERSION}/{name}.json")
+                        files[name] = stack.enter_context(file)
+                    files[name].write(before.get(name, b"[\n") + json.dumps(row).encode())
+                    before[name] = b",\n"
+
+        for job in jobs:
+            kinds += job["tables"].pop("category")
+            classes |= {int(number): name for number, name in job.get("classes", {}).items()}
+            write(job["tables"])
+        write({"category": _categories(kinds, classes) if "lidarseg" in files else kinds})
         for name, file in files.items():
             file.write(b"\n]\n" if name in before else b"[]\n")
     with place.writing(_MAP) as file:
@@ -260,18 +256,6 @@ class _Tables:
                     timestamp=when, fileformat="pcd", height=0, width=0, filename=names[sweep],
                     is_key_frame=names[sweep].startswith("samples/"), **beside,
                 )  # fmt: skip
-
-    def add_labels(self, classes: Mapping[int, str]) -> None:
-        """Add the classes, in place of what actors are by the same names, and all labels."""
-        kinds, self.rows["category"] = self.rows["category"], []
-        for index, name in classes.items():
-            self._add("category", name, name=name, description="", index=index)
-        self.rows["category"] += [row for row in kinds if row["name"] not in classes.values()]
-        self.rows["lidarseg"] = [
-            {"token": token, "sample_data_token": token, "filename": _labels_of(row["filename"])}
-            for row in self.rows["sample_data"]
-            for token in [row["token"]]
-        ]
 
     def add_actors(self, boxes: list[list[Boxes]]) -> None:
         """Add what actors are, and where they were in the key frames of each sample."""

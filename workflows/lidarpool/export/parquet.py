@@ -25,8 +25,6 @@ _GROUP_ROWS = 65_536
 class Pieces(pieces.Pieces):
     """A file for each million points; units and meanings are in the metadata of the fields.
 
-    In the schema's are names of objects and classes.
-
     In a data set it is a partition, `points/job=7`, in groups of rows of which readers of single
     sweeps read one or two.
     """
@@ -45,8 +43,7 @@ class Pieces(pieces.Pieces):
         ]
         objects = "\n".join((*sweeps.objects, *sweeps.actors))  # that the column `object` counts
         words = {"coordinates": sweeps.coordinates, "objects": objects}
-        if sweeps.classes:
-            words["classes"] = json.dumps(dict(sweeps.classes))
+        words |= {"classes": json.dumps(dict(sweeps.classes))} if sweeps.classes else {}
         self.schema = pa.schema(fields, words)
 
     def __len__(self) -> int:

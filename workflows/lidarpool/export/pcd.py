@@ -17,8 +17,7 @@ class Pieces(pieces.Pieces):
     """One file for each sweep, with all columns; red, green and blue are one field `rgb`.
 
     Points are in the sensor's axes as they were when the sweep began; VIEWPOINT says where those
-    were in the world. Times are seconds since the sweep began, as float32. Names of classes are
-    comments in the head.
+    were in the world. Times are seconds since the sweep began, as float32.
     """
 
     def files(self, number: int, points: Cloud) -> tuple[dict[str, bytes], None]:
@@ -45,7 +44,5 @@ class Pieces(pieces.Pieces):
         place = sweeps.pose.positions[number].tolist()
         file.metadata.viewpoint = (*place, w, x, y, z)
         memory = io.BytesIO()
-        for label, name in sweeps.classes.items():
-            memory.write(f"# class {label} {name}\n".encode())
         file.save(memory, Encoding.BINARY)
         return {f"{number:06}.pcd": memory.getvalue()}, None

@@ -62,16 +62,15 @@ _LAYOUTS = {
 _LAYOUTS["images"] = _LAYOUTS["velodyne"]
 # Fields behind those of a layout: {name: type, columns that it needs}.
 _EXTRA = {"rgb": ("<f4", {*COLOURS}), VELOCITY: ("<f4", {VELOCITY}), "label": ("<u4", {"class"})}
-_LABELS = "vision_msgs/msg/LabelInfo", "vision_msgs/msg/VisionClass"  # which rosbags lacks
-_LABEL_INFO = "std_msgs/Header header\nVisionClass[] class_map\nfloat32 threshold"
-_VISION_CLASS = "uint16 class_id\nstring class_name"
+# Of vision_msgs, which rosbags lacks.
+_LABEL_INFO = "std_msgs/Header header\nvision_msgs/VisionClass[] class_map\nfloat32 threshold\n"
+_LABEL_INFO += f"{80 * '='}\nMSG: vision_msgs/VisionClass\nuint16 class_id\nstring class_name\n"
 
 
 def write_rosbag2(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> None:
     """Write a bag, a folder for `ros2 bag play`; see `write_mcap`."""
     store = get_typestore(Stores.ROS2_HUMBLE)
-    for text, name in zip((_LABEL_INFO, _VISION_CLASS), _LABELS, strict=True):
-        store.register(get_types_from_msg(text, name))
+    store.register(get_types_from_msg(_LABEL_INFO, "vision_msgs/msg/LabelInfo"))
     # Readers of Humble take no later version: from 9 on, its profiles are lists.
     with Writer(path, version=8, storage_plugin=StoragePlugin.MCAP) as bag:
         topics: dict[str, Any] = {}
@@ -91,8 +90,9 @@ def write_mcap(path: Path, cloud: CloudLike, sweeps: Sweeps, layout: str) -> Non
     Each sweep is a PointCloud2 on `/NAME/points`, NAME that of its sensor, or on `/points`. Points
     are in the sensor's axes when the sweep began. `/tf` has the frames of the carrier (`base_link`)
     and of actors in `map`, and `/clock` the time, both at each sweep; `/tf_static` has the sensors
-    on the carrier, and `/label_info` the names of classes (LabelInfo), if there are some. The survey begins at its start, or at `START_NS` without one. `/actors` has
-    a MarkerArray of the boxes of actors where their points of the sweep are.
+    on the carrier, and `/label_info` names of classes (LabelInfo of vision_msgs). The survey begins
+    at its start, or at `START_NS` without one. `/actors` has a MarkerArray of the boxes of actors
+    where their points of the sweep are.
 
     Instruments of the carrier are frames `imu` and `gnss` on it. `/imu/data_raw` has Imu, without
     orientations, and `/gnss/fix` NavSatFix or, where latitudes are not known, `/gnss/position`
@@ -137,7 +137,7 @@ def _messages(cloud: CloudLike, sweeps: Sweeps, layout: str, types: Any) -> Iter
     on_carrier += _instruments(sweeps)
     yield "/tf_static", make.transforms(on_carrier, start_ns), start_ns
     if sweeps.classes:
-        info, named = (types[name] for name in _LABELS)
+        info, named = make.kinds("vision_msgs", "LabelInfo", "VisionClass")
         told = [named(number, name) for number, name in sweeps.classes.items()]
         yield "/label_info", info(make.header("", start_ns), told, 0.0), start_ns
     for sweep, points in enumerate(sweeps.points(cloud)):
@@ -324,10 +324,9 @@ def _rows(
         }
     if "rgb" in (row.names or ()):
         values["rgb"] = as_float(*(there[name] for name in COLOURS))
-    if VELOCITY in (row.names or ()):
-        values[VELOCITY] = there[VELOCITY]
-    if "label" in (row.names or ()):
-        values["label"] = there["class"]
+    for name, column in ((VELOCITY, VELOCITY), ("label", "class")):
+        if name in (row.names or ()):
+            values[name] = there[column]
     rows = np.zeros(len(points), row)
     for name, column in values.items():
         rows[name] = column
@@ -340,7 +339,8 @@ class _Messages:
     def __init__(self, types: Any) -> None:
         self._types = types
 
-    def _kinds(self, package: str, *names: str) -> list[Any]:
+    def kinds(self, package: str, *names: str) -> list[Any]:
+        """Types of messages of a package."""
         return [self._types[f"{package}/msg/{name}"] for name in names]
 
     def stamp(self, time_ns: int) -> Any:
@@ -353,8 +353,8 @@ class _Messages:
 
     def transforms(self, frames: list[tuple[str, str, Placed, int]], time_ns: int) -> Any:
         """Frames in others: parent, name, poses, and which of them."""
-        vector, turn = self._kinds("geometry_msgs", "Vector3", "Quaternion")
-        transform, stamped = self._kinds("geometry_msgs", "Transform", "TransformStamped")
+        vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
+        transform, stamped = self.kinds("geometry_msgs", "Transform", "TransformStamped")
         return self._types["tf2_msgs/msg/TFMessage"]([
             stamped(
                 self.header(parent, time_ns), name,
@@ -376,8 +376,8 @@ class _Messages:
         return merge(*both, key=lambda one: one[2])
 
     def _imu(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
-        vector, turn = self._kinds("geometry_msgs", "Vector3", "Quaternion")
-        (imu,) = self._kinds("sensor_msgs", "Imu")
+        vector, turn = self.kinds("geometry_msgs", "Vector3", "Quaternion")
+        (imu,) = self.kinds("sensor_msgs", "Imu")
         unknown = np.zeros(9)
         unknown[0] = -1  # there is no orientation
         rate, force = (
@@ -394,8 +394,8 @@ class _Messages:
             yield "/imu/data_raw", message, time_ns
 
     def _gnss(self, there: Instruments, frame: str, start_ns: int) -> Iterator[Sent]:
-        point, stamped = self._kinds("geometry_msgs", "Point", "PointStamped")
-        fix, status = self._kinds("sensor_msgs", "NavSatFix", "NavSatStatus")
+        point, stamped = self.kinds("geometry_msgs", "Point", "PointStamped")
+        fix, status = self.kinds("sensor_msgs", "NavSatFix", "NavSatStatus")
         variances = np.zeros(3) if there.gnss is None else np.array(there.gnss.variances)
         known = fix.COVARIANCE_TYPE_DIAGONAL_KNOWN if variances.any() else 0
         for time, x, y, z, *place in there.rows(GNSS_FILE):
@@ -422,8 +422,8 @@ class _Messages:
     def markers(self, boxes: Boxes, actors: list[str], time_ns: int) -> Any:
         """Boxes of actors as a sensor saw them, in place of those that another saw before."""
         types, names = self._types, ("Point", "Quaternion", "Pose", "Vector3")
-        point, turn, pose, vector = self._kinds("geometry_msgs", *names)
-        marker, mesh = self._kinds("visualization_msgs", "Marker", "MeshFile")
+        point, turn, pose, vector = self.kinds("geometry_msgs", *names)
+        marker, mesh = self.kinds("visualization_msgs", "Marker", "MeshFile")
         image = types["sensor_msgs/msg/CompressedImage"]
         header, none = self.header(WORLD, time_ns), np.empty(0, np.uint8)
         orange = types["std_msgs/msg/ColorRGBA"](1, 0.6, 0, 0.4)

@@ -88,8 +88,7 @@ class Sweeps:
     start_ns: int | None = None  # from 1970-01-01 UTC to the survey's start
     instruments: Instruments | None = None  # of the carrier, with files beside it
     fired: Fired | None = None  # all rays, if the survey keeps every return with its ray
-    # Names in the column `class`; the tokens that formats make of sweeps do not depend on them.
-    classes: Mapping[int, str] = field(default_factory=dict, compare=False)
+    classes: Mapping[int, str] = field(default_factory=dict, compare=False)  # their names
 
     def __len__(self) -> int:
         return len(self.begins_ns)
@@ -220,8 +219,7 @@ class Sweeps:
         words = {"format": _FORMAT, **{name: getattr(self, name) for name in _WORDS}}
         if self.instruments is not None:
             words["instruments"] = self.instruments.words()
-        if self.classes:
-            words["classes"] = dict(self.classes)
+        words |= {"classes": dict(self.classes)} if self.classes else {}
         arrays: dict[str, Any] = {"words": np.frombuffer(json.dumps(words).encode(), np.uint8)}
         arrays |= {name: getattr(self, name) for name in _ARRAYS}
         placed = {"": self.pose, "mount_": self.mounts}

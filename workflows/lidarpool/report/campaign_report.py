@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from types import MappingProxyType
 from typing import Any
 
 from ..base.errors import LidarpoolError, explained
@@ -20,7 +19,7 @@ from ..run.run_result import CampaignRun
 from ..scenario.campaign import CampaignSpec
 from .charts import draw_results, draw_varied
 from .page.rendering import rendered
-from .report import named_classes, stage_figures
+from .report import class_names, stage_figures
 
 CARD, PAGE, PICTURES, SPLITS = "README.md", "report.html", "pictures", "splits"
 VALUES_SHOWN = 12  # of a quantity with labels
@@ -38,7 +37,6 @@ def write_card(
     jobs: Iterable[JobRow],
     versions: Mapping[str, str],
     picture: Page | None = None,
-    classes: Mapping[int, str] = MappingProxyType({}),
 ) -> dict[str, Any]:
     """Write README.md, report.html, pictures and splits of a data set, and report.json last.
 
@@ -56,8 +54,6 @@ def write_card(
         Software on which the bytes of points depend, {name: version}.
     picture
         Of one job, for README.md.
-    classes
-        Names of classes.
 
     Returns
     -------
@@ -77,7 +73,7 @@ def write_card(
             with place.writing(f"{PICTURES}/{name}.png") as file:
                 file.write(drawing.png())
         place.remove([f"{PICTURES}/{name}.png" for name in pages if name not in drawn])
-        report = campaign_report(campaign, run, versions, figures, classes)
+        report = campaign_report(campaign, run, versions, figures)
         values: dict[str, Any] = {
             "report": report,
             "captions": _CAPTIONS,
@@ -118,11 +114,7 @@ def _with_splits(place: Storage, jobs: Iterable[JobRow]) -> Iterator[JobRow]:
 
 
 def campaign_report(
-    campaign: CampaignSpec,
-    run: CampaignRun,
-    versions: Mapping[str, str],
-    figures: Figures,
-    classes: Mapping[int, str],
+    campaign: CampaignSpec, run: CampaignRun, versions: Mapping[str, str], figures: Figures
 ) -> dict[str, Any]:
     """Return the figures of a data set, as in report.json."""
     return {
@@ -149,7 +141,8 @@ def campaign_report(
             name: {key: counts[key] for key in ("jobs", "sweeps", "points")}
             for name, counts in figures.splits.items()
         },
-        "classes": named_classes(figures.classes, classes),
+        "classes": {str(number): {**counts} for number, counts in sorted(figures.classes.items())},
+        **class_names(run.classes),
         "varied": list(figures.described()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],

@@ -26,7 +26,6 @@ from ..run.run_result import RunResult
 from ..run.trials import TRIAL
 from ..scene.scene import Scene
 from ..sensor import Sensor, Survey
-from ..sensor.materials import CLASS_MOST
 from ..sensor.survey import CloudOptions
 from ..sensor.weather import Weather
 
@@ -65,7 +64,7 @@ class CountedCloud:
     def __init__(self, cloud: CloudLike, objects: int) -> None:
         self._cloud = cloud
         self.by_object, self.no_surface = np.zeros(objects, np.int64), 0
-        self.by_class = np.zeros(CLASS_MOST + 1, np.int64)
+        self.by_class = np.zeros(1 << 16, np.int64)
         self.limits: dict[str, tuple[float, float]] = {}
         self.bounds: Floats = np.asarray(cloud.bounds, dtype=np.float64)
         # A cell that a surface crosses has about the square of its side of that surface.
@@ -148,10 +147,8 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
             name: int(count) for name, count in zip(scene.all_names, cloud.by_object, strict=True)
         }
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
-        "classes": named_classes(
-            {n: {"points": int(cloud.by_class[n])} for n in np.flatnonzero(cloud.by_class)},
-            survey.classes,
-        ),
+        "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
+        **class_names(survey.classes),
         "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
@@ -171,14 +168,9 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
     }
 
 
-def named_classes(
-    classes: Mapping[int, Mapping[str, int]], names: Mapping[int, str]
-) -> dict[str, dict[str, Any]]:
-    """Figures of classes for JSON, with the names of those that have one."""
-    return {
-        str(number): {**classes[number], **({"name": names[number]} if number in names else {})}
-        for number in sorted(classes)
-    }
+def class_names(names: Mapping[int, str]) -> dict[str, dict[str, str]]:
+    """Entry of a report with names of classes, if there are some."""
+    return {"class_names": {str(n): name for n, name in names.items()}} if names else {}
 
 
 def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:

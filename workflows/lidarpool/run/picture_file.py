@@ -73,7 +73,7 @@ class PictureContent:
     reflectance: Floats | None = None
     coordinates: str = "world"  # of the cloud's points, or "sensor": they do not fit the scene
     triangles: int = 0  # of the scene, though simpler instances may be drawn
-    classes: Sequence[str] = ()  # names of the classes 0, 1, 2, …
+    classes: Sequence[str] | None = None  # names of the classes 0, 1, 2, …
 
     @classmethod
     def of(cls, result: RunResult) -> PictureContent:
@@ -138,11 +138,9 @@ class PictureContent:
         """Names of the values 0, 1, 2, … of a column, if any."""
         if column.name == "sensor":
             return [way.name for way in self.sensors]
-        if column == TABLE["class"]:
-            return self.classes
         if column == TABLE["cause"]:
             return CAUSES
-        return self.scene.all_names if column.name == "object" else ()
+        return {"object": self.scene.all_names, "class": self.classes}.get(column.name) or ()
 
     def save(self, path: Path) -> None:
         """Write it as a NumPy archive; the same content gives the same bytes."""
@@ -244,8 +242,7 @@ class PictureContent:
             plan = Plan(path=arrays["path"], **numbers)
         rays, trials = arrays["sample_rays"], tuple(arrays.get("waypoints", ()))
         duration, own = float(arrays["duration_ns"]), [Column(**one) for one in names["own"]]
-        rest = names["coordinates"], names["triangles"], names.get("classes", ())
-        rest = (arrays.get("reflectance"), *rest)
+        rest = arrays.get("reflectance"), *map(names.get, ("coordinates", "triangles", "classes"))
         return cls(scene, sensors, counts, rays, planning, plan, trials, duration, own, *rest)
 
 

@@ -109,8 +109,9 @@ class CampaignRun:
         Wall time of this run.
     stages
         Tasks of each stage.
-    notes, sensors
-        Remarks for the user, and the sensors of the jobs that are done, {name: models and rates}.
+    notes, sensors, classes
+        Remarks for the user, the sensors of the jobs that are done, {name: models and rates}, and
+        names of classes, {number: name}.
     """
 
     failed: tuple[JobRow, ...]
@@ -123,6 +124,7 @@ class CampaignRun:
     stages: tuple[StageTotals, ...] = ()
     notes: tuple[str, ...] = ()
     sensors: Mapping[str, str] = field(default_factory=dict)
+    classes: Mapping[int, str] = field(default_factory=dict)
 
     @classmethod
     def of(

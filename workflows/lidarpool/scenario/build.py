@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from fnmatch import fnmatchcase
 from functools import partial
@@ -332,24 +332,9 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
     for semantic_class in sorted({one for one in vehicles if one is not None}):
         rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
         made = with_class(made or [every], semantic_class, rows, scene.all_names)
-    if _has_city(scenario):
+    if any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files):
         made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
     return made
-
-
-def _has_city(scenario: Scenario) -> bool:
-    return any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files)
-
-
-def _class_names(given: Scenario, columns: Collection[str]) -> dict[int, str]:
-    """Names of classes, also of those that city objects have by their types."""
-    names = dict(given.classes)
-    if "class" in columns and _has_city(given):
-        vehicles = given.traffic.vehicles if given.traffic else ()
-        own = {one.semantic_class for one in (*given.materials, *given.placed, *vehicles)}
-        own |= {number for number, name in CITY_NAMES.items() if name in names.values()}
-        names = {n: name for n, name in CITY_NAMES.items() if n not in own} | names
-    return names
 
 
 def _survey(
@@ -370,6 +355,12 @@ def _survey(
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
     track = way if isinstance(way, Track) else None
     poses = () if isinstance(way, Track) else given.poses or way
+    # City objects have classes by their types; a number or name of the scenario's is its own.
+    placed = (*given.placed, *(given.traffic.vehicles if given.traffic else ()))
+    own = {one.semantic_class for one in (*given.materials, *placed)}
+    made = {one.semantic_class for one in materials} - own if "class" in cloud["columns"] else ()
+    named = {CITY_NAMES[number]: number for number in made if number in CITY_NAMES}
+    named |= {name: number for number, name in given.classes.items()}
     own_noise = all(one.noise is not None for one in carried)
     alone = not given.sensors and given.mount is None and carried[0].noise is None
     return Survey(
@@ -378,7 +369,7 @@ def _survey(
         **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
         steps=given.steps,
         materials=materials,
-        classes=_class_names(given, cloud["columns"]),
+        classes={number: name for name, number in named.items()},
         returns=Returns(**dict(given.returns)),
         noise=Noise() if own_noise else Noise(**dict(given.noise)),
         navigation=given.navigation,

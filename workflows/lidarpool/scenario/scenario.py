@@ -55,14 +55,12 @@ class Scenario(Section):
     ----------
     scene, sensor, materials, returns, noise, weather, navigation, cloud, output, planning, pool
         See `lidarpool.scenario.sections`.
-    classes
-        Names of semantic classes, {number: name}.
     poses
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
         objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
         middle of a room or landscape, or around an object.
-    steps
-        Time steps from each pose.
+    steps, classes
+        Time steps from each pose, and names of semantic classes, {number: name}.
 
     Raises
     ------

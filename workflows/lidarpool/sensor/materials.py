@@ -34,23 +34,20 @@ NEAR_NM, FAR_NM = 905.0, 1550.0  # wavelengths of the table of reflectances
 POLISHED = 0.04  # share that plastics, paints and wet surfaces reflect at right angles, n = 1.5
 DARKEST = 1e-3  # least reflectance of a colour, so that every hit is a return
 
-CLASS_MOST = 65_535
-SemanticClass = Annotated[int, Field(ge=0, le=CLASS_MOST)]
+SemanticClass = Annotated[int, Field(ge=0, le=65_535)]
 Transparent = Literal["none", "pass", "mirror"]
 
 
 def _checked_names(given: Any, handler: Callable[[Any], Any]) -> Any:
     """Refuse names of classes that files cannot hold, or that two classes share."""
-    numbers: dict[str, int] = {}
     for number, name in given.items() if isinstance(given, Mapping) else ():
-        known = type(number) is int and 0 <= number <= CLASS_MOST
-        if not (known and isinstance(name, str) and 0 < len(name) < 100 and name.isprintable()):
+        known = type(number) is int and 0 <= number <= 65_535 and isinstance(name, str)
+        alone = [*given.values()].count(name) == 1
+        if not (known and alone and 0 < len(name) < 100 and name.isprintable()):
             raise ValueError(
-                f"{shown({number: name})} is no class with its name: give a whole number of 0 to "
-                f"{CLASS_MOST} and a line of less than 100 letters, such as {{10: car}}."
+                f"{shown({number: name})} is no class with a name of its own: give whole numbers "
+                "of 0 to 65535 and a different text for each, such as {10: car}."
             )
-        if (other := numbers.setdefault(name, number)) != number:
-            raise ValueError(f"{other} and {number} are both {name!r}: give each its own name.")
     return handler(given)
 
 

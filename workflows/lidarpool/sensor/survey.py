@@ -212,8 +212,7 @@ class Survey(CloudOptions, Weather):
     navigation
         IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
     classes
-        Names of semantic classes, {number: name}, which reports and files get; the cloud then has
-        the column `class`. They do not tell one survey from another.
+        Names of semantic classes, {number: name}, for reports and files; they add the column.
     **options
         The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
@@ -247,12 +246,9 @@ class Survey(CloudOptions, Weather):
         self._check_names()
         if self.sensors:
             self._set(sensor=self.sensors[0].sensor)
-        extra = (("sensor",) if len(self.sensors) > 1 else ()) + (
-            ("class",) if self.classes else ()
-        )
-        self._set(
-            columns=chosen((*self.columns, *extra)), classes=dict(sorted(self.classes.items()))
-        )
+        extra = {"sensor": len(self.sensors) > 1, "class": self.classes}
+        columns = (*self.columns, *(name for name, needed in extra.items() if needed))
+        self._set(columns=chosen(columns), classes=dict(sorted(self.classes.items())))
         finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
             if getattr(self, name) is None:
