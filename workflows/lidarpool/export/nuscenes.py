@@ -144,7 +144,7 @@ def _files(sweeps: Sweeps, channels: Sequence[str], first: Bools, entry: Entry |
     ]
 
 
-def _categories(kinds: list[dict[str, Any]], classes: Mapping[int, str]) -> list[dict[str, Any]]:
+def _categories(kinds: Iterable[Any], classes: Mapping[int, str]) -> list[dict[str, Any]]:
     """Rows of all classes and of kinds of actors, numbered without gaps as lidarseg needs it."""
     known = {row["name"]: row for row in kinds}
     last = max((number for number in classes if number < 256), default=0)
@@ -163,9 +163,9 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
             name: stack.enter_context(place.writing(f"{VERSION}/{name}.json")) for name in _TABLES
         }
         before: dict[str, bytes] = {}  # what comes before the next row
-        kinds, classes = list[dict[str, Any]](), dict[int, str]()
+        kinds, classes = dict[str, dict[str, Any]](), dict[int, str]()
 
-        def write(tables: Mapping[str, list[dict[str, Any]]]) -> None:
+        def write(tables: Mapping[str, Iterable[dict[str, Any]]]) -> None:
             for name, rows in tables.items():
                 for row in rows:
                     if name in _SHARED:
@@ -179,10 +179,11 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
                     before[name] = b",\n"
 
         for job in jobs:
-            kinds += job["tables"].pop("category")
+            kinds |= {row["token"]: row for row in job["tables"].pop("category")}
             classes |= {int(number): name for number, name in job.get("classes", {}).items()}
             write(job["tables"])
-        write({"category": _categories(kinds, classes) if "lidarseg" in files else kinds})
+        rows = kinds.values()
+        write({"category": _categories(rows, classes) if "lidarseg" in files else rows})
         for name, file in files.items():
             file.write(b"\n]\n" if name in before else b"[]\n")
     with place.writing(_MAP) as file:

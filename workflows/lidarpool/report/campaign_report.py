@@ -19,7 +19,7 @@ from ..run.run_result import CampaignRun
 from ..scenario.campaign import CampaignSpec
 from .charts import draw_results, draw_varied
 from .page.rendering import rendered
-from .report import class_names, stage_figures
+from .report import stage_figures
 
 CARD, PAGE, PICTURES, SPLITS = "README.md", "report.html", "pictures", "splits"
 VALUES_SHOWN = 12  # of a quantity with labels
@@ -142,7 +142,7 @@ def campaign_report(
             for name, counts in figures.splits.items()
         },
         "classes": {str(number): {**counts} for number, counts in sorted(figures.classes.items())},
-        **class_names(run.classes),
+        **({"class_names": dict(run.classes)} if run.classes else {}),
         "varied": list(figures.described()),
         "failed": [_job_entry(row, "error") for row in figures.failed],
         "slowest": [_job_entry(row, "seconds") for row in figures.slowest],

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict
 from importlib.metadata import PackageNotFoundError, version
@@ -148,7 +148,7 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
         }
         | ({NO_SURFACE: cloud.no_surface} if cloud.no_surface else {}),
         "classes": {str(n): {"points": k} for n, k in enumerate(cloud.by_class.tolist()) if k},
-        **class_names(survey.classes),
+        **({"class_names": dict(survey.classes)} if survey.classes else {}),
         "points_per_m2": cloud.density if survey.coordinates == "world" else None,
         "columns": _columns(cloud),
         "seconds": {
@@ -166,11 +166,6 @@ def make_report(result: RunResult, files: Sequence[str], cloud: CountedCloud) ->
         "planning": _planning(result),
         "files": list(files),
     }
-
-
-def class_names(names: Mapping[int, str]) -> dict[str, dict[str, str]]:
-    """Entry of a report with names of classes, if there are some."""
-    return {"class_names": {str(n): name for n, name in names.items()}} if names else {}
 
 
 def summary(folder: Path | Storage, report: dict[str, Any]) -> dict[str, Any]:
