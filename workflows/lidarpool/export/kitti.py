@@ -115,8 +115,10 @@ class Reader(reading.Reader):
 
 
 def labels_file(classes: Mapping[int, str]) -> bytes:
-    """Return names of classes as tools of SemanticKITTI read them; 0 is there."""
-    return yaml.safe_dump({"labels": {0: "unlabeled", **classes}}, allow_unicode=True).encode()
+    """Return names of classes, and colours (blue, green, red), as semantic-kitti-api reads them."""
+    labels = {0: "unlabeled", **classes}
+    colours = {number: [number * step % 256 for step in (37, 91, 151)] for number in labels}
+    return yaml.safe_dump({"labels": labels, "color_map": colours}, allow_unicode=True).encode()
 
 
 def _names(sweeps: Sweeps, entry: Entry | None) -> list[str]:
