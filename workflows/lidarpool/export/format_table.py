@@ -66,7 +66,7 @@ _KITTI = (
 )
 _NUSCENES = (
     r"(samples|sweeps)/[^/]+/([^/]+/)?\d+\.pcd\.bin|v1\.0-lidarpool/\w+\.json|maps/none\.png|"
-    r"lidarseg/v1\.0-lidarpool/[^/]+_lidarseg\.bin"
+    r"lidarseg/v1\.0-lidarpool/[^/]+\.pcd\.bin"
 )
 _PARTS = r"part-\d+\.parquet"
 

@@ -173,8 +173,7 @@ def merge(place: Storage, jobs: Iterable[Mapping[str, Any]]) -> None:
                             continue
                         shared.add(row["token"])
                     if name not in files:  # lidarseg
-                        file = place.writing(f"{VERSION}/{name}.json")
-                        files[name] = stack.enter_context(file)
+                        files[name] = stack.enter_context(place.writing(f"{VERSION}/{name}.json"))
                     files[name].write(before.get(name, b"[\n") + json.dumps(row).encode())
                     before[name] = b",\n"
 

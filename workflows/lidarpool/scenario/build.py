@@ -358,7 +358,8 @@ def _survey(
     # City objects have classes by their types; a number or name of the scenario's is its own.
     placed = (*given.placed, *(given.traffic.vehicles if given.traffic else ()))
     own = {one.semantic_class for one in (*given.materials, *placed)}
-    made = {one.semantic_class for one in materials} - own if "class" in cloud["columns"] else ()
+    asked = given.classes or "class" in cloud["columns"]
+    made = {one.semantic_class for one in materials} - own if asked else ()
     named = {CITY_NAMES[number]: number for number in made if number in CITY_NAMES}
     named |= {name: number for number, name in given.classes.items()}
     own_noise = all(one.noise is not None for one in carried)
