@@ -59,9 +59,8 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     """
     coloured = {*COLOURS} <= {column.name for column in cloud.table}
     packets = _Packets.of(cloud)
-    header = laspy.LasHeader(
-        version="1.4", point_format=(6 if packets is None else 9) + (1 if coloured else 0)
-    )
+    point_format = (6 if packets is None else 9) + int(coloured)
+    header = laspy.LasHeader(version="1.4", point_format=point_format)
     header.generating_software = "lidarpool"
     header.creation_date = date(1980, 1, 6)  # of GPS time 0, at which surveys without a date begin
     begins_s = 0.0
@@ -75,10 +74,9 @@ def _write(path: Path, cloud: CloudLike, sweeps: Sweeps, *, compress: bool) -> N
     # 2.7.2, and what reads through it, opens no others (PDAL's issue 4412).
     header.global_encoding.wkt = True
     if sweeps.classes:
-        lookup = laspy.vlrs.known.ClassificationLookupVlr()
+        header.vlrs.append(lookup := laspy.vlrs.known.ClassificationLookupVlr())
         for number in range(256):  # the record has them all
             lookup[number] = sweeps.classes.get(number, "").encode("ascii", "replace")[:15].decode()
-        header.vlrs.append(lookup)
     if packets is not None:
         header.vlrs.extend(packets.descriptors)
         header.global_encoding.waveform_data_packets_internal = True
