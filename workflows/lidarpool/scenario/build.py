@@ -22,6 +22,7 @@ from ..export.formats import Format
 from ..plan import Planning
 from ..plan.planning import Search
 from ..scene.actors import Actor
+from ..scene.files.cityjson import CLASS_NAMES as CITY_NAMES
 from ..scene.files.cityjson import CLASSES as CITY_CLASSES
 from ..scene.files.meshfile import CITYJSON
 from ..scene.robot import Robot
@@ -354,6 +355,13 @@ def _survey(
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
     track = way if isinstance(way, Track) else None
     poses = () if isinstance(way, Track) else given.poses or way
+    # City objects have classes by their types; a number or name of the scenario's is its own.
+    placed = (*given.placed, *(given.traffic.vehicles if given.traffic else ()))
+    own = {one.semantic_class for one in (*given.materials, *placed)}
+    asked = given.classes or "class" in cloud["columns"]
+    made = {one.semantic_class for one in materials} - own if asked else ()
+    named = {CITY_NAMES[number]: number for number in made if number in CITY_NAMES}
+    named |= {name: number for number, name in given.classes.items()}
     own_noise = all(one.noise is not None for one in carried)
     alone = not given.sensors and given.mount is None and carried[0].noise is None
     return Survey(
@@ -362,6 +370,7 @@ def _survey(
         **({"sensor": carried[0].sensor} if alone else {"sensors": carried}),
         steps=given.steps,
         materials=materials,
+        classes={number: name for name, number in named.items()},
         returns=Returns(**dict(given.returns)),
         noise=Noise() if own_noise else Noise(**dict(given.noise)),
         navigation=given.navigation,

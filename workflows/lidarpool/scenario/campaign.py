@@ -650,8 +650,9 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             key, node, kind = _field(node, rest[0], at)
             used = 1
         elif isinstance(node, dict):
-            key, used = _named(list(node), rest, at)
-            node = node[key]
+            keys = {str(key): key for key in node}  # of classes, numbers
+            name, used = _named([*keys], rest, at)
+            node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
             key, used = _entry(node, rest, at)
             node = node[key]

@@ -18,6 +18,7 @@ from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
 from ..scene.files.meshfile import SUFFIXES
 from ..sensor import Material, Navigation
+from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
@@ -94,8 +95,8 @@ class Scenario(Section):
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
         objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
         middle of a room or landscape, or around an object.
-    steps
-        Time steps from each pose.
+    steps, classes
+        Time steps from each pose, and names of semantic classes, {number: name}.
 
     Raises
     ------
@@ -174,6 +175,10 @@ class Scenario(Section):
             max_length=100_000,
         ),
     ] = ()
+    classes: Annotated[
+        ClassNames,
+        about("names of classes, for reports and files; they add the column class", {40: "road"}),
+    ] = {}  # noqa: RUF012 - of a frozen model
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
     weather: Annotated[Weather, may_be_empty(Weather)] = Weather()

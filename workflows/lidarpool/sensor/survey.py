@@ -25,7 +25,7 @@ from ..columns.table import (
     stored,
     waveform_column,
 )
-from .materials import Material
+from .materials import ClassNames, Material
 from .navigation import Navigation, check_navigation
 from .noise import ALARMS_MOST, Noise
 from .optics import WINDOW_SIGMAS, Precision, Returns
@@ -211,6 +211,8 @@ class Survey(CloudOptions, Weather):
         Noise of ranges and angles, and lost returns.
     navigation
         IMU and GNSS receiver of the carrier, whose samples are written beside the cloud.
+    classes
+        Names of semantic classes, {number: name}, for reports and files; they add the column.
     **options
         The fields of `Weather` and `CloudOptions`, such as `rain_mm_h` and `keep_every`.
 
@@ -236,6 +238,7 @@ class Survey(CloudOptions, Weather):
     returns: Returns = field(default_factory=Returns)
     noise: Noise = field(default_factory=Noise)
     navigation: Navigation | None = None
+    classes: ClassNames = field(default_factory=dict, compare=False)
 
     def __post_init__(self) -> None:
         self._set(poses=_poses(self.poses), sensors=tuple(self.sensors))
@@ -243,8 +246,9 @@ class Survey(CloudOptions, Weather):
         self._check_names()
         if self.sensors:
             self._set(sensor=self.sensors[0].sensor)
-        extra = ("sensor",) if len(self.sensors) > 1 else ()
-        self._set(columns=chosen((*self.columns, *extra)))
+        extra = {"sensor": len(self.sensors) > 1, "class": self.classes}
+        columns = (*self.columns, *(name for name, needed in extra.items() if needed))
+        self._set(columns=chosen(columns), classes=dict(sorted(self.classes.items())))
         finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
             if getattr(self, name) is None:

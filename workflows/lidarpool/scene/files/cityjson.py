@@ -36,6 +36,8 @@ CLASSES = {
     11: ("Road *", "Transport*Square *"),
     17: ("Bridge* *",),
 }  # fmt: skip
+CLASS_NAMES = {1: "unclassified", 2: "ground", 5: "high vegetation", 6: "building", 9: "water",
+               10: "rail", 11: "road surface", 17: "bridge deck"}  # fmt: skip
 
 # How deep surfaces are nested in the boundaries of a geometry.
 _DEPTHS = {
