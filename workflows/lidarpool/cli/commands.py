@@ -184,7 +184,7 @@ def run(
     A campaign file, or several scenarios, make one data set.
 
     A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
-    above if it is an object; every hit is kept, to 1 mm. For another sensor, pose or unit of
+    above if it is an object; every hit is kept. For another sensor, pose or unit of
     length, lidarpool init DIR --mesh FILE writes a scenario to edit.
 
     \b

@@ -208,6 +208,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
         "scans": job.survey.scan_count,
         "rays": job.survey.ray_count,
         "estimate": estimate,
+        "precision_m": job.survey.precision_m,
         "trials": job.trials,
         "backend": backend,
         "casters": casters,
@@ -528,8 +529,8 @@ def _of_job(job: Job, found: dict[str, Any]) -> Iterator[str]:
         yield f"air         takes {1000 * alpha:.3g}/km: {left}"
     if estimate:
         yield (
-            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits; an estimate "
-            f"from {estimate['rays']:,} rays cast here"
+            f"points      about {estimate['points']:,} of {estimate['hits']:,} hits, rounded to "
+            f"{job.survey.precision_m:g} m; an estimate from {estimate['rays']:,} rays cast here"
         )
     yield f"planning    {f'{job.trials:,} trials' if job.trials else 'none'}"
     backend = found["backend"]

@@ -528,8 +528,6 @@ def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> st
     """Return the text of a scenario whose poses are the stations."""
     import yaml
 
-    from ..scenario.scenario import MESH_CLOUD
-
     def moved(file: Path) -> str:
         return Path(os.path.relpath(file.resolve(), folder.resolve())).as_posix()
 
@@ -544,7 +542,7 @@ def _scenario(read: Scenario, folder: Path, model: str, plan: StationPlan) -> st
         "sensor": {"model": moved(Path(model)) if own else model},
         "poses": [[round(float(part), 3) for part in place] for place in plan.stations],
         "steps": 36,
-        "cloud": {**MESH_CLOUD, "columns": ["range"]},
+        "cloud": {"columns": ["range"]},
     }
     head = (
         f"# {plural(len(plan.stations), 'station')}, in the order in which they were chosen: "

@@ -26,7 +26,7 @@ from ..scene.files.cityjson import CLASSES as CITY_CLASSES
 from ..scene.files.meshfile import CITYJSON
 from ..scene.robot import Robot
 from ..scene.scene import Scene
-from ..sensor import Material, Mounted, Noise, Pose, Returns, Survey, Track
+from ..sensor import Material, Mounted, Noise, Pose, Returns, Sensor, Survey, Track
 from ..sensor.materials import MaterialTable, rows_named, with_class, with_classes
 from ..sensor.survey import CloudOptions
 from ..sensor.trajectory import CENTRE
@@ -53,8 +53,8 @@ SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
-# Of the hits in a scene with the default objects, every so many are kept.
-SEED_KEPT = 5
+# The cloud of a scene with the default objects: of the hits, every so many are kept.
+SEED_KEPT, SEED_PRECISION_M = 5, 0.01
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,7 +149,11 @@ def build(
         sensors = _mounted(shapes)
     placing: Placing | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
-        placing = place(scene, sensors[0], landscape=bool(found.rasters))
+        alone = scenario.mount is None and not scenario.sensors
+        narrow = alone and not scenario.sensor.model_fields_set
+        placing = place(scene, sensors[0], landscape=bool(found.rasters), narrow=narrow)
+        if placing.grid:
+            sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
     poses = SEED_POSES if placing is None else placing.poses
     survey_of = partial(_survey, scenario, sensors, track or poses, scene.origin, epsg)
     actors = _actors(shapes, standing, track)
@@ -349,8 +353,9 @@ def _survey(
     needs, cloud = given.output.needs, declared(given.cloud, CloudOptions)
     cloud["columns"] = (*given.cloud.columns, *needs, *columns)
     cloud["epsg"] = given.cloud.epsg or epsg
-    if given.scene.has_seed and cloud["keep_every"] is None:
-        cloud["keep_every"] = 1 if "ray" in needs else SEED_KEPT
+    if given.scene.has_seed:
+        cloud["keep_every"] = cloud["keep_every"] or (1 if "ray" in needs else SEED_KEPT)
+        cloud["precision_m"] = cloud["precision_m"] or SEED_PRECISION_M
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
     track = way if isinstance(way, Track) else None
     poses = () if isinstance(way, Track) else given.poses or way

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
 from ..scene.simplified import Drawn
 from ..scene.surroundings import Surroundings, in_the_way, is_open
-from ..sensor import Mounted, Pose
+from ..sensor import Mounted, Pose, Sensor
 
 # Heights above a floor; and the least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
@@ -30,6 +30,10 @@ _AZIMUTHS_DEG, _ABOVE_DEG, _FAR = (45, 135, 225, 315), 20.0, (1.5, 3.0)
 _LOOKED_AT = 1000  # firings that tell a sensor's field of view
 _FACING_DEG = 45.0  # rays of that field
 
+# A grid around an object has about so many points, but not more rays; of all poses. Rays that are
+# tried are so many in a row, and the field of view is so much wider than the object.
+_POINTS, _RAYS_MOST, _TRIED, _MARGIN = 100_000, 5_000_000, 64, 1.02
+
 # Larger scenes are not looked at, nor sheets such as terrains of more triangles than the second,
 # and instances have no more: a tree takes 300 bytes and some microseconds a triangle.
 _TRIANGLES_MOST, _SHEETS_MOST = 2_000_000, 200_000
@@ -42,14 +46,18 @@ class Placing:
     poses: tuple[Pose, ...]  # in world coordinates
     note: str = ""  # for users, on poses that they may not expect
     around: bool = False  # whether the poses are around an object
+    grid: Mapping[str, float] = field(default_factory=dict)  # of `Sensor.grid`, if narrowed to it
 
 
-def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
+def place(
+    scene: Scene, carried: Mounted, landscape: bool = False, narrow: bool = False
+) -> Placing:
     """Choose poses in a scene from mesh files; a landscape is not taken for an object.
 
     In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
-    a lower room. Around an object they are on four sides and above it.
+    a lower room. Around an object they are on four sides and above it; a grid to `narrow` is
+    narrowed to it.
     """
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
@@ -70,7 +78,39 @@ def place(scene: Scene, carried: Mounted, landscape: bool = False) -> Placing:
         f"this looks like an object of {sides} m, not a place to stand in: "
         f"{plural(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
     )
-    return Placing(poses, note, around=True)
+    grid = _narrowed(drawn, looker, poses) if narrow else {}
+    if grid:
+        width, height = grid["horizontal_fov_deg"], grid["vertical_fov_deg"]
+        note += (
+            f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
+            f"{grid['layers']:,} rays over the {width:g} x {height:g} degrees that it takes up"
+        )
+    return Placing(poses, note, around=True, grid=grid)
+
+
+def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, float]:
+    """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
+    sides = np.zeros(2)  # the widest angles to either side, and up or down
+    for at, pose in zip(_local(poses, scene), poses, strict=True):
+        x, y, z = ((scene.vertices - at) @ pose.rotation).T
+        angles = np.abs([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
+        sides = np.maximum(sides, angles.max(axis=1))
+    width, height = np.clip(np.ceil(np.degrees(sides) * 20 * _MARGIN) / 10, 0.1, 179.0).tolist()
+    tried = Sensor.grid(_TRIED, _TRIED, height, horizontal_fov_deg=width)
+    rays = tried.directions(np.arange(_TRIED)).reshape(-1, 3)
+    share = np.mean([
+        np.isfinite(looker.cast(np.tile(at, (len(rays), 1)), rays @ pose.rotation.T).distance)
+        for at, pose in zip(_local(poses, scene), poses, strict=True)
+    ])  # fmt: skip
+    count = min(_POINTS / max(share, 1e-6), _RAYS_MOST)
+    a_degree = np.sqrt(count / (len(poses) * width * height))
+    rows, columns = (max(4, round(side * a_degree / 10)) * 10 for side in (width, height))
+    return {
+        "rays_per_revolution": rows,
+        "layers": columns,
+        "vertical_fov_deg": height,
+        "horizontal_fov_deg": width,
+    }
 
 
 def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:

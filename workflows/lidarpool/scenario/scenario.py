@@ -41,9 +41,6 @@ from .sections import (
     scene_in_short,
 )
 
-# The cloud of a mesh file without a scenario.
-MESH_CLOUD = {"precision_m": 0.001}
-
 
 class Scenario(Section):
     """A survey and its path planning, as described by a scenario file.
@@ -162,7 +159,7 @@ class Scenario(Section):
         """
         path = Path(path)
         mesh = path.suffix.lower() in SUFFIXES
-        data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD} if mesh else read_yaml(path)
+        data = {"scene": {"files": [path.name]}} if mesh else read_yaml(path)
         return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod

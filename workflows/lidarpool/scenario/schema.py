@@ -14,7 +14,7 @@ from pydantic.json_schema import GenerateJsonSchema
 from ..base.validation import fields_of, is_section
 from .campaign_sections import CampaignSection
 from .placing import Placing, as_entry, on_one_line
-from .scenario import MESH_CLOUD, Scenario
+from .scenario import Scenario
 from .sections import Section
 
 SCHEMA_FILE = "scenario.schema.json"  # in the folder of a scenario
@@ -88,12 +88,12 @@ def scenario_template(files: Sequence[dict[str, str]] = (), placing: Placing | N
     """Return a commented scenario in YAML that holds all defaults.
 
     `files` are mesh files to survey, as in `scene.files`. `placing` is where the sensor is put in
-    them; its poses are written if they are around an object.
+    them; its poses and grid are written if they are around an object.
     """
     lines = [_HEAD]
-    given: dict[str, Any] = {}
-    if files:
-        given = {"scene": {"files": [*files]}, "cloud": MESH_CLOUD}
+    given: dict[str, Any] = {"scene": {"files": [*files]}} if files else {}
+    if placing is not None:
+        given["sensor"] = placing.grid
     for name, field in Scenario.model_fields.items():
         lines.append("")
         if name == "poses" and placing is not None:

@@ -40,6 +40,7 @@ OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
 SENSORS_MOST = 255  # the type of the column
 PARTICLES_MOST = 100  # that a pulse may return from
 RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
+PRECISION_M = 0.001  # of points, if a sensor states no resolution
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
 LASTS_MOST_NS = 2.0**63  # the type of the column time: 292 years
 
@@ -134,7 +135,11 @@ class CloudOptions:
     precision_m: Annotated[
         Precision,
         FILLED_IN,
-        about("step in metres that points are rounded to; by default the sensor's, or 0.01", 0.01),
+        about(
+            "step in metres that points are rounded to; by default the sensor's resolution of "
+            "ranges, 0.001 if it states none, and 0.01 in a scene with the default objects",
+            0.001,
+        ),
     ] = None  # type: ignore[assignment]
     coordinates: Annotated[
         Literal[COORDINATES],  # type: ignore[valid-type]
@@ -245,7 +250,7 @@ class Survey(CloudOptions, Weather):
             self._set(sensor=self.sensors[0].sensor)
         extra = ("sensor",) if len(self.sensors) > 1 else ()
         self._set(columns=chosen((*self.columns, *extra)))
-        finest = min(carried.sensor.optics.resolution_m for carried in self.carried)
+        finest = min(one.sensor.optics.resolution_m or PRECISION_M for one in self.carried)
         for name, default in {"keep_every": 1, "precision_m": finest}.items():
             if getattr(self, name) is None:
                 self._set(**{name: default})
