@@ -110,12 +110,6 @@ def init(folder: Path, meshes: tuple[Path, ...], unit: str | None, up_axis: str 
 
 def _entry(path: Path, folder: Path, unit: str | None, up_axis: str | None) -> dict[str, str]:
     """Entry of `scene.files` for a mesh file, relative to the scenario's folder."""
-    from ..scene.files.meshfile import SUFFIXES
-
-    if not path.is_file() or path.suffix.lower() not in SUFFIXES:
-        raise LidarpoolError(
-            f"{path} has no mesh format that can be read; these can: {' '.join(SUFFIXES)}."
-        )
     said = {"file": Path(os.path.relpath(path, folder)).as_posix()}
     return said | {k: v for k, v in (("unit", unit), ("up_axis", up_axis)) if v}
 

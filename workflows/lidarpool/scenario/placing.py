@@ -195,7 +195,8 @@ def poses_around(scene: Scene, carried: Mounted) -> tuple[Pose, ...]:
     far = max(far, carried.sensor.min_range_m + diagonal)
     digits = max(0, 3 - int(np.floor(np.log10(diagonal))))
     poses = []
-    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (180, 90.0)):
+    wide = high[0] - low[0] > high[1] - low[1]  # a turn sweeps the longer side, seen from above
+    for azimuth, above in (*((a, _ABOVE_DEG) for a in _AZIMUTHS_DEG), (270 if wide else 180, 90.0)):
         angles = np.radians([azimuth, above])
         (ca, ce), (sa, se) = np.cos(angles), np.sin(angles)
         at = np.round(middle + far * np.array([ca * ce, sa * ce, se]), digits) + 0.0

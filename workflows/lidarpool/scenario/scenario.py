@@ -14,7 +14,7 @@ from ..base.errors import Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
-from ..scene.files.meshfile import SUFFIXES
+from ..scene.files.meshfile import CONVERTED, ROBOTS, SUFFIXES
 from ..sensor import Material, Navigation
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
@@ -158,7 +158,7 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        mesh = path.suffix.lower() in SUFFIXES
+        mesh = path.suffix.lower() in (*SUFFIXES, *ROBOTS, *CONVERTED)
         data = {"scene": {"files": [path.name]}} if mesh else read_yaml(path)
         return cls.from_data(data, source=str(path), folder=path.parent)
 

@@ -94,8 +94,8 @@ class MeshFile(Section):
         str,
         about(
             ".glb .gltf .obj .stl .ply .off .dae .3mf .usd, CityJSON (.city.json), voxels of "
-            "AMAPVox (.vox), or a raster of heights: .tif .asc .hgt .img .dem .dt2; from the "
-            "scenario's folder",
+            "AMAPVox (.vox), a robot that stands still (.urdf), or a raster of heights: .tif .asc "
+            ".hgt .img .dem .dt2; from the scenario's folder",
             min_length=1,
             max_length=4096,
         ),
