@@ -150,8 +150,13 @@ def build(
     placing: Placing | None = None
     if scenario.poses is None and track is None and not scenario.scene.has_seed:
         alone = scenario.mount is None and not scenario.sensors
-        narrow = alone and not scenario.sensor.model_fields_set
-        placing = place(scene, sensors[0], landscape=bool(found.rasters), narrow=narrow)
+        placing = place(
+            scene,
+            sensors[0],
+            landscape=bool(found.rasters),
+            city=_has_city(scenario),
+            narrow=alone and not scenario.sensor.model_fields_set,
+        )
         if placing.grid:
             sensors = [replace(sensors[0], sensor=Sensor.grid(**placing.grid))]
     poses = SEED_POSES if placing is None else placing.poses
@@ -335,9 +340,13 @@ def _materials(scenario: Scenario, scene: Scene, vehicles: Sequence[int | None])
     for semantic_class in sorted({one for one in vehicles if one is not None}):
         rows = np.array([first + k for k, one in enumerate(vehicles) if one == semantic_class])
         made = with_class(made or [every], semantic_class, rows, scene.all_names)
-    if any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files):
+    if _has_city(scenario):
         made = with_classes(made or [every], CITY_CLASSES, scene.all_names)
     return made
+
+
+def _has_city(scenario: Scenario) -> bool:
+    return any(entry.file.lower().endswith(CITYJSON) for entry in scenario.scene.files)
 
 
 def _survey(

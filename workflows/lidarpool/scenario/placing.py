@@ -12,17 +12,19 @@ from numpy.typing import ArrayLike
 
 from ..base.arrays import Floats
 from ..base.words import plural
+from ..scene.files.cityjson import BUILDING, CLASSES
 from ..scene.floor import heights_at, reaching, room_at
 from ..scene.scene import Scene
 from ..scene.simplified import Drawn
 from ..scene.surroundings import Surroundings, in_the_way, is_open
 from ..sensor import Mounted, Pose, Sensor
+from ..sensor.materials import rows_named
 
 # Heights above a floor; and the least distance from the ceiling.
 _HEIGHTS_M, _BELOW_M = (1.0, 2.0, 3.0), 0.2
 
-# Distances from the middle that are tried in turn if something is in the way there.
-_ASIDE_M = (2.0, 4.0, 8.0)
+# Distances from the middle that are tried in turn if something is in the way there, or a building.
+_ASIDE_M = (2.0, 4.0, 8.0, 16.0, 32.0, 64.0)
 
 # Poses around an object: azimuths, which see two sides of a box each; degrees above its middle; and
 # distance from its middle, in its diagonals, the least and the most.
@@ -50,14 +52,20 @@ class Placing:
 
 
 def place(
-    scene: Scene, carried: Mounted, landscape: bool = False, narrow: bool = False
+    scene: Scene,
+    carried: Mounted,
+    *,
+    landscape: bool = False,
+    city: bool = False,
+    narrow: bool = False,
 ) -> Placing:
     """Choose poses in a scene from mesh files; a landscape is not taken for an object.
 
     In a room or a landscape they are in the middle, or beside what stands there, such as a tree; 1,
     2 and 3 m above the floor or ground, or at a quarter, half and three quarters of the height of
     a lower room. Around an object they are on four sides and above it; a grid to `narrow` is
-    narrowed to it.
+    narrowed to it. The buildings of a `city` are not entered: poses are on ground beside them, or
+    around all of them.
     """
     low, high = scene.bounds + scene.origin
     middle = (low + high) / 2
@@ -65,11 +73,15 @@ def place(
     if landscape and not len(heights_at(drawn, middle[0], middle[1])):  # a hole
         ground = drawn.vertices[drawn.faces].mean(axis=1) + drawn.origin
         middle = ground[np.argmin(np.hypot(*(ground - middle)[:, :2].T))]
-    standing = _standing(drawn, middle)
-    looker = None if landscape else _looker(drawn)
-    if looker is None or not looker.is_object(looker.views(_local(standing, scene))):
+    standing, looker = _standing(drawn, middle), None if landscape else _looker(drawn)
+    if city and len(heights_at(_buildings(drawn), middle[0], middle[1])):
+        standing = _aside(drawn, middle, outdoors=True)
+        is_object = not standing
+    else:
+        is_object = looker is not None and looker.is_object(looker.views(_local(standing, scene)))
+    if not is_object:
         if in_the_way(drawn, _local(standing, scene)):
-            standing = _aside(drawn, middle) or standing
+            standing = _aside(drawn, middle, outdoors=city) or standing
         return Placing(standing, _inside(looker, _local(standing, scene), scene, carried))
     poses = poses_around(scene, carried)
     far = np.linalg.norm(poses[-1].position - (low + high) / 2)
@@ -78,7 +90,7 @@ def place(
         f"this looks like an object of {sides} m, not a place to stand in: "
         f"{plural(len(poses), 'pose')} around and above it, {far:,.3g} m from its middle"
     )
-    grid = _narrowed(drawn, looker, poses) if narrow else {}
+    grid = _narrowed(drawn, looker, poses) if narrow and looker else {}
     if grid:
         width, height = grid["horizontal_fov_deg"], grid["vertical_fov_deg"]
         note += (
@@ -123,10 +135,17 @@ def _standing(scene: Scene, at: Floats) -> tuple[Pose, ...]:
     return tuple(Pose((x, y, float(floor + height))) for height in heights)
 
 
-def _aside(scene: Scene, middle: Floats) -> tuple[Pose, ...]:
+def _buildings(scene: Scene) -> Scene:
+    """Return the triangles of a city's buildings."""
+    rows = [rows_named(pattern, scene.names) for pattern in CLASSES[BUILDING]]
+    own = np.isin(scene.face_object, np.concatenate(rows))
+    return replace(scene, faces=scene.faces[own], face_object=scene.face_object[own])
+
+
+def _aside(scene: Scene, middle: Floats, *, outdoors: bool = False) -> tuple[Pose, ...]:
     """Poses beside the middle (3,) of a scene where nothing is in the way; none if there are none.
 
-    World coordinates.
+    World coordinates. Those `outdoors` are on something, and neither in a building nor on one.
     """
     half = np.ptp(scene.bounds, axis=0) / 2
     reach = np.minimum(half, [max(_ASIDE_M) + 1.0] * 2 + [np.inf])
@@ -137,6 +156,10 @@ def _aside(scene: Scene, middle: Floats) -> tuple[Pose, ...]:
         for angle in np.arange(8) * np.pi / 4:
             step = far * np.array([np.cos(angle), np.sin(angle), 0.0])
             if (np.abs(step[:2]) < half[:2]).all():
+                x, y, _ = middle + step
+                built = outdoors and len(heights_at(_buildings(around), x, y))
+                if built or (outdoors and not len(heights_at(around, x, y))):
+                    continue
                 poses = _standing(around, middle + step)
                 if not in_the_way(around, _local(poses, scene)):
                     return poses
