@@ -187,8 +187,7 @@ def forecast(job: Job, options: RunOptions, client: Client | None = None) -> dic
             f"needs about {format_bytes(least)}: make room, name another folder with "
             f"{'TMPDIR' if stored else '--out'}, or take a larger keep_every."
         )
-    local = options.own and client is None
-    needed = _bytes_needed(job, points, batch, cluster, local=local)
+    needed = _bytes_needed(job, points, batch, cluster, local=options.own and client is None)
     if cluster.memory and cluster.memory < needed:
         mistakes.lines.append(
             f"There are {format_bytes(cluster.memory)} of memory, and the run needs about "

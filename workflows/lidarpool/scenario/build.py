@@ -364,7 +364,8 @@ def _survey(
     cloud["epsg"] = given.cloud.epsg or epsg
     if given.scene.has_seed:
         cloud["keep_every"] = cloud["keep_every"] or (1 if "ray" in needs else SEED_KEPT)
-        cloud["precision_m"] = cloud["precision_m"] or SEED_PRECISION_M
+        if not any(one.sensor.optics.resolution_m for one in carried):
+            cloud["precision_m"] = cloud["precision_m"] or SEED_PRECISION_M
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
     track = way if isinstance(way, Track) else None
     poses = () if isinstance(way, Track) else given.poses or way

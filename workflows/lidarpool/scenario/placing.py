@@ -48,7 +48,7 @@ class Placing:
     poses: tuple[Pose, ...]  # in world coordinates
     note: str = ""  # for users, on poses that they may not expect
     around: bool = False  # whether the poses are around an object
-    grid: Mapping[str, float] = field(default_factory=dict)  # of `Sensor.grid`, if narrowed to it
+    grid: Mapping[str, Any] = field(default_factory=dict)  # of `Sensor.grid`, if narrowed to it
 
 
 def place(
@@ -100,26 +100,25 @@ def place(
     return Placing(poses, note, around=True, grid=grid)
 
 
-def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, float]:
+def _narrowed(scene: Scene, looker: Surroundings, poses: Sequence[Pose]) -> dict[str, Any]:
     """Return what `Sensor.grid` takes to see an object from poses, with about `_POINTS` points."""
+    turns = [np.eye(3) if pose.rotation is None else pose.rotation for pose in poses]
+    placed = [*zip(_local(poses, scene), turns, strict=True)]
     sides = np.zeros(2)  # the widest angles to either side, and up or down
-    for at, pose in zip(_local(poses, scene), poses, strict=True):
-        x, y, z = ((scene.vertices - at) @ pose.rotation).T
+    for at, turn in placed:
+        x, y, z = ((scene.vertices - at) @ turn).T
         angles = np.abs([np.arctan2(y, x), np.arctan2(z, np.hypot(x, y))])
         sides = np.maximum(sides, angles.max(axis=1))
     width, height = np.clip(np.ceil(np.degrees(sides) * 20 * _MARGIN) / 10, 0.1, 179.0).tolist()
     tried = Sensor.grid(_TRIED, _TRIED, height, horizontal_fov_deg=width)
     rays = tried.directions(np.arange(_TRIED)).reshape(-1, 3)
-    share = np.mean([
-        np.isfinite(looker.cast(np.tile(at, (len(rays), 1)), rays @ pose.rotation.T).distance)
-        for at, pose in zip(_local(poses, scene), poses, strict=True)
-    ])  # fmt: skip
-    count = min(_POINTS / max(share, 1e-6), _RAYS_MOST)
-    a_degree = np.sqrt(count / (len(poses) * width * height))
-    rows, columns = (max(4, round(side * a_degree / 10)) * 10 for side in (width, height))
+    met = [looker.cast(np.tile(at, (len(rays), 1)), rays @ turn.T).distance for at, turn in placed]
+    count = min(_POINTS / max(np.mean(np.isfinite(met)).item(), 1e-6), _RAYS_MOST)
+    a_degree = (count / (len(poses) * width * height)) ** 0.5
+    azimuths, layers = (int(side * a_degree / 10) * 10 for side in (width, height))
     return {
-        "rays_per_revolution": rows,
-        "layers": columns,
+        "rays_per_revolution": max(40, azimuths),  # a time step has one at least
+        "layers": max(10, layers),
         "vertical_fov_deg": height,
         "horizontal_fov_deg": width,
     }

@@ -38,7 +38,6 @@ from .sections import (
     file_states,
 )
 
-
 # Fields of a mesh file that a robot that stands still has.
 _OF_ROBOTS = {"file", "opacity", "translation", "rotation_deg", "scale", "matrix"}
 

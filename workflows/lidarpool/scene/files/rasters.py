@@ -399,9 +399,9 @@ def _check_size(
     if count <= room:
         whole = [*np.floor(low).tolist(), *np.ceil(high).tolist()]
         raise MeshFileError(
-            f"has {sides[0]:,} x {sides[1]:,} pixels, {2 * count / 1e6:.0f} million triangles. In a "
-            f"scenario, scene: [{{file: {name}, step_m: {step:g}}}] takes means\nof them; in place of "
-            f"step_m, window: {window} takes the middle, window: {whole} all"
+            f"has {sides[0]:,} x {sides[1]:,} pixels, {2 * count / 1e6:.0f} million triangles. In "
+            f"a scenario, scene: [{{file: {name}, step_m: {step:g}}}] takes means\nof them; not "
+            f"step_m but window: {window} takes the middle, and window: {whole} all"
         )
     coarser = f" or step_m: {step:g}" if count <= _MOST_READ else ""
     raise MeshFileError(
