@@ -41,17 +41,18 @@ def test_init_with_meshes_names_them_as_seen_from_the_scenario(tmp_path, lidarpo
     files = [(entry.file, entry.unit) for entry in made.scene.files]
     assert files == [("../../my room.stl", "mm"), ("../../#1: é.glb", "mm")]
     assert len(build(made).scene.names) == 2
-    assert (made.cloud.keep_every, made.cloud.precision_m) == (None, 0.001)
     assert made.poses is not None and len(made.poses) == 5, "around boxes of a millimetre"
-    rest = {"scene": {"files", "preset"}, "cloud": True, "poses": True}
+    assert made.sensor.horizontal_fov_deg < 45, "narrowed to them"
+    rest = {"scene": {"files", "preset"}, "sensor": True, "poses": True}
     assert made.model_dump(exclude=rest) == Scenario().model_dump(exclude=rest)
 
 
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        (["--mesh", "nowhere.stl"], "nowhere.stl has no mesh format"),
-        (["--mesh", "notes.txt"], "notes.txt has no mesh format"),
+        (["--mesh", "nowhere.stl"], "nowhere.stl does not exist"),
+        (["--mesh", "notes.txt"], "notes.txt has the ending .txt, which is not a mesh format"),
+        (["--mesh", "rover.sdf"], "rover.sdf is not read: convert it to OpenUSD"),
         (["--unit", "mm"], "name it with --mesh"),
         (["--mesh", "notes.txt", "--unit", "ells"], "ells"),
     ],

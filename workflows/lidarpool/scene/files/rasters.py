@@ -40,7 +40,7 @@ _OPTIONS = {"AAIGrid": {"DATATYPE": "Float64"}}  # or a file that begins with in
 
 _AT_ONCE = 100_000  # vertices that are reprojected, through lists
 _PIXEL_BYTES = 100  # of a mesh of pixels: vertices, two triangles, and what makes them
-_UNASKED = 5_000_000  # pixels that are taken without a window and a step: half a minute
+_UNASKED = 5_000_000  # pixels that are taken without a window and a step; more take long
 _MOST_READ = 1_000_000_000  # pixels of which a coarser grid is made, which takes two minutes
 _WIDEST_DEG = 12.0  # of longitude in a UTM zone, which is 6 wide
 
