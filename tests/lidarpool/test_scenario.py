@@ -20,8 +20,7 @@ from lidarpool.sensor import Noise, Returns, Sensor, Survey
 from lidarpool.sensor.materials import MaterialTable
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
-POSES = [(0, 0, 1), (0, 0, 2), (0, 0, 3)]
-DEFAULT = Survey(Sensor.grid(), poses=POSES, keep_every=5, precision_m=0.01)
+DEFAULT = Survey(Sensor.grid(), poses=[(0, 0, 1), (0, 0, 2), (0, 0, 3)], keep_every=5)
 
 
 @pytest.fixture

@@ -53,8 +53,11 @@ SEED_START = (25.0, 25.0)
 SEED_TARGET = (-30.0, -20.0)
 SEED_POSES = tuple(Pose((0.0, 0.0, height)) for height in (1.0, 2.0, 3.0))
 
-# The cloud of a scene with the default objects: of the hits, every so many are kept.
-SEED_KEPT, SEED_PRECISION_M = 5, 0.01
+# Of the hits in a scene with the default objects, every so many are kept.
+SEED_KEPT = 5
+
+# Precision of points in scenes without these, if no sensor states a resolution.
+MESH_PRECISION_M = 0.001
 
 
 @dataclass(frozen=True, eq=False)
@@ -364,8 +367,8 @@ def _survey(
     cloud["epsg"] = given.cloud.epsg or epsg
     if given.scene.has_seed:
         cloud["keep_every"] = cloud["keep_every"] or (1 if "ray" in needs else SEED_KEPT)
-        if not any(one.sensor.optics.resolution_m for one in carried):
-            cloud["precision_m"] = cloud["precision_m"] or SEED_PRECISION_M
+    elif not any(one.sensor.optics.resolution_m for one in carried):
+        cloud["precision_m"] = cloud["precision_m"] or MESH_PRECISION_M
     check_whole((*needs, *columns), cloud["keep_every"] or 1)
     track = way if isinstance(way, Track) else None
     poses = () if isinstance(way, Track) else given.poses or way

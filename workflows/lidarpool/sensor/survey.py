@@ -40,7 +40,7 @@ OPTIONAL_NAMES = tuple(column.in_files for column in OPTIONAL)
 SENSORS_MOST = 255  # the type of the column
 PARTICLES_MOST = 100  # that a pulse may return from
 RAYS_MOST = 1 << 32  # of a scan, which is cast in one call
-PRECISION_M = 0.001  # of points, if a sensor states no resolution
+PRECISION_M = 0.01  # of points, if a sensor states no resolution
 START_FROM = datetime(2017, 1, 1, tzinfo=UTC)  # since when GPS and UTC have been 18 s apart
 LASTS_MOST_NS = 2.0**63  # the type of the column time: 292 years
 
@@ -137,7 +137,7 @@ class CloudOptions:
         FILLED_IN,
         about(
             "step in metres that points are rounded to; by default the sensor's resolution of "
-            "ranges, 0.001 if it states none, and 0.01 in a scene with the default objects",
+            "ranges; if it states none 0.001, with the default objects and in Python 0.01",
             0.001,
         ),
     ] = None  # type: ignore[assignment]
