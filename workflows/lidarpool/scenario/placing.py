@@ -95,7 +95,7 @@ def place(
         width, height = grid["horizontal_fov_deg"], grid["vertical_fov_deg"]
         note += (
             f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
-            f"{grid['layers']:,} rays over the {width:g} x {height:g} degrees that it takes up"
+            f"{grid['layers']:,} rays from each over the {width:g} x {height:g} degrees that it takes up"
         )
     return Placing(poses, note, around=True, grid=grid)
 
@@ -151,13 +151,13 @@ def _aside(scene: Scene, middle: Floats, *, outdoors: bool = False) -> tuple[Pos
     local = middle - scene.origin
     near = reaching(scene, local - reach, local + reach)
     around = replace(scene, faces=scene.faces[near], face_object=scene.face_object[near])
+    built = _buildings(around) if outdoors else None
     for far in _ASIDE_M:
         for angle in np.arange(8) * np.pi / 4:
             step = far * np.array([np.cos(angle), np.sin(angle), 0.0])
             if (np.abs(step[:2]) < half[:2]).all():
                 x, y, _ = middle + step
-                built = outdoors and len(heights_at(_buildings(around), x, y))
-                if built or (outdoors and not len(heights_at(around, x, y))):
+                if built and (len(heights_at(built, x, y)) or not len(heights_at(around, x, y))):
                     continue
                 poses = _standing(around, middle + step)
                 if not in_the_way(around, _local(poses, scene)):

@@ -298,7 +298,7 @@ def _bytes_of(path: Path, most: int) -> bytes:
     """Content of a file of a known format, or of its beginning; -1 for all."""
     suffix = path.suffix.lower()
     if suffix in ROBOTS:
-        raise LidarpoolError(f"{path} is a robot: load_robot reads it, and scenarios name it.")
+        raise LidarpoolError(f"{path} is a robot: read it with load_robot, or by a scenario.")
     if suffix in CONVERTED:
         raise LidarpoolError(f"{path} is not read: {CONVERTED[suffix]}.")
     if suffix not in SUFFIXES:
