@@ -95,7 +95,7 @@ def place(
         width, height = grid["horizontal_fov_deg"], grid["vertical_fov_deg"]
         note += (
             f"; as no sensor is given, a grid of {grid['rays_per_revolution']:,} x "
-            f"{grid['layers']:,} rays from each over the {width:g} x {height:g} degrees that it takes up"
+            f"{grid['layers']:,} rays from each, over {width:g} x {height:g} degrees around it"
         )
     return Placing(poses, note, around=True, grid=grid)
 
