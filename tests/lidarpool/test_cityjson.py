@@ -255,3 +255,29 @@ def test_memory_is_refused_before_it_is_taken(tmp_path, monkeypatch):
     monkeypatch.setattr("lidarpool.base.allowance.memory", lambda: 100_000_000)
     with pytest.raises(LidarpoolError, match=r"would unpack to .* CityJSONSeq"):
         load(tmp_path, '{"type": "CityJSON", "x": [' + "[]," * 300_000 + "[]]}")
+
+
+def block(x, y, side, z0=0):
+    """Corners, in units of half a metre, and boundaries of a solid around x, y."""
+    corners = (np.array(CUBE) - [1, 1, 0]) * [side, side, 8] + [x, y, z0]
+    return corners.tolist()
+
+
+@pytest.mark.parametrize(("ground", "side"), [(False, 10), (True, 10), (True, 60)])
+def test_the_sensor_stands_beside_buildings_or_around_them(tmp_path, ground, side):
+    vertices = [*block(0, 0, side), *block(3 * side, 0, side)]
+    second = [[[[8 + corner for corner in ring]] for [ring] in SOLID[0]]]
+    objects = {"a": thing(geometry()), "b": thing(geometry(boundaries=second))}
+    if ground:
+        far = 6 * side
+        vertices += [[-far, -far, 0], [far, -far, 0], [far, far, 0], [-far, far, 0]]
+        flat = geometry("CompositeSurface", [[[16, 17, 18, 19]]], "1")
+        objects["g"] = thing(flat, kind="TINRelief")
+    write(tmp_path / "a.city.json", city(objects, vertices))
+    built = build(Scenario.load(tmp_path / "a.city.json"))
+    assert built.placing.around is not ground
+    for pose in built.placing.poses:
+        x, y, z = np.subtract(pose.position, TRANSFORM["translate"]) * 2
+        inside = [max(abs(x - at), abs(y)) < side and z < 16 for at in (0, 3 * side)]
+        assert not any(inside)
+        assert not ground or z in (2, 4, 6)

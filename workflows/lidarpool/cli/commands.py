@@ -186,8 +186,8 @@ def run(
     A campaign file, or several scenarios, make one data set.
 
     A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
-    above if it is an object; every hit is kept, to 1 mm. --sensor, --pose and the like say it
-    otherwise; lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
+    above if it is an object; every hit is kept. --sensor, --pose and the like say it otherwise;
+    lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
 
     \b
     Examples:

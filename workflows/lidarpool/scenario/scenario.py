@@ -16,7 +16,7 @@ from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
-from ..scene.files.meshfile import SUFFIXES
+from ..scene.files.meshfile import CONVERTED, ROBOTS, SUFFIXES
 from ..sensor import Material, Navigation
 from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
@@ -44,9 +44,6 @@ from .sections import (
     scene_in_short,
 )
 
-# The cloud of a mesh file without a scenario.
-MESH_CLOUD = {"precision_m": 0.001}
-
 # Options of a mesh file without a scenario, and where a scenario has them.
 MESH_OPTIONS = {
     "sensor": "sensor",
@@ -70,13 +67,12 @@ def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -
 
     read = {name: options[name] for name in ("unit", "up_axis") if name in options}
     entries = [{"file": name} | read if read else name for name in map(moved, files)]
-    cloud = (MESH_CLOUD if files else {}) | {k: options[k] for k in ("columns",) if k in options}
     model = options.get("sensor")
     data = {
         "scene": {"files": entries} if files else None,
         "sensor": moved(model) if model and model.endswith((".yaml", ".yml")) else model,
         "poses": options.get("pose"),
-        "cloud": cloud or None,
+        "cloud": {"columns": options["columns"]} if "columns" in options else None,
         "output": {"write": options["format"]} if "format" in options else None,
     }
     return {name: value for name, value in data.items() if value is not None}
@@ -207,7 +203,7 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        mesh = path.suffix.lower() in SUFFIXES
+        mesh = path.suffix.lower() in (*SUFFIXES, *ROBOTS, *CONVERTED)
         data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
         if options and not mesh:
             name = next(iter(options))
