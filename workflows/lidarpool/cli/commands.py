@@ -137,6 +137,7 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
 
 @cli.command()
 @click.argument("scenarios", metavar="SCENARIO...", nargs=-1, required=True, type=click.Path())
+@shared.mesh_options
 @shared.out
 @shared.scheduler
 @shared.cluster
@@ -174,6 +175,7 @@ def run(
     terminal: Terminal,
     options: RunOptions,
     scenarios: tuple[str, ...],
+    of_mesh: dict[str, Any],
     no_plan: bool,
     only: str | None,
     number: int | None,
@@ -184,13 +186,14 @@ def run(
     A campaign file, or several scenarios, make one data set.
 
     A mesh file is scanned from the middle of its floor, below the ceiling, or from around and
-    above if it is an object; every hit is kept, to 1 mm. For another sensor, pose or unit of
-    length, lidarpool init DIR --mesh FILE writes a scenario to edit.
+    above if it is an object; every hit is kept. --sensor, --pose and the like say it otherwise;
+    lidarpool init DIR --mesh FILE writes the same as a scenario to edit.
 
     \b
     Examples:
       lidarpool run examples/seed.yaml --out seed
       lidarpool run hall.glb --no-plan --resume --scheduler tcp://127.0.0.1:8786
+      lidarpool run part.stl --unit mm --sensor ouster/os1-64 --pose 0,0,1.9 --format las
       lidarpool run examples/seed.yaml --cluster examples/clusters/slurm.yaml
       lidarpool run examples/campaign.yaml --out dataset
       lidarpool run --verify dataset
@@ -212,8 +215,12 @@ def run(
         return
     assert options.out is not None, "it has a default"
     options = replace(options, folder=Storage.at(options.out).below(RUN_FOLDER))
-    if len(paths) > 1 or is_campaign(paths[0]):
-        several = len(paths) > 1
+    several = len(paths) > 1
+    if of_mesh and several:
+        raise click.UsageError(
+            "--sensor, --pose and the like are for one mesh: run each by itself."
+        )
+    if several or (not of_mesh and is_campaign(paths[0])):
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
         if number is not None:
             run_job(campaign, number, terminal, options, backend, only)
@@ -224,7 +231,7 @@ def run(
     elif options.retry_failed or options.verify or number is not None:
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
-        scenario = Scenario.load(paths[0])
+        scenario = Scenario.load(paths[0], of_mesh)
         run_scenario(scenario, terminal, options, backend, no_plan=no_plan, only=only)
 
 

@@ -27,7 +27,7 @@ from ..columns.cloud import Cloud
 from ..columns.cloud_file import CloudFile
 from ..columns.ply_format import AXES
 from ..columns.table import AXES as POSITION
-from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z
+from ..columns.table import CAUSES, NO_SURFACE, OBJECT, TABLE, Column, X, Y, Z, by_value
 from ..export.formats import save_cloud
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..pipeline.database import FILE
@@ -168,10 +168,9 @@ class View:
             return self.results
         if self.pictured is not None and column in self.columns:
             return self.pictured.names_of(self.columns[column])
-        if self.sweeps is not None and column == "sensor":
-            return self.sweeps.sensors
-        if self.sweeps is not None and column == "object":
-            return (*self.sweeps.objects, *self.sweeps.actors)
+        if (known := self.sweeps) is not None and column in ("sensor", "object", "class"):
+            objects, classes = (*known.objects, *known.actors), by_value(known.classes)
+            return {"sensor": known.sensors, "object": objects, "class": classes}[column]
         return CAUSES if self.columns.get(column) == TABLE["cause"] else ()
 
     def _around(self) -> tuple[Floats, Floats, Floats]:

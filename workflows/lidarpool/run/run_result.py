@@ -10,6 +10,7 @@ from typing import Any
 from poolpart import TaskRecord
 
 from ..base.arrays import Floats32, Ints
+from ..base.validation import one_line
 from ..columns.cloud import Cloud
 from ..columns.parts import StoredCloud
 from ..datasets.job_table import JobRow
@@ -109,8 +110,9 @@ class CampaignRun:
         Wall time of this run.
     stages
         Tasks of each stage.
-    notes, sensors
-        Remarks for the user, and the sensors of the jobs that are done, {name: models and rates}.
+    notes, sensors, classes
+        Remarks for the user, the sensors of the jobs that are done, {name: models and rates}, and
+        names of classes, {number: name}.
     """
 
     failed: tuple[JobRow, ...]
@@ -123,6 +125,8 @@ class CampaignRun:
     stages: tuple[StageTotals, ...] = ()
     notes: tuple[str, ...] = ()
     sensors: Mapping[str, str] = field(default_factory=dict)
+    classes: Mapping[int, str] = field(default_factory=dict)
+    __repr__ = one_line
 
     @classmethod
     def of(

@@ -16,15 +16,26 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import BaseModel, Field
+from pydantic_core import to_json
 
 from ..base.declared import Seed
 from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.fingerprint import fingerprint
-from ..base.validation import checked, dotted, fields_of, is_section, sections_in, sentences, shown
+from ..base.validation import (
+    checked,
+    dotted,
+    field_hint,
+    fields_of,
+    is_section,
+    sections_in,
+    sentences,
+    shown,
+)
 from ..base.words import did_you_mean, plural
 from ..base.yamlfile import read_yaml
 from ..datasets.job_table import Value
 from ..export.format_table import check_whole
+from ..sensor.calibrations import text_of
 from .build import Job, build
 from .campaign_sections import (
     COUNT_MOST,
@@ -224,7 +235,11 @@ class CampaignSpec:
         mistakes = Mistakes()
         # `Path.exists` fails at names that no file can have.
         lost = [path for path in self.files if not os.path.exists(path)]  # noqa: PTH110
-        mistakes.lines += [f"{self.command}: {str(path)!r} does not exist." for path in lost]
+        mistakes.lines += [
+            f"{self.command}: {self._jobs.named_in(path)}{str(path)!r} does not exist: check the "
+            "name and the folder."
+            for path in lost
+        ]
         mistakes.tell()
 
     @cached_property
@@ -276,6 +291,10 @@ class _JobSource:
 
     def scenario(self, number: int) -> Scenario | None:
         return None
+
+    def named_in(self, file: Path) -> str:
+        """Where a file is named, for messages: a table and its line; empty if in none."""
+        return ""
 
     def job(self, number: int, cache: SceneCache | None, columns: Sequence[str], own: Any) -> Job:
         scenario = self.scenario(number)
@@ -436,8 +455,16 @@ class _Varied(_JobSource):
         return {
             "vary": fingerprint({t: c.model_dump() for t, c in self._vary.items()}, [*self._vary]),
             "base": fingerprint([(base.name, _print(base.scenario)) for base in self._bases]),
-            "tables": fingerprint(repr([base.tables for base in self._bases])),
+            "tables": fingerprint(to_json([base.tables for base in self._bases])),
         }
+
+    def named_in(self, file: Path) -> str:
+        tables = {path: text for base in self._bases for text, path in base.table_files.items()}
+        for table, text in tables.items():
+            for number, line in enumerate(text_of(table).splitlines(), 1):
+                if file.name in line and not line.lstrip().startswith("#"):
+                    return f"{text}: {table}, line {number}: "
+        return ""
 
     def values(self, number: int) -> dict[str, Value]:
         return self._drawn(number)[0]
@@ -484,6 +511,7 @@ class _Base:
         self._vary, (self._noise, _) = vary, find_field(self.scenario, _NOISE)
         self._steps: dict[str, FieldSteps] = {}
         self.tables: dict[str, list[Any]] = {}
+        self.table_files: dict[str, Path] = {}
         self.files: set[Path] = set()  # that a job may read
         mistakes = Mistakes()
         for text, choice in vary.items():
@@ -491,7 +519,7 @@ class _Base:
                 self._steps[text], kind = find_field(self.scenario, text)
                 if choice.sample is None:
                     continue
-                table = self.scenario.path(choice.sample.file)
+                self.table_files[text] = table = self.scenario.path(choice.sample.file)
                 with prefixed(text):
                     if (key := (table, repr(kind))) not in tables:
                         tables[key] = read_rows(table, kind)
@@ -640,8 +668,9 @@ def find_field(scenario: Scenario, text: str) -> tuple[FieldSteps, Any]:
             key, node, kind = _field(node, rest[0], at)
             used = 1
         elif isinstance(node, dict):
-            key, used = _named(list(node), rest, at)
-            node = node[key]
+            keys = {str(key): key for key in node}  # of classes, numbers
+            name, used = _named([*keys], rest, at)
+            node = node[key := keys[name]]
         elif isinstance(node, (tuple, list)):
             key, used = _entry(node, rest, at)
             node = node[key]
@@ -657,7 +686,7 @@ def _field(node: BaseModel, name: str, at: str) -> tuple[str, Any, Any]:
     fields = {field.alias or own: own for own, field in fields_of(type(node)).items()}
     if name not in fields:
         place = f"a field of {at}" if at else "a section of a scenario"
-        raise LidarpoolError(f"{name!r} is not {place}.{did_you_mean(name, fields)}")
+        raise LidarpoolError(f"{name!r} is not {place}.{field_hint(name, fields, Scenario)}")
     own = fields[name]
     return name, getattr(node, own, None), fields_of(type(node))[own].annotation
 

@@ -4,25 +4,28 @@ from __future__ import annotations
 
 import os
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Annotated, Any
 
 from pydantic import PrivateAttr
 
-from ..base.declared import Several, Text, about
-from ..base.errors import Mistakes, prefixed
+from ..base.declared import Several, Text, about, by_text
+from ..base.errors import LidarpoolError, Mistakes, prefixed
 from ..base.validation import sentences
 from ..base.yamlfile import read_yaml
 from ..columns.table import COLOURS
-from ..scene.files.meshfile import SUFFIXES
+from ..scene.files.meshfile import CONVERTED, ROBOTS, SUFFIXES
 from ..sensor import Material, Navigation
+from ..sensor.materials import ClassNames
 from ..sensor.survey import SENSORS_MOST, CloudOptions, StepCount
 from ..sensor.trajectory import CENTRE
 from ..sensor.weather import Weather
 from .actor_motion import (
     ActorSection,
-    CarriedSection,
-    MountSection,
+    CarriedEntry,
+    MountEntry,
     TrafficSection,
     TrajectoryEntry,
 )
@@ -41,8 +44,38 @@ from .sections import (
     scene_in_short,
 )
 
-# The cloud of a mesh file without a scenario.
-MESH_CLOUD = {"precision_m": 0.001}
+# Options of a mesh file without a scenario, and where a scenario has them.
+MESH_OPTIONS = {
+    "sensor": "sensor",
+    "unit": "unit of scene.files",
+    "up_axis": "up_axis of scene.files",
+    "pose": "poses",
+    "columns": "cloud.columns",
+    "format": "output.write",
+}
+
+
+def mesh_data(files: Sequence[Path], folder: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the scenario of mesh files as data, as its YAML would have it.
+
+    Names of files start from `folder`, that of the scenario. `options` are {name in
+    `MESH_OPTIONS`: value}; what is not among them is left out, and so is the scene without files.
+    """
+
+    def moved(file: str | Path) -> str:
+        return Path(os.path.relpath(file, folder)).as_posix()
+
+    read = {name: options[name] for name in ("unit", "up_axis") if name in options}
+    entries = [{"file": name} | read if read else name for name in map(moved, files)]
+    model = options.get("sensor")
+    data = {
+        "scene": {"files": entries} if files else None,
+        "sensor": moved(model) if model and model.endswith((".yaml", ".yml")) else model,
+        "poses": options.get("pose"),
+        "cloud": {"columns": options["columns"]} if "columns" in options else None,
+        "output": {"write": options["format"]} if "format" in options else None,
+    }
+    return {name: value for name, value in data.items() if value is not None}
 
 
 class Scenario(Section):
@@ -58,8 +91,8 @@ class Scenario(Section):
         Poses of the sensor, in world coordinates. By default it stands at the origin (default
         objects), 1, 2 and 3 metres above the ground; in mesh files where `place` puts it: in the
         middle of a room or landscape, or around an object.
-    steps
-        Time steps from each pose.
+    steps, classes
+        Time steps from each pose, and names of semantic classes, {number: name}.
 
     Raises
     ------
@@ -68,7 +101,9 @@ class Scenario(Section):
     """
 
     scene: Annotated[SceneSection, scene_in_short] = SceneSection()
-    sensor: Annotated[SensorSection, may_be_empty(SensorSection)] = SensorSection()
+    sensor: Annotated[
+        SensorSection, may_be_empty(SensorSection), by_text("model", SensorSection | None)
+    ] = SensorSection()
     poses: Annotated[
         Several[PoseEntry] | None,
         about(
@@ -89,18 +124,20 @@ class Scenario(Section):
         ),
     ] = None
     sensors: Annotated[
-        dict[Text, CarriedSection],
+        dict[Text, CarriedEntry],
         about(
             "instead of sensor: several on one carrier, by name, each with its mount",
-            {"front": {"model": "velodyne/vlp16", "mount": {"position": [2, 0, 0.5]}}},
+            {"front": {"model": "velodyne/vlp16", "mount": [2, 0, 0.5]}, "roof": "ouster/os1-64"},
             max_length=SENSORS_MOST,
         ),
     ] = {}  # noqa: RUF012 - of a frozen model
     actors: Annotated[
         Several[ActorSection],
         about(
-            "moving objects: meshes, boxes or robots; one without a trajectory is the carrier",
+            "objects that move, or stand at a pose: meshes, boxes or robots; one without "
+            "trajectory and at is the carrier",
             [{"name": "Van", "box": [5, 2, 2.2], "trajectory": "van.tum", "class": 3}],
+            [{"name": "Crane", "file": "crane.urdf", "at": [4, 5, 0]}],
             max_length=10_000,
         ),
     ] = ()
@@ -112,9 +149,10 @@ class Scenario(Section):
         ),
     ] = None
     mount: Annotated[
-        MountSection | None,
+        MountEntry | None,
         about(
             "pose of the sensor on its carrier, in the carrier's axes",
+            [1, 0, 2],
             {"position": [1, 0, 2], "pitch_deg": 10},
         ),
     ] = None
@@ -133,6 +171,10 @@ class Scenario(Section):
             max_length=100_000,
         ),
     ] = ()
+    classes: Annotated[
+        ClassNames,
+        about("names of classes, for reports and files; they add the column class", {40: "road"}),
+    ] = {}  # noqa: RUF012 - of a frozen model
     returns: Annotated[ReturnsSection, may_be_empty(ReturnsSection)] = ReturnsSection()
     noise: Annotated[NoiseSection, may_be_empty(NoiseSection)] = NoiseSection()
     weather: Annotated[Weather, may_be_empty(Weather)] = Weather()
@@ -152,8 +194,8 @@ class Scenario(Section):
     _source: str = PrivateAttr(default="the default survey")  # for messages
 
     @classmethod
-    def load(cls, path: str | Path) -> Scenario:
-        """Read a scenario file (YAML), or make a scenario of a mesh file.
+    def load(cls, path: str | Path, options: Mapping[str, Any] = MappingProxyType({})) -> Scenario:
+        """Read a scenario file (YAML), or make a scenario of a mesh file; see `mesh_data`.
 
         Raises
         ------
@@ -161,8 +203,14 @@ class Scenario(Section):
             With the file, the field, what was given and what is allowed.
         """
         path = Path(path)
-        mesh = path.suffix.lower() in SUFFIXES
-        data = {"scene": {"files": [path.name]}, "cloud": MESH_CLOUD} if mesh else read_yaml(path)
+        mesh = path.suffix.lower() in (*SUFFIXES, *ROBOTS, *CONVERTED)
+        data = mesh_data([path], path.parent, options) if mesh else read_yaml(path)
+        if options and not mesh:
+            name = next(iter(options))
+            raise LidarpoolError(
+                f"--{name.replace('_', '-')} is for a mesh file: in {path}"
+                f"{', or rather its base' * ('base' in data)}, change {MESH_OPTIONS[name]}."
+            )
         return cls.from_data(data, source=str(path), folder=path.parent)
 
     @classmethod
@@ -215,11 +263,11 @@ class Scenario(Section):
             wrong.append("trajectory.beyond is for actors; the carrier's has to cover the survey.")
         if self.trajectory is not None and self.poses is not None:
             wrong.append("give either poses or a trajectory, not both.")
-        carried = [entry for entry in self.actors if entry.trajectory is None]
+        carried = [entry for entry in self.actors if entry.is_carrier]
         if carried and self.trajectory is None:
             wrong.append(
-                f"actor {carried[0].name!r} has no trajectory: give it one, or give the survey a "
-                "trajectory in place of poses, to be its carrier."
+                f"actor {carried[0].name!r} has no trajectory: give it one, or at: [x, y, z] if it "
+                "stands, or give the survey a trajectory in place of poses, to be its carrier."
             )
         if self.links and not any(entry.robot for entry in carried):
             wrong.append(

@@ -19,7 +19,7 @@ from ...base.errors import LidarpoolError, prefixed
 from ...base.validation import checked
 from ...base.vectors import determinant, matmul, turned
 from ...base.vocabulary import UNITS_M
-from ...base.words import did_you_mean, plural, printable
+from ...base.words import as_python, did_you_mean, plural, printable
 from ...sensor import Track
 from ...sensor.trajectory import quaternions_of
 from ..actors import Actor, one_mesh
@@ -57,6 +57,13 @@ _READERS: dict[str, Callable[[bytes, Path, Wanted], Content]] = {
     **dict.fromkeys(CITYJSON, read_cityjson),
 }
 SUFFIXES = (*_READERS, *RASTERS)
+ROBOTS = (".urdf", ".xacro")  # of which `urdf` refuses the latter, with what to do
+_MUJOCO = "a model of MuJoCo becomes OpenUSD by mujoco-usd-converter"
+CONVERTED = {  # {ending of scenes that are not read: what to do}
+    ".sdf": "convert it to OpenUSD (sdf2usd of gz-usd) or URDF, or name the meshes that it names",
+    ".mjcf": _MUJOCO,
+    ".xml": f"{_MUJOCO}, and lidarpool import reads a survey of HELIOS++",
+}
 UNITLESS = (".obj", ".stl", ".ply", ".off")  # formats without a unit
 
 GENERATOR = "lidarpool"  # that files of our own name, .glb as Y-up, others as Z-up
@@ -68,6 +75,11 @@ _HEAD = 200  # bytes of a file that such a comment is in
 OpacityMode = Literal["mask", "ignore"]
 
 _log = logging.getLogger(__name__)
+
+
+def warn(note: str) -> None:
+    """Log a note in the words of Python."""
+    _log.warning(as_python(note))
 
 
 class Objects(NamedTuple):
@@ -100,7 +112,7 @@ def load_objects(
     window: Window | None = None,
     epsg: int | None = None,
     assets: str | Path | None = None,
-    tell: Callable[[str], None] = _log.warning,
+    tell: Callable[[str], None] = warn,
     axes: Callable[[str], None] | None = None,
 ) -> Objects:
     """Read all objects of a mesh file.
@@ -186,7 +198,7 @@ def load_objects(
 
 
 def load_meshes(
-    path: str | Path, *, tell: Callable[[str], None] = _log.warning, **options: Any
+    path: str | Path, *, tell: Callable[[str], None] = warn, **options: Any
 ) -> tuple[SceneMesh | SceneInstance, ...]:
     """Read all objects of a mesh file, as `load_objects`, and let them stand."""
     found = load_objects(path, tell=tell, **options)
@@ -238,9 +250,9 @@ def _tell_axes(
         done, why, other = "states no axes and is taken as Z-up", "", "y"
     else:
         return
-    (axes or (_log.warning if why else _log.info))(
-        f"{path.name} {done}; if it lies on its side, set up_axis: {other} in scene.files "
-        f"(lidarpool init --mesh FILE --up-axis {other}); any up_axis ends this note"
+    (axes or (warn if why else lambda note: _log.info(as_python(note))))(
+        f'{path.name} {done}; if it lies on its side, give <scene.files.up_axis="{other}">; any '
+        "up_axis ends this note"
     )
 
 
@@ -289,9 +301,12 @@ def _read_whole(path: Path, data: bytes, wanted: Wanted, raster: dict[str, Any])
 
 def _bytes_of(path: Path, most: int) -> bytes:
     """Content of a file of a known format, or of its beginning; -1 for all."""
-    if path.suffix.lower() == ".urdf":
-        raise LidarpoolError(f"{path} is a robot: name it as the file of one of the actors.")
-    if path.suffix.lower() not in SUFFIXES:
+    suffix = path.suffix.lower()
+    if suffix in ROBOTS:
+        raise LidarpoolError(f"{path} is a robot: read it with load_robot, or by a scenario.")
+    if suffix in CONVERTED:
+        raise LidarpoolError(f"{path} is not read: {CONVERTED[suffix]}.")
+    if suffix not in SUFFIXES:
         raise LidarpoolError(
             f"{path} has the ending {path.suffix or '(none)'}, which is not a mesh format that "
             f"can be read; these are: {' '.join(SUFFIXES)}."

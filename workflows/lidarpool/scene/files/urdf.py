@@ -8,7 +8,6 @@ attributes.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from graphlib import CycleError, TopologicalSorter
@@ -32,17 +31,12 @@ from ..robot import HELD, MOVING, Joint, Robot
 from ..scene_instances import SceneInstance
 from ..scene_mesh import SceneMesh
 from ..shapes import capsule, cylinder
-from .meshfile import OpacityMode, load_meshes
-
-SUFFIXES = (".urdf", ".xacro")  # the latter are refused, with what to do
+from .meshfile import OpacityMode, load_meshes, warn
 
 _LINKS_MOST = 1000  # humanoids with hands have 150
 _SIDES = 64  # of a cylinder: its faces are 0.12 % of the radius inside it at most
 _UP = 5  # folders above a robot's file in which its packages are looked for
 _FARTHEST = 1e8  # of any number in a file
-
-
-_log = logging.getLogger(__name__)
 
 
 @checked
@@ -51,7 +45,7 @@ def load_robot(
     *,
     opacity: OpacityMode = "mask",
     colours: bool = False,
-    tell: Callable[[str], None] = _log.warning,
+    tell: Callable[[str], None] = warn,
 ) -> Robot:
     """Read a robot from a URDF file, with the visual meshes of its links.
 
@@ -299,6 +293,8 @@ class _Looks:
     def _shape(self, shape: Element) -> tuple[Floats, list[SceneMesh]]:
         """Return factors (3,), one of which may be zero, and meshes that are to be scaled."""
         if shape.tag == "mesh":
+            if len(factors := shape.get("scale", "").split()) == 4:  # as public files have it
+                shape.set("scale", " ".join(factors[:3]))
             scale = _numbers(shape, "scale", 3, "1 1 1")
             return scale, self._meshes(shape.get("filename", "")) if scale.all() else []
         if shape.tag == "box":
