@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+from base64 import b64decode
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 import yaml
 from lxml import html
+from PIL import Image
 
 from lidarpool import (
     Cloud,
@@ -28,7 +31,7 @@ from lidarpool.pipeline.names import COLLECT, GENERATE, INTERSECT, SORT
 from lidarpool.pipeline.task_book import TaskBook
 from lidarpool.plan import best
 from lidarpool.plan.trial import run_trial
-from lidarpool.report.page.rendering import ROWS_MOST, write_page
+from lidarpool.report.page.rendering import ROWS_MOST, put_picture, write_page
 from lidarpool.report.report import CountedCloud, make_report
 from lidarpool.run.trials import TRIAL
 from lidarpool.scenario.scenario import Scenario
@@ -135,12 +138,12 @@ def write(tmp_path: Path) -> Callable[..., tuple[str, dict[str, Any]]]:
             | changes
         )
         drawn = PICTURES if plan else PICTURES[:4]
-        pictures = {name: f'<svg id="{name}"></svg>' for name in drawn}
-        files = [*(f"{name}.png" for name in drawn), "report.html", "report.json"]
-        numbers = counted(result.points, len(scene.names))
-        report = make_report(result, files, numbers)
-        write_page(tmp_path / "report.html", report, result, numbers, pictures, scenario)
-        return (tmp_path / "report.html").read_text(encoding="utf-8"), report
+        page, numbers = tmp_path / "report.html", counted(result.points, len(scene.names))
+        report = make_report(result, numbers)
+        write_page(page, report, result, numbers, scenario)
+        for name in drawn:
+            put_picture(page, name, f'<svg id="{name}"></svg>')
+        return page.read_text(encoding="utf-8"), report
 
     return write
 
@@ -149,11 +152,39 @@ def test_the_page_refers_to_nothing_outside_and_has_its_pictures_within(write):
     text, _ = write()
     page = html.fromstring(text)
     assert not page.xpath("//script | //link | //iframe | //object | //embed | //base")
-    assert not page.xpath("//@href | //@srcset | //@action | //@poster | //@data")
+    assert not page.xpath("//@srcset | //@action | //@poster | //@data")
+    assert all(source.startswith("data:image/png;base64,") for source in page.xpath("//@href"))
     assert not re.search(r"url\(|@import|https?://|\son\w+=", text)
     assert "default-src 'none'" in page.xpath("//meta[@http-equiv]/@content")[0]
     assert not page.xpath("//@src")
     assert page.xpath("//figure/svg/@id") == PICTURES
+    assert page.xpath("//figure[not(@hidden)]/@data-picture") == ["above", *PICTURES]
+
+
+def test_pictures_come_into_the_page_when_they_are_drawn(write, tmp_path):
+    text, _ = write(plan=None)
+    assert html.fromstring(text).xpath("//figure[@hidden]/@data-picture") == ["path"]
+    page = tmp_path / "report.html"
+    for size in (9, 1):
+        put_picture(page, "path", f'<svg class="{size * "x"}">\\1</svg>')
+    assert page.read_text("utf-8") == text.replace(
+        '"path" hidden>\n    \n    <figc', '"path"><svg class="x">\\1</svg><figc'
+    )
+    page.write_text("of another program")
+    put_picture(page, "path", "<svg></svg>")
+    assert page.read_text() == "of another program"
+
+
+def test_the_points_are_shown_from_above(write):
+    places = np.array([(0, 0, 0), (0, 0, 1), (0, 0, 2), (10, 0, 0), (0, 5, 0.0)])
+    places += 1000
+    columns = {name: np.zeros(5, np.int32) for name in ("scan", "channel", "object")}
+    (source,) = html.fromstring(write(cloud=Cloud(places, columns))[0]).xpath("//image/@href")
+    with Image.open(io.BytesIO(b64decode(source.partition(",")[2]))) as image:
+        shade = np.asarray(image)[..., 3]
+    assert shade.shape == (26, 51)  # the north is up
+    assert (shade[25, 0], shade[25, 50], shade[0, 0]) == (255, 127, 127)
+    assert np.count_nonzero(shade) == 3
 
 
 def test_names_are_words_and_never_markup(write):
@@ -307,7 +338,7 @@ def test_what_is_unusual_is_told(write, changes, words):
 
 def test_without_planning(write):
     text, _ = write(plan=None, tasks=[task for task in records() if task.stage != TRIAL])
-    assert "The path" not in text and "swarm" not in text and text.count("<figure>") == 4
+    assert "The path" not in text and "swarm" not in text and text.count(" hidden>") == 1
 
 
 def test_the_scenario_on_the_page_is_the_scenario(write):
@@ -322,7 +353,7 @@ def test_the_scenario_on_the_page_is_the_scenario(write):
             "planning": {"start": [0, 0], "target": [9, 9], "obstacles": []},
         }
     )
-    (shown,) = html.fromstring(write(scenario=scenario)[0]).xpath("//code/text()")
+    (shown,) = html.fromstring(write(scenario=scenario)[0]).xpath("//pre/code/text()")
     assert Scenario.from_data(yaml.safe_load(shown)).model_dump() == scenario.model_dump()
     many = Scenario.from_data({"poses": [{"position": [k, 0, 1]} for k in range(5000)]})
     assert len(write(scenario=many)[0]) < len(write()[0]) + 60_000

@@ -1,6 +1,7 @@
 """What is said of a run: bars as long as there is a terminal, or else lines that come seldom."""
 
 import os
+import re
 import sys
 from contextlib import suppress
 from dataclasses import replace
@@ -39,6 +40,35 @@ def test_a_terminal_that_is_closed_ends_nothing(kind, monkeypatch):
     assert said
     with suppress(OSError):  # what it could not write it tries to write once more
         stream.close()
+
+
+def test_a_terminal_shows_what_is_written_and_how_far(monkeypatch):
+    try:
+        master, slave = os.openpty()
+    except OSError as error:
+        pytest.skip(f"there are no pseudo-terminals here: {error}")
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "90")
+    with os.fdopen(slave, "w") as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        with Terminal().writing("writing the cloud") as advance:
+            advance("cloud.ply", 0, 8000, "points")
+            advance("cloud.ply", 6000, 8000, "points")
+            advance("cloud.ply", 6000, 8000, "points")  # some were read twice
+            advance("pictures", 1, 4, "pictures")
+        said = os.read(master, 1 << 16).decode()
+    os.close(master)
+    told = [
+        " ".join(re.sub(r"\x1b\[[^a-zA-Z]*[a-zA-Z]|━|╸|╺", "", line).split())
+        for line in said.splitlines()
+    ]
+    assert told[-3:-1] == ["cloud.ply 8000/8000 points", "pictures 1/4 pictures"]
+
+
+def test_a_log_has_a_line_on_what_is_written(capsys):
+    with Terminal().writing("writing the cloud") as advance:
+        advance("cloud.ply", 1, 8000, "points")
+    assert [line[10:] for line in capsys.readouterr().err.splitlines()] == ["writing the cloud"]
 
 
 def test_a_complaint_commands_no_terminal(tmp_path, capsys, monkeypatch):

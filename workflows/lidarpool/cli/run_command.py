@@ -49,6 +49,7 @@ def run_scenario(
     *,
     no_plan: bool = False,
     only: str | None = None,
+    pictures: bool = False,
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
@@ -60,7 +61,7 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
-    _run_survey(built, job, options, terminal, only)
+    _run_survey(built, job, options, terminal, only, pictures)
 
 
 def _run_survey(
@@ -69,6 +70,7 @@ def _run_survey(
     options: RunOptions,
     terminal: Terminal,
     only: str | None,
+    pictures: bool,
     judge: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
     """Run a job, and write it as the result of a survey; `judge` returns a note on it."""
@@ -77,7 +79,7 @@ def _run_survey(
         terminal.tell(note)
     jobs = OneJob(job)
     output = SurveyOutput(
-        options.out, job.survey, job.outputs, only == "cloud", built.scenario, judge
+        options.out, job.survey, job.outputs, only == "cloud", built.scenario, judge, pictures
     )
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
@@ -121,6 +123,7 @@ def run_job(
     options: RunOptions,
     backend: str | None,
     only: str | None,
+    pictures: bool,
 ) -> None:
     """Run one job of a campaign again, and write it as the result of a survey.
 
@@ -154,7 +157,7 @@ def run_job(
         return f"the points are those of job {name} in {place}, bit for bit"
 
     options = options.with_pool(scenario.pool, backend)
-    _run_survey(built, replace(job, number=0), options, terminal, only, compare)
+    _run_survey(built, replace(job, number=0), options, terminal, only, pictures, compare)
 
 
 def no_hits(job: Job) -> str:

@@ -32,7 +32,9 @@ from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
 from ..render.shot import SIZE, Samples, SurfaceView, take_shot
 from ..render.stage import make_axis, nice_step
 from ..run.picture_file import PictureContent, ways_of
+from ..run.progress import Advance
 from ..scene.scene import Scene
+from .page.rendering import put_picture
 
 SIDE_LEAST, SIDE_MOST = 480, 4096  # letters need some pixels; a pixel takes 0.4 kB of memory
 _LIGHT = ("reflectivity", "intensity")  # columns for the picture of intensity, the better first
@@ -47,13 +49,18 @@ _BLOCK = 4  # pixels a side
 
 def draw_pictures(
     shown: PictureContent,
-    cloud: Path,
+    result: Path,
     folder: str | Path,
     only: Sequence[str] = (),
     size: tuple[int, int] = SIZE,
     colour: str = Z.name,
+    advance: Advance = lambda *_: None,
 ) -> Iterator[Path]:
-    """Draw pictures, those in `only`, into a folder, which is made; see `picture_makers`."""
+    """Draw pictures of a result, those in `only`, into a folder, which is made.
+
+    They also go into the page of the result if that is in the folder. See `picture_makers`.
+    """
+    cloud, page = result / "cloud.ply", Path(folder) / "report.html"
     least, most = min(size), max(size)
     if least < SIDE_LEAST or most > SIDE_MOST or most > SIDES_RATIO * least:
         raise LidarpoolError(
@@ -75,9 +82,14 @@ def draw_pictures(
             raise LidarpoolError(f"There is no picture {name!r}: {why}.")
     with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
-    for name in only or makers:
-        path = Path(folder) / f"{name}.png"
-        makers[name]().save(path)
+    names = only or [*makers]
+    advance("pictures", 0, len(names), "pictures")
+    for name in names:
+        path, picture = Path(folder) / f"{name}.png", makers[name]()
+        picture.save(path)
+        if page.exists():
+            put_picture(page, name, picture.svg())
+        advance("pictures", 1, len(names), "pictures")
         yield path
 
 

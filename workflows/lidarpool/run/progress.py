@@ -49,6 +49,8 @@ class Progress:
 
 
 Show = Callable[[Progress], None]
+# Is told of what is written: its name, items that were written just now, of all, and their unit.
+Advance = Callable[[str, int, int, str], None]
 
 
 def in_words(rate: float) -> str:
@@ -94,8 +96,11 @@ def standing_still(progress: Progress) -> str:
 
 
 @contextmanager
-def bars(console: Console) -> Iterator[Show]:
-    """Bars by stage with rates and time left; yields the function that moves them."""
+def bar_lines(console: Console) -> Iterator[Callable[[str, int, int, str, str], None]]:
+    """Bars that appear when they are first moved.
+
+    Yields the function that moves one: label, items done, of all, their unit, and a remark.
+    """
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -105,19 +110,29 @@ def bars(console: Console) -> Iterator[Show]:
     )
     with Bars(*columns, console=console) as shown:
         lines: dict[str, TaskID] = {}
-        paces = {label: Pace() for label, _, _ in STAGES}
+
+        def move(label: str, done: int, total: int, unit: str, pace: str) -> None:
+            if label not in lines:
+                lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
+            shown.update(lines[label], completed=done, pace=pace)
+
+        yield move
+
+
+@contextmanager
+def bars(console: Console) -> Iterator[Show]:
+    """Bars by stage with rates and time left; yields the function that moves them."""
+    paces = {label: Pace() for label, _, _ in STAGES}
+    with bar_lines(console) as move:
 
         def show(progress: Progress) -> None:
-            """Move the bars; one appears when its total is known."""
             for label, count, unit in STAGES:
                 done, total = getattr(progress, count), getattr(progress, unit)
-                if total and label not in lines:
-                    lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
-                if label in lines:
+                if total:
                     pace = paces[label].told(progress.seconds, done, total)
                     if unit == "scans" and done < total:
                         pace = standing_still(progress) or pace
-                    shown.update(lines[label], completed=done, pace=pace)
+                    move(label, done, total, unit, pace)
 
         yield show
 
@@ -152,6 +167,10 @@ class Screen:
     def status(self, words: str) -> AbstractContextManager[None]:
         """Show what is going on while the body runs."""
         return nullcontext()
+
+    def writing(self, words: str) -> AbstractContextManager[Advance]:
+        """Show what is being written while the body runs; gives the function that is told."""
+        return nullcontext(lambda *_: None)
 
     def progress(self) -> AbstractContextManager[Show]:
         """Show the progress while the body runs; gives the function that does."""
