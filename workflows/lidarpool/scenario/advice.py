@@ -10,6 +10,7 @@ from ..base.words import plural
 from ..columns.table import VELOCITY
 from ..scene.files.meshfile import CITYJSON, UNITLESS, wrote_it
 from ..sensor.materials import MaterialTable
+from ..sensor.models import STATED
 from .build import Built
 from .placing import inside_note
 from .scenario import Scenario
@@ -26,14 +27,15 @@ def advice(built: Built) -> list[str]:
     """Return notes on likely mistakes, such as a size that suggests another unit.
 
     Also on objects that were left out, on files whose axes were guessed, on where the sensor is,
-    and on settings without effect.
+    on figures that data sheets lack, and on settings without effect.
     """
     notes, remarks = built.found.notes, built.found.remarks
     axes = remarks[:1]
     if remarks[1:]:
         axes = [f"{axes[0]}; {plural(len(remarks) - 1, 'more file')}, too"]
     likely = filter(None, (_of_size(built), _of_poses(built), _of_colours(built)))
-    return [*notes, *axes, *likely, *_without_effect(built.scenario)]
+    unstated = dict.fromkeys(_of_datasheets(built))
+    return [*notes, *axes, *likely, *unstated, *_without_effect(built.scenario)]
 
 
 def _of_size(built: Built) -> str:
@@ -90,6 +92,17 @@ def _of_colours(built: Built) -> str:
         f"{len(grey):,} of {plural(int(textured.sum()), 'object')} with reflectance: texture "
         f"have no colours and are grey: {shown}"
     )
+
+
+def _of_datasheets(built: Built) -> Iterator[str]:
+    """Name what the data sheets of sensors do not state, and the scenario does not give."""
+    scenario, given = built.scenario, built.scenario.noise.model_fields_set
+    sections = (scenario.sensors or {"": scenario.sensor}).values()
+    for section, noise in zip(sections, built.survey.noise_each, strict=True):
+        left = [name for name in STATED if name not in given and not getattr(noise, name)]
+        if section.performance == "datasheet" and left:
+            lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in left)
+            yield f"the data sheet of {section.model} does not state {lacks}: they have no effect"
 
 
 def _without_effect(scenario: Scenario) -> Iterator[str]:
