@@ -254,6 +254,23 @@ def test_what_differs_from_an_ideal_sensor_is_told_of_each(write):
     assert "<dt>rain_mm_h</dt><dd>10</dd>" in text and "snow_mm_h" not in text
 
 
+def test_figures_have_the_digits_that_are_read(write):
+    """The VLP-16's firings in a turn are 1,808.4491."""
+    sensor = load_sensor("velodyne/vlp16", max_range_m=1234.5678)
+    survey = Survey(
+        sensors=[Mounted(sensor, name="left", noise=Noise(detection_range_m=100.8767244))],
+        poses=[(0, 0, 1)], steps=60, visibility_km=10 / 3,
+    )  # fmt: skip
+    text, _ = write(survey=survey, origin=(500_000.123456, -0.00004, 1.5), plan=None)
+    told = {
+        dt.text: dt.getnext().text for dt in html.fromstring(text).xpath("//dl[@class='pairs']//dt")
+    }
+    assert told["firings per turn"] == "1,808.4" and told["range"] == "0.4 m to 1,234.6 m"
+    assert (told["detection_range_m"], told["visibility_km"]) == ("100.9", "3.333")
+    assert told["local origin"] == "(500,000.123, 0, 1.5) m"
+    assert told["survey and planning overlap"] == "0 s"
+
+
 def test_hits_on_nothing_are_told_from_those_on_surfaces(write):
     cloud = cloud_of(500, 2, 120, 16)
     cloud["object"][:100] = -1

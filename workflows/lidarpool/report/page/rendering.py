@@ -247,9 +247,9 @@ def code(text: str) -> Markup:
 
 def duration(seconds: float) -> str:
     """Return a time in the unit that suits it."""
-    if seconds < 0.001:
+    if 0 < seconds < 0.001:
         return f"{1e6 * seconds:.0f} µs"
-    if seconds < 0.9995:
+    if 0 < seconds < 0.9995:
         return f"{1e3 * seconds:.3g} ms"
     if seconds < 99.95:
         return f"{seconds:.3g} s"
@@ -285,20 +285,21 @@ def excess(fraction: float) -> str:
     return f"{fraction:+.2%}".replace("-", MINUS)
 
 
-def formatted(value: Any, digits: int = 6) -> str:
-    """Return a number, whole ones with all their digits; text, true or false, or several."""
+def formatted(value: Any) -> str:
+    """Return a number of four digits, or to a tenth, whole ones with all; text, or several."""
     if isinstance(value, bool):
         return "yes" if value else "no"
     if isinstance(value, list | tuple):
-        return " × ".join(formatted(one, digits) for one in value)
+        return " × ".join(map(formatted, value))
     if isinstance(value, float):
-        return f"{value:,.{digits}g}"
+        digits = ".1f" if 1000 <= abs(value) < 1e9 else ".4g"
+        return f"{value:,{digits}}".removesuffix(".0")
     return f"{value:,}" if isinstance(value, int) else str(value)
 
 
 def numbers(values: Sequence[float]) -> str:
-    """Coordinates, short."""
-    return ", ".join(f"{value:,.10g}" for value in values).replace("-", MINUS)
+    """Coordinates in metres, to the millimetre."""
+    return ", ".join(f"{round(value, 3) + 0.0:,.10g}" for value in values).replace("-", MINUS)
 
 
 def millimetres(value: float | None) -> str:
