@@ -78,8 +78,8 @@ class Result(RunResult):
         from ..report.output import SurveyOutput
 
         wanted = [Format.of(entry) for entry in formats]
-        place = output_place(folder)
-        output = SurveyOutput(place, self.survey, wanted, only_cloud, pictures=pictures)
+        extent = "cloud" if only_cloud else "pictures" if pictures else "page"
+        output = SurveyOutput(output_place(folder), self.survey, wanted, extent)
         with output.held():
             output.refuse(lambda: self.identity, overwrite=overwrite)
             output.write(self)

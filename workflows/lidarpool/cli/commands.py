@@ -51,6 +51,7 @@ _shown = shared.together(
     ),
     click.option(
         "--only",
+        "extent",
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no page.",
     ),
@@ -121,7 +122,7 @@ def cli() -> None:
 @shared.out
 @_shown
 @_runs
-def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
+def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     """Run the default survey and plan a path, on this machine, and draw the pictures.
 
     \b
@@ -132,7 +133,7 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
     from ..scenario.scenario import Scenario
     from .run_command import run_scenario
 
-    run_scenario(Scenario(), terminal, options, only=only, pictures=only is None)
+    run_scenario(Scenario(), terminal, options, extent=extent or "pictures")
 
 
 @cli.command()
@@ -142,7 +143,9 @@ def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
 @shared.cluster
 @shared.backend
 @shared.no_plan
-@shared.flag("--pictures", help="Draw the pictures, too, as lidarpool plot does later.")
+@click.option(
+    "--pictures", "extent", flag_value="pictures", help="Draw the pictures, as lidarpool plot does."
+)
 @shared.flag("--resume", help="Resume an unfinished run, if there is one.")
 @shared.flag("--fresh", help="Delete an unfinished run.")
 @shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
@@ -176,8 +179,7 @@ def run(
     options: RunOptions,
     scenarios: tuple[str, ...],
     no_plan: bool,
-    only: str | None,
-    pictures: bool,
+    extent: str | None,
     number: int | None,
     backend: str | None,
 ) -> None:
@@ -208,8 +210,6 @@ def run(
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
-    if only is not None and pictures:
-        raise click.UsageError("--only cloud leaves out what --pictures draws: give one of them.")
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))
@@ -220,8 +220,8 @@ def run(
         several = len(paths) > 1
         campaign = CampaignSpec.of_scenarios(paths) if several else CampaignSpec.load(paths[0])
         if number is not None:
-            run_job(campaign, number, terminal, options, backend, only, pictures)
-        elif only is not None or pictures:
+            run_job(campaign, number, terminal, options, backend, extent)
+        elif extent is not None:
             raise click.UsageError(
                 "--only and --pictures are for one survey: a data set is written as a whole."
             )
@@ -231,9 +231,7 @@ def run(
         raise click.UsageError("--job, --retry-failed and --verify are for campaigns.")
     else:
         scenario = Scenario.load(paths[0])
-        run_scenario(
-            scenario, terminal, options, backend, no_plan=no_plan, only=only, pictures=pictures
-        )
+        run_scenario(scenario, terminal, options, backend, no_plan=no_plan, extent=extent)
 
 
 @cli.command()

@@ -48,8 +48,7 @@ def run_scenario(
     backend: str | None = None,
     *,
     no_plan: bool = False,
-    only: str | None = None,
-    pictures: bool = False,
+    extent: str | None = None,
 ) -> None:
     """Run a scenario, write the result and print a summary.
 
@@ -61,7 +60,7 @@ def run_scenario(
     with terminal.status("reading the scene", logged=False):
         built = build(scenario, plans=not no_plan)
         job = built.job()
-    _run_survey(built, job, options, terminal, only, pictures)
+    _run_survey(built, job, options, terminal, extent)
 
 
 def _run_survey(
@@ -69,8 +68,7 @@ def _run_survey(
     job: Job,
     options: RunOptions,
     terminal: Terminal,
-    only: str | None,
-    pictures: bool,
+    extent: str | None,
     judge: Callable[[RunResult], str] = lambda result: "",
 ) -> None:
     """Run a job, and write it as the result of a survey; `judge` returns a note on it."""
@@ -78,9 +76,8 @@ def _run_survey(
     for note in advice(built):
         terminal.tell(note)
     jobs = OneJob(job)
-    output = SurveyOutput(
-        options.out, job.survey, job.outputs, only == "cloud", built.scenario, judge, pictures
-    )
+    extent = extent or "page"
+    output = SurveyOutput(options.out, job.survey, job.outputs, extent, built.scenario, judge)
     with page_of(jobs, options.live) as page:
         result, report = Conductor(jobs, options, output, terminal, page)()
         lines = _of_result(options.out, result, job, report)
@@ -122,8 +119,7 @@ def run_job(
     terminal: Terminal,
     options: RunOptions,
     backend: str | None,
-    only: str | None,
-    pictures: bool,
+    extent: str | None,
 ) -> None:
     """Run one job of a campaign again, and write it as the result of a survey.
 
@@ -157,7 +153,7 @@ def run_job(
         return f"the points are those of job {name} in {place}, bit for bit"
 
     options = options.with_pool(scenario.pool, backend)
-    _run_survey(built, replace(job, number=0), options, terminal, only, pictures, compare)
+    _run_survey(built, replace(job, number=0), options, terminal, extent, compare)
 
 
 def no_hits(job: Job) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import AbstractContextManager, ExitStack, contextmanager, nullcontext
 from dataclasses import dataclass
@@ -15,17 +14,7 @@ from distributed import Client
 from rich.console import Console
 
 from ..base.streams import Unheard
-from ..run.progress import (
-    STAGES,
-    Advance,
-    Pace,
-    Progress,
-    Screen,
-    Show,
-    bar_lines,
-    bars,
-    standing_still,
-)
+from ..run.progress import STAGES, Pace, Progress, Screen, Show, Written, bars, rows, standing_still
 from .shared_options import set_logs
 
 # Plain lines come after another tenth of the elapsed time, within these bounds, so that a survey
@@ -67,20 +56,11 @@ class Terminal(Screen):
             yield
 
     @contextmanager
-    def writing(self, words: str) -> Iterator[Advance]:
+    def writing(self, words: str) -> Iterator[Written]:
         """Show a bar for each output while the body writes them; in a log, `words`."""
-        if (console := self._console) is None:
-            with self.status(words):
-                yield lambda *_: None
-            return
-        done: Counter[str] = Counter()
-        with bar_lines(console) as move:
-
-            def advance(name: str, more: int, of: int, unit: str) -> None:
-                done[name] = min(done[name] + more, of)  # pieces may be read twice
-                move(name, done[name], of, unit, "")
-
-            yield advance
+        console = self._console
+        with self.status(words) if console is None else rows(console) as show:
+            yield show or (lambda *_: None)
 
     @contextmanager
     def progress(self) -> Iterator[Show]:

@@ -14,7 +14,6 @@ from ..base.arrays import AnyArray
 from ..base.errors import LidarpoolError
 from ..base.storage import Storage
 from ..columns.cloud import Cloud, CloudLike
-from ..columns.parts import StoredCloud
 from .format_table import FORMATS
 from .sweeps import MIXED_UP, Sweeps
 
@@ -132,11 +131,6 @@ class RangeWriter:
         if not self.place.sees(_MARK, self._mark):
             return None
         return pieces.write(self.place, *span)
-
-    def tell(self, points: int) -> None:
-        """Have a cloud that tells how far it was read tell of points that workers wrote."""
-        if isinstance(self.cloud, StoredCloud):
-            self.cloud.tell(points)
 
     def stop(self) -> None:
         """Let no further range be written."""

@@ -24,7 +24,7 @@ from ..export.navigation_files import Instruments, write_instruments
 from ..export.sweeps import SWEEPS_FILE, Sweeps
 from ..run.conductor import Conductor, Output
 from ..run.picture_file import PICTURE_FILE, PictureContent
-from ..run.progress import Advance
+from ..run.progress import Written
 from ..run.run_result import RunResult
 from ..run.writer import LidarWorkers
 from ..scenario.scenario import Scenario
@@ -45,17 +45,16 @@ _FURTHER = (*(FORMATS[name].file for name in EXPORTS), *INSTRUMENT_FILES)
 class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
     """The result of a survey in its folder or storage, `place`; gives it with its report.
 
-    `formats` are written beside the cloud, `pictures` are drawn if they are wanted, `only_cloud`
-    leaves out the page and what is drawn from, and `judge` returns a note on the result.
+    `formats` are written beside the cloud. `extent` is how much: the "cloud", the "page", too, with
+    what pictures are drawn from, or "pictures", too. `judge` returns a note on the result.
     """
 
     place: Path | Storage
     survey: Survey
     formats: Sequence[Format]
-    only_cloud: bool = False
+    extent: str = "page"
     scenario: Scenario | None = None
     judge: Callable[[RunResult], str] = lambda result: ""
-    pictures: bool = False
 
     def __post_init__(self) -> None:
         self.formats = [one for one in self.formats if one.format != "ply"]
@@ -121,17 +120,16 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
             conductor.result_is_in(self.place)
             conductor.store.remove()
 
-        report = "" if self.only_cloud else " and the report"
-        what = f"the cloud, the pictures{report}" if self.pictures else f"the cloud{report}"
-        with conductor.screen.writing(f"writing {what}") as advance:
-            return result, self.write(result, in_place, workers, advance)
+        more = {"cloud": "", "page": " and the report", "pictures": ", the report and the pictures"}
+        with conductor.screen.writing(f"writing the cloud{more[self.extent]}") as show:
+            return result, self.write(result, in_place, workers, show)
 
     def write(
         self,
         result: RunResult,
         then: Callable[[], object] = lambda: None,
         workers: LidarWorkers | None = None,
-        advance: Advance = lambda *_: None,
+        show: Written = lambda *_: None,
     ) -> dict[str, Any]:
         """Write cloud, pictures and report into the held place, and return the report.
 
@@ -139,7 +137,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         the disk, so that an earlier result stays whole if one cannot be written. Pictures of an
         earlier result that this one does not make are removed. `then` is called when all are in
         place, before a pending interrupt is raised. `workers` write formats of many files, and
-        `advance` is told what is being written, and how far it is.
+        `show` is told what is being written, and how far it is.
 
         Where `place` is a storage, all is put into it, report.json last. Files of workers go there
         directly, and an earlier result is removed before.
@@ -150,16 +148,20 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         storage = place if isinstance(place, Storage) else None
         target = Storage.at(storage or folder)
         _, earlier = _earlier(target)
-        further, sweeps = (
-            _further_files(result.survey, formats),
-            Sweeps.of(result.survey, result.scene),
-        )
+        further = _further_files(result.survey, formats)
+        sweeps = Sweeps.of(result.survey, result.scene)
 
         def points(file: str) -> StoredCloud:
             """Return the points, which tell how far a file is while they are read."""
-            count = len(result.points)
-            advance(file, 0, count, "points")
-            return replace(result.points, tell=lambda more: advance(file, more, count, "points"))
+            count, done = len(result.points), 0
+
+            def tell(more: int) -> None:
+                nonlocal done
+                done = min(done + more, count)  # some may be read twice
+                show(file, done, count, "points")
+
+            tell(0)
+            return replace(result.points, tell=tell)
 
         advice = "make room or give another folder with --out"
         with (
@@ -186,8 +188,8 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                 result = workers.recorded(result)
             report = make_report(result, cloud)
             report["notes"] += [note for one in formats for note in one.notes(result.points)]
-            if not self.only_cloud:
-                self._show(result, report, cloud, staged, advance)
+            if self.extent != "cloud":
+                self._report(result, report, cloud, staged, show)
             made = [name for name in FILES[1:] if name == REPORT or (staged / name).exists()]
             report["files"] = [CLOUD, *further, *made]
             text = json.dumps(report, indent=1, allow_nan=False) + "\n"
@@ -203,24 +205,20 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
                     then()
         return report
 
-    def _show(
-        self,
-        result: RunResult,
-        report: dict[str, Any],
-        cloud: CountedCloud,
-        staged: Path,
-        advance: Advance,
-    ) -> None:
+    def _report(
+        self, result: RunResult, report: dict[str, Any], cloud: CountedCloud, staged: Path,
+        show: Written,
+    ) -> None:  # fmt: skip
         """Write the page, what pictures are drawn of, and the pictures if they are wanted."""
         from .page.rendering import write_page  # jinja2
 
         shown = PictureContent.of(result)
         shown.save(staged / PICTURE_FILE)
         write_page(staged / PAGE, report, result, cloud, self.scenario)
-        if self.pictures:
+        if self.extent == "pictures":
             from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
 
-            for _ in draw_pictures(shown, staged, staged, advance=advance):
+            for _ in draw_pictures(shown, staged, staged, show=show):
                 pass
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -32,7 +32,7 @@ from ..render.pictures import MOST_POINTS, draw_cloud, draw_hits, draw_scene
 from ..render.shot import SIZE, Samples, SurfaceView, take_shot
 from ..render.stage import make_axis, nice_step
 from ..run.picture_file import PictureContent, ways_of
-from ..run.progress import Advance
+from ..run.progress import Written
 from ..scene.scene import Scene
 from .page.rendering import put_picture
 
@@ -54,11 +54,13 @@ def draw_pictures(
     only: Sequence[str] = (),
     size: tuple[int, int] = SIZE,
     colour: str = Z.name,
-    advance: Advance = lambda *_: None,
+    show: Written = lambda *_: None,
 ) -> Iterator[Path]:
-    """Draw pictures of a result, those in `only`, into a folder, which is made.
+    """Draw pictures of a result, those in `only`, into a folder, which is made, and into its page.
 
-    They also go into the page of the result if that is in the folder. See `picture_makers`.
+    All have the same viewpoint. Without planning there is no picture of the path; and none of
+    points in the axes of their sensors, which do not fit the scene. The cloud is coloured by the
+    column `colour`.
     """
     cloud, page = result / "cloud.ply", Path(folder) / "report.html"
     least, most = min(size), max(size)
@@ -67,8 +69,7 @@ def draw_pictures(
             f"A picture cannot be {size[0]} x {size[1]} pixels: give width and height of "
             f"{SIDE_LEAST} to {SIDE_MOST} each, one at most twice the other, such as 1600 x 1000."
         )
-    columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
-    makers = picture_makers(shown, cloud, columns, size, colour)
+    makers = _picture_makers(shown, cloud, size, colour)
     for name in only:
         if name not in PICTURES:
             there = did_you_mean(name, PICTURES) or f" There are {', '.join(PICTURES)}."
@@ -83,29 +84,21 @@ def draw_pictures(
     with explained(f"The folder {folder} cannot be made", "give another"):
         Path(folder).mkdir(parents=True, exist_ok=True)
     names = only or [*makers]
-    advance("pictures", 0, len(names), "pictures")
-    for name in names:
+    for number, name in enumerate(names):
+        show("pictures", number, len(names), "pictures")
         path, picture = Path(folder) / f"{name}.png", makers[name]()
         picture.save(path)
         if page.exists():
             put_picture(page, name, picture.svg())
-        advance("pictures", 1, len(names), "pictures")
         yield path
+    show("pictures", len(names), len(names), "pictures")
 
 
-def picture_makers(
-    shown: PictureContent,
-    cloud: Path,
-    columns: Collection[str],
-    size: tuple[int, int] = SIZE,
-    colour: str = Z.name,
+def _picture_makers(
+    shown: PictureContent, cloud: Path, size: tuple[int, int], colour: str
 ) -> dict[str, Callable[[], Page]]:
-    """Return functions that draw pictures, all from the same viewpoint.
-
-    Without planning there is no picture of the path; and none of points in the axes of their
-    sensors, which do not fit the scene. The file `cloud` is read when it is drawn, and coloured by
-    the column `colour`; its `columns` tell whether there is a picture of intensity.
-    """
+    """Return functions that draw pictures; the file `cloud` is read when it is drawn."""
+    columns = [column.name for column in CloudFile(cloud).table] if cloud.exists() else []
     alone = shown.coordinates == "sensor"
     middle = shown.duration_ns / 2
 

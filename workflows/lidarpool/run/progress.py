@@ -49,8 +49,7 @@ class Progress:
 
 
 Show = Callable[[Progress], None]
-# Is told of what is written: its name, items that were written just now, of all, and their unit.
-Advance = Callable[[str, int, int, str], None]
+Written = Callable[[str, int, int, str], None]  # name of an output, items that are done, all, unit
 
 
 def in_words(rate: float) -> str:
@@ -96,11 +95,8 @@ def standing_still(progress: Progress) -> str:
 
 
 @contextmanager
-def bar_lines(console: Console) -> Iterator[Callable[[str, int, int, str, str], None]]:
-    """Bars that appear when they are first moved.
-
-    Yields the function that moves one: label, items done, of all, their unit, and a remark.
-    """
+def rows(console: Console) -> Iterator[Callable[..., None]]:
+    """Bars that appear when they are first moved; yields the function that moves one."""
     columns = (
         TextColumn("{task.description:<11}"),
         BarColumn(bar_width=None),
@@ -111,7 +107,7 @@ def bar_lines(console: Console) -> Iterator[Callable[[str, int, int, str, str], 
     with Bars(*columns, console=console) as shown:
         lines: dict[str, TaskID] = {}
 
-        def move(label: str, done: int, total: int, unit: str, pace: str) -> None:
+        def move(label: str, done: int, total: int, unit: str, pace: str = "") -> None:
             if label not in lines:
                 lines[label] = shown.add_task(label, total=total, unit=unit, pace="")
             shown.update(lines[label], completed=done, pace=pace)
@@ -123,7 +119,7 @@ def bar_lines(console: Console) -> Iterator[Callable[[str, int, int, str, str], 
 def bars(console: Console) -> Iterator[Show]:
     """Bars by stage with rates and time left; yields the function that moves them."""
     paces = {label: Pace() for label, _, _ in STAGES}
-    with bar_lines(console) as move:
+    with rows(console) as move:
 
         def show(progress: Progress) -> None:
             for label, count, unit in STAGES:
@@ -168,7 +164,7 @@ class Screen:
         """Show what is going on while the body runs."""
         return nullcontext()
 
-    def writing(self, words: str) -> AbstractContextManager[Advance]:
+    def writing(self, words: str) -> AbstractContextManager[Written]:
         """Show what is being written while the body runs; gives the function that is told."""
         return nullcontext(lambda *_: None)
 

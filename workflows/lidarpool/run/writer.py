@@ -211,9 +211,7 @@ class LidarWorkers:
                 for future in (shared, *running):
                     raise_if_failed(future, f"Writing {writer.place}")
                 done = self._tasks.take_done()
-                new = {span: made for span, made in done if made is not None}
-                writer.tell(sum(points for points, _ in new.values()))
-                written |= new
+                written |= {span: made for span, made in done if made is not None}
                 watch.look()
                 if not done:
                     time.sleep(LOOK_EVERY_S)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from ..sensor.models import STATED
 from .build import Built
 from .placing import inside_note
 from .scenario import Scenario
+from .sections import SensorSection
 
 # Sizes of scenes in metres are between these. An .stl is mostly a part, in millimetres; an object
 # to look at from outside is rarely longer than a bus. glTF is in metres, and some exporters write
@@ -97,8 +98,8 @@ def _of_colours(built: Built) -> str:
 def _of_datasheets(built: Built) -> Iterator[str]:
     """Name what the data sheets of sensors do not state, and the scenario does not give."""
     scenario, given = built.scenario, built.scenario.noise.model_fields_set
-    sections = (scenario.sensors or {"": scenario.sensor}).values()
-    for section, noise in zip(sections, built.survey.noise_each, strict=True):
+    sections: Mapping[str, SensorSection] = scenario.sensors or {"": scenario.sensor}
+    for section, noise in zip(sections.values(), built.survey.noise_each, strict=True):
         left = [name for name in STATED if name not in given and not getattr(noise, name)]
         if section.performance == "datasheet" and left:
             lacks = ", ".join(f"{STATED[name]} (noise.{name})" for name in left)
