@@ -261,7 +261,7 @@ def test_figures_have_the_digits_that_are_read(write):
         sensors=[Mounted(sensor, name="left", noise=Noise(detection_range_m=100.8767244))],
         poses=[(0, 0, 1)], steps=60, visibility_km=10 / 3,
     )  # fmt: skip
-    text, _ = write(survey=survey, origin=(500_000.123456, -0.00004, 1.5), plan=None)
+    text, _ = write(survey=survey, origin=(500_000.123456, -0.00004, 1.5), tasks=())
     told = {
         dt.text: dt.getnext().text for dt in html.fromstring(text).xpath("//dl[@class='pairs']//dt")
     }

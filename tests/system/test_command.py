@@ -253,6 +253,8 @@ def test_pictures_are_drawn_if_they_are_asked_for_or_later(run, lidarpool, tmp_p
     assert run("--quiet", "--pictures").code == 0
     assert json.loads((out / "report.json").read_text())["files"] == MADE
     assert names_in(out) == {*MADE} and hidden(out / "report.html") == ["intensity"]
+    outcome = run("--pictures", "--only", "cloud")
+    assert outcome.code == 2 and "leaves out what --pictures draws" in outcome.err
 
 
 @pytest.mark.parametrize("words", [["--version"], ["--help"], ["run", "--help"], [None]])

@@ -51,7 +51,6 @@ _shown = shared.together(
     ),
     click.option(
         "--only",
-        "extent",
         type=click.Choice(["cloud"]),
         help="Write the cloud and report.json, no page.",
     ),
@@ -122,7 +121,7 @@ def cli() -> None:
 @shared.out
 @_shown
 @_runs
-def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
+def demo(terminal: Terminal, options: RunOptions, only: str | None) -> None:
     """Run the default survey and plan a path, on this machine, and draw the pictures.
 
     \b
@@ -133,7 +132,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
     from ..scenario.scenario import Scenario
     from .run_command import run_scenario
 
-    run_scenario(Scenario(), terminal, options, extent=extent or "pictures")
+    run_scenario(Scenario(), terminal, options, extent=only or "pictures")
 
 
 @cli.command()
@@ -143,9 +142,7 @@ def demo(terminal: Terminal, options: RunOptions, extent: str | None) -> None:
 @shared.cluster
 @shared.backend
 @shared.no_plan
-@click.option(
-    "--pictures", "extent", flag_value="pictures", help="Draw the pictures, as lidarpool plot does."
-)
+@shared.flag("--pictures", help="Draw the pictures, too, as lidarpool plot does later.")
 @shared.flag("--resume", help="Resume an unfinished run, if there is one.")
 @shared.flag("--fresh", help="Delete an unfinished run.")
 @shared.flag("--retry-failed", help="Of a campaign: do the jobs that have failed again.")
@@ -179,7 +176,8 @@ def run(
     options: RunOptions,
     scenarios: tuple[str, ...],
     no_plan: bool,
-    extent: str | None,
+    only: str | None,
+    pictures: bool,
     number: int | None,
     backend: str | None,
 ) -> None:
@@ -210,6 +208,9 @@ def run(
         raise click.UsageError("--resume continues the run that --fresh deletes: give one of them.")
     if options.retry_failed and (options.fresh or number is not None):
         raise click.UsageError("--retry-failed goes on with a campaign: not with --fresh or --job.")
+    if only is not None and pictures:
+        raise click.UsageError("--only cloud leaves out what --pictures draws: give one of them.")
+    extent = "pictures" if pictures else only
     paths = [*map(Path, scenarios)]
     if options.verify and not paths[0].is_file():
         click.echo(verify(Storage.at(scenarios[0])))

@@ -218,8 +218,7 @@ class SurveyOutput(Output[tuple[RunResult, dict[str, Any]]]):
         if self.extent == "pictures":
             from .result_pictures import draw_pictures  # Matplotlib, and seconds for each picture
 
-            for _ in draw_pictures(shown, staged, staged, show=show):
-                pass
+            list(draw_pictures(shown, staged, staged, show=show))
 
 
 def _further_files(survey: Survey, formats: Sequence[Format]) -> list[str]:
