@@ -58,9 +58,8 @@ def draw_pictures(
 ) -> Iterator[Path]:
     """Draw pictures of a result, those in `only`, into a folder, which is made, and into its page.
 
-    All have the same viewpoint. Without planning there is no picture of the path; and none of
-    points in the axes of their sensors, which do not fit the scene. The cloud is coloured by the
-    column `colour`.
+    All have the same viewpoint, and the cloud the colours of the column `colour`. There is none of
+    a path that was not planned, nor of points in the axes of their sensors: the scene is in others.
     """
     cloud, page = result / "cloud.ply", Path(folder) / "report.html"
     least, most = min(size), max(size)

@@ -174,9 +174,9 @@ class HeliosScene:
         if not files:
             raise LidarpoolError("no filter loads a file.")
         up = up if up in ("y", "z") else None
+        place = up, turn, float(scale)
         for file, mesh in zip(files, cycle(points)):
-            place = up, turn, float(scale), offset.copy()
-            yield HeliosPart(file, *place, falls, library, material, mesh)
+            yield HeliosPart(file, *place, offset.copy(), falls, library, material, mesh)
 
     @cached_property
     def _ground(self) -> Scene | None:
@@ -262,9 +262,9 @@ def _surfels(path: Path, given: dict[str, str]) -> SceneMesh:
     lines = read(path).decode("utf-8", "replace").translate(separators).splitlines()
     try:
         points = np.loadtxt(lines, comments="//", usecols=(0, 1, 2), ndmin=2)
+        return surfels(path, points, number(given, "voxelSize", 1.0) or 1.0)
     except ValueError as error:
         raise LidarpoolError(f"{path} has rows that are no points: {error}.") from error
-    return surfels(path, points, number(given, "voxelSize", 1.0) or 1.0)
 
 
 def _text(path: Path) -> str:
